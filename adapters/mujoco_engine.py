@@ -60,6 +60,7 @@ from plumbline.engines.metamorphic_hooks import MetamorphicHooks
 from plumbline.model import kinematics
 from plumbline.model.datatypes import (
     KINDS,
+    ROD,
     Array,
     EngineFailure,
     Integrator,
@@ -71,8 +72,9 @@ from plumbline.model.datatypes import (
 )
 from plumbline.model.loops import PER_BODY, STABILISATION, cut_open, determinate_part, wrench_length
 from plumbline.model.redescription import (
-    ADDED_MOTIONS,
+    HELD_KINDS,
     Rearranged,
+    added_motions,
     joints_as_cylinders,
     rods_taken_out,
     state_of_cylinders,
@@ -153,7 +155,7 @@ class Mujoco(MetamorphicHooks):
         ),
     )
     options = loop_options = (DENSE,)
-    joint_options = MappingProxyType({TENDONS: ("rod",), HELD: tuple(ADDED_MOTIONS)})
+    joint_options = MappingProxyType({TENDONS: (ROD,), HELD: HELD_KINDS})
     # the matrices of implicit steps, in dampers too, depend on the coordinates
     motion_options = MappingProxyType({HELD: ("RK4",)})
     unmoved_options = MappingProxyType({TENDONS: TENDON_MOTIONS})
@@ -481,14 +483,14 @@ class _SoftMechanism:
         rest = self.rodless.model if self.rodless else model
         self.cut = cut_open(rest) if rest.has_loops else None
         self.opened = self.cut.model if self.cut else rest
-        self.rods = [k for k, kind in enumerate(model.kind) if self.rodless and kind == "rod"]
+        self.rods = np.flatnonzero(model.rods).tolist() if self.rodless else []
         place = np.append(np.argsort(self.rodless.order), -1) if self.rodless else np.zeros(0, int)
         place = np.append(self.cut.place, -1)[place] if self.cut else place
         for k in self.rods:
             softness = sum(1 / model.mass[b] for b in model.body[k] if b >= 0)
             ties.append(_Tie(place[model.body[k]], model.point[k], model.length[k], softness))
         held = joints_as_cylinders(self.opened) if option == HELD else self.opened
-        added = [ADDED_MOTIONS.get(kind, ()) if option == HELD else () for kind in self.opened.kind]
+        added = added_motions(self.opened) if option == HELD else [() for _ in self.opened.kind]
         constraints = _Constraints(self.cut.ends if self.cut else (), tuple(added), tuple(ties))
         self.tree = _MujocoChain(held, dense=option == DENSE, constraints=constraints)
 

@@ -26,7 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from reference_impl.euler_parameters import A, G, L, cross, dot
-from reference_impl.mechanism import KINDS, Array, Mechanism
+from reference_impl.mechanism import Array, Mechanism
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,21 +52,21 @@ class Elements:
     def __init__(self, mechanism: Mechanism) -> None:
         m = self.mechanism = mechanism
         found: list[tuple[int, int, int, bool, bool]] = []
-        for k, kind in enumerate(m.kind):
+        for k, kind in enumerate(m.kinds):
             balls = [("turn", 0), ("turn", 1), ("turn", 2)]
-            for i, (what, axis) in enumerate(balls if kind == "ball" else KINDS[kind].motions):
-                column = 0 if kind == "ball" else i
+            for i, (what, axis) in enumerate(balls if kind.is_spherical else kind.motions):
+                column = 0 if kind.is_spherical else i
                 if (
                     m.armature[k, column]
                     or m.damping[k, column]
                     or m.stiffness[k, column]
                     or m.effort[k, column]
                 ):
-                    found.append((k, column, axis, what == "slide", i == 0 and kind != "ball"))
+                    found.append((k, column, axis, what == "slide", i == 0 and not kind.is_spherical))
         table = np.array(found, np.intp).reshape(-1, 5).T
         self.joint, self.column, self.axis = table[:3]
         self.is_slide, self.is_far = table[3:].astype(bool)  # is_far: its axis is fixed in the far body
-        self.is_ball = np.array([m.kind[k] == "ball" for k in self.joint], bool)
+        self.is_ball = np.array([m.kinds[k].is_spherical for k in self.joint], bool)
         at = self.joint, self.column
         self.armature, self.damping, self.stiffness = m.armature[at], m.damping[at], m.stiffness[at]
         self.effort, self.rest = m.effort[at], m.rest[at]

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reference_impl.euler_parameters import I3, A, AnyArray, B, G, L, dot, outer
-from reference_impl.mechanism import KINDS, Mechanism
+from reference_impl.mechanism import Mechanism
 
 VECTORS = "ijkxyzXYZd"  # what rows are products of
 
@@ -102,7 +102,7 @@ def joint_of_rows(mechanism: Mechanism) -> NDArray[np.intp]:
         (c,) the joint of each row, ascending.
 
     """
-    return np.repeat(np.arange(len(mechanism.kind)), [len(KINDS[kind].rows) for kind in mechanism.kind])
+    return np.repeat(np.arange(len(mechanism.kind)), [len(kind.rows) for kind in mechanism.kinds])
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,10 +133,10 @@ def _row_layout(mechanism: Mechanism) -> _RowLayout:
     world = far < 0
     s = np.stack([mechanism.point[:, 1], np.where(world[:, None], 0, mechanism.point[:, 0])])
     joint = joint_of_rows(mechanism)
-    pairs = [pair for kind in mechanism.kind for pair in KINDS[kind].rows]
+    pairs = [pair for kind in mechanism.kinds for pair in kind.rows]
     is_rod = np.array([pair == ("d", "d") for pair in pairs], bool)
     rods = joint[is_rod]
-    used = [{name for pair in KINDS[kind].rows for name in pair} for kind in mechanism.kind]
+    used = [{name for pair in kind.rows for name in pair} for kind in mechanism.kinds]
     turned = np.array([k for k, names in enumerate(used) if names & set("xyzXYZ")], np.intp)
     f, h = np.moveaxis(A(mechanism.turn[turned]).swapaxes(-1, -2), 1, 0)  # rows: the axes
     axes = np.stack([h, np.where(world[turned, None, None], 0, f)])

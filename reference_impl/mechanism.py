@@ -4,48 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from reference_impl.joint_kinds import BALL, KINDS, ROD, JointKind, Kind
+
 Array = NDArray[np.float64]
-Kind = Literal["rod", "ball", "hinge", "universal", "slide", "cylindrical", "weld", "free"]
-
-
-class JointKind(NamedTuple):
-    """What a joint holds, and what it leaves free."""
-
-    # Rows C = uᵀw by the names of u and w: i, j, k the world's axes, x, y, z the joint's in the far body,
-    # X, Y, Z in the near one, d from the far to the near point.
-    rows: tuple[tuple[str, str], ...]
-    # Its scalar coordinates from the far body on: turns about or slides along one of the axes 0, 1, 2.
-    motions: tuple[tuple[Literal["turn", "slide"], int], ...] = ()
-    has_attitude: bool = False  # whether p of the near body is a coordinate, not a result
-
-    @property
-    def holds_distance(self) -> bool:
-        """Whether it holds the distance of its two points, not the points together."""
-        return ("d", "d") in self.rows
-
-    @property
-    def holds_nothing(self) -> bool:
-        """Whether the near body is free."""
-        return not self.rows
-
-
-_POINT = (("i", "d"), ("j", "d"), ("k", "d"))
-_ATTITUDE = (("x", "Y"), ("y", "Z"), ("z", "X"))
-KINDS: dict[Kind, JointKind] = {
-    "rod": JointKind((("d", "d"),), has_attitude=True),
-    "ball": JointKind(_POINT, has_attitude=True),
-    "hinge": JointKind((*_POINT, ("x", "Z"), ("y", "Z")), (("turn", 2),)),
-    "universal": JointKind((*_POINT, ("x", "Y")), (("turn", 0), ("turn", 1))),
-    "slide": JointKind((("x", "d"), ("y", "d"), *_ATTITUDE), (("slide", 2),)),
-    "cylindrical": JointKind((("x", "d"), ("y", "d"), ("x", "Z"), ("y", "Z")), (("slide", 2), ("turn", 2))),
-    "weld": JointKind((*_POINT, *_ATTITUDE)),
-    "free": JointKind((), has_attitude=True),
-}
 ZERO_INERTIA = 1e-14  # a principal moment that is this part of the largest is the rounding of 0
 CHAIN_FIELDS = (
     "mass", "inertia", "proximal", "distal", "length",
@@ -211,6 +177,11 @@ class Mechanism:
         return len(self.mass)
 
     @property
+    def kinds(self) -> tuple[JointKind, ...]:
+        """(J,) the entries of `KINDS`."""
+        return tuple(KINDS[kind] for kind in self.kind)
+
+    @property
     def is_chain(self) -> bool:
         """Whether it `has_chain_joints`, and inertia about every axis, which forms of chains invert."""
         return self.has_chain_joints and not self.lacks_inertia
@@ -248,7 +219,12 @@ class Mechanism:
     @property
     def rods(self) -> NDArray[np.bool_]:
         """(J,) True where joint k is a rod."""
-        return np.array([kind == "rod" for kind in self.kind])
+        return np.array([kind.holds_distance for kind in self.kinds], bool)
+
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        """(J,) True where joint k leaves its body free."""
+        return np.array([kind.holds_nothing for kind in self.kinds], bool)
 
     @property
     def has_joint_elements(self) -> bool:
@@ -288,7 +264,7 @@ def _has_joint_elements(mechanism: Mechanism) -> bool:
 
 @lru_cache(maxsize=64)
 def _has_chain_joints(mechanism: Mechanism) -> bool:
-    if mechanism.has_loops or mechanism.has_elements or not set(mechanism.kind) <= {"rod", "ball"}:
+    if mechanism.has_loops or mechanism.has_elements or not all(x.holds_no_turn for x in mechanism.kinds):
         return False
     is_row = bool(np.all(mechanism.body[:, 0] == np.arange(mechanism.n) - 1))
     return is_row and not np.any(mechanism.point[0, 0])
@@ -304,4 +280,4 @@ def _lacks_inertia(mechanism: Mechanism) -> bool:
 
 def _chain_kinds(length: Array) -> tuple[Kind, ...]:
     """Rods where there is a length, balls elsewhere."""
-    return tuple("rod" if size > 0 else "ball" for size in length)
+    return tuple(ROD if size > 0 else BALL for size in length)

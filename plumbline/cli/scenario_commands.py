@@ -85,7 +85,7 @@ def describe_immovable_joints(s: scenarios.Scenario) -> str:
     still, n = immovable_joints(s.model, s.state), s.model.n
     if not still:
         return ""
-    if len(still) == sum(kind != "weld" for kind in s.model.kind):
+    if len(still) == sum(not kind.is_rigid for kind in s.model.kinds):
         return "the mechanism cannot move: its loops hold every joint"
     names = [s.body_names[k] if k < n else f"closes[{k - n}]" for k in still]
     return f"the loops hold these joints, which cannot move: {', '.join(names)}"

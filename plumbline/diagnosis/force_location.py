@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plumbline.diagnosis.joint_causes import one_number
-from plumbline.model.datatypes import KINDS, Array, Model
+from plumbline.model.datatypes import Array, Model
 from plumbline.model.kinematics import quaternion_exponential, quaternion_product
 
 Place = tuple[str, list[Model]]  # words, and the mechanism with each of its forces
@@ -34,17 +34,19 @@ def force_places(model: Model) -> Iterator[list[Place]]:
 
     """
     single, joints, balls = list[Place](), list[Place](), list[Place]()
-    for k, kind in enumerate(model.kind):
-        motions = KINDS[kind].motions
+    for k, kind in enumerate(model.kinds):
+        motions = kind.motions
         for i, (what, _) in enumerate(motions):
-            which = f" {'xy'[i] if kind == 'universal' else what}" * (len(motions) > 1)
+            which = f" {kind.motion_names[i]}" * (len(motions) > 1)
             words = f"another {'force' if what == 'slide' else 'torque'} acted along joint {k + 1}{which}"
             effort = one_number("effort", (k, i))(model, model.effort[k, i] + 1.0)
             single.append((words, [effort]))
-        if kind == "ball":
+        if kind.is_spherical:
             balls.append((f"another moment acted in joint {k + 1}", _moments_in_ball(model, k)))
         if len(motions) > 1:
-            joints.append((f"other efforts acted along joint {k + 1}", [one for _, (one,) in single[-2:]]))
+            joints.append(
+                (f"other efforts acted along joint {k + 1}", [one for _, (one,) in single[-len(motions) :]])
+            )
     springs = [
         one_number("spring_stiffness", (i,))(model, model.spring_stiffness[i] + 1.0)
         for i in range(len(model.spring_body))

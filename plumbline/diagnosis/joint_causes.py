@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from plumbline.model.datatypes import JOINT_ELEMENTS, KINDS, SPRING_FIELDS, Array, Model
+from plumbline.model.datatypes import JOINT_ELEMENTS, SPRING_FIELDS, Array, Model
 from plumbline.model.kinematics import quaternion_exponential, quaternion_product, rotation_matrix
 
 ACCEPTED_SHARE = 1e-6  # of the difference; evaluating in doubles leaves 1e-10 of it and less
@@ -83,9 +83,9 @@ def joint_causes(model: Model) -> Iterator[JointCause]:
                     change = _scaled_places(name, places)
                     yield JointCause(f"{element_words(name)} of all {what}s", change, 1.0, 1.0)
         for k, i in _coordinates(model):
-            which = f" {'xy'[i] if model.kind[k] == 'universal' else ('slide', 'turn')[i]}"
-            of = f"joint {k + 1}" + which * (len(KINDS[model.kind[k]].motions) > 1)
-            if name not in ("rest", "effort") or model.kind[k] != "ball":
+            names = model.kinds[k].motion_names
+            of = f"joint {k + 1}" + (f" {names[i]}" if len(names) > 1 else "")
+            if name not in ("rest", "effort") or not model.kinds[k].is_spherical:
                 scale = float(abs(values[k, i])) or 1.0
                 yield JointCause(
                     f"{element_words(name)} of {of}", one_number(name, (k, i)), float(values[k, i]), scale
@@ -95,10 +95,10 @@ def joint_causes(model: Model) -> Iterator[JointCause]:
             value = float(getattr(model, name)[i])
             subject = f"the {name.removeprefix('spring_')} of spring {i + 1}"
             yield JointCause(subject, one_number(name, (i,)), value, abs(value) or 1.0)
-    for k, kind in enumerate(model.kind):
-        if kind == "free":
+    for k, kind in enumerate(model.kinds):
+        if kind.holds_nothing:
             continue
-        if kind == "rod":
+        if kind.holds_distance:
             length = float(model.length[k])
             yield JointCause(
                 f"the length of joint {k + 1}", one_number("length", (k,)), length, length, " m", False
@@ -110,7 +110,7 @@ def joint_causes(model: Model) -> Iterator[JointCause]:
                 at = (k, side, axis)
                 subject = f"{'xyz'[axis]} of the {where} point of joint {k + 1}"
                 yield JointCause(subject, one_number("point", at), float(model.point[at]), 0.1, " m")
-                if kind not in ("rod", "ball") and (kind, where) != ("weld", "near"):  # equal to a far turn
+                if not kind.has_attitude and (side == 0 or not kind.is_rigid):  # equal to a far turn
                     subject = f"the turn of the axes of joint {k + 1} in the {where} body about {'xyz'[axis]}"
                     yield JointCause(subject, _turned(k, side, axis), 0.0, 0.1, " rad")
 
@@ -122,11 +122,11 @@ def vector_causes(model: Model) -> Iterator[JointCause]:
         Points and turns of the axes of each joint, loads of each body, and gravity.
 
     """
-    for k, kind in enumerate(model.kind):
-        if kind == "free":
+    for k, kind in enumerate(model.kinds):
+        if kind.holds_nothing:
             continue
         for side, where in enumerate(("far", "near")):
-            if kind not in ("rod", "ball") and (kind, where) != ("weld", "near"):
+            if not kind.has_attitude and (side == 0 or not kind.is_rigid):
                 subject = f"the axes of joint {k + 1} in the {where} body"
                 yield JointCause(subject, _turned_about(k, side), (0.0, 0.0, 0.0), 0.1, " rad")
             subject = f"the {where} point of joint {k + 1}"
@@ -225,8 +225,7 @@ def element_words(name: str) -> str:
 
 def _coordinates(model: Model) -> list[tuple[int, int]]:
     """Joint and column of all coordinates that can have elements."""
-    counts = [1 if kind == "ball" else len(KINDS[kind].motions) for kind in model.kind]
-    return [(k, i) for k, count in enumerate(counts) for i in range(count)]
+    return [(k, i) for k, kind in enumerate(model.kinds) for i in range(kind.element_count)]
 
 
 def _shift_is_askew(model: Model, k: int) -> bool:
@@ -237,7 +236,7 @@ def _shift_is_askew(model: Model, k: int) -> bool:
 
 def _is(model: Model, at: tuple[int, int], what: str) -> bool:
     """Whether a coordinate is a slide or a turn."""
-    motions = KINDS[model.kind[at[0]]].motions
+    motions = model.kinds[at[0]].motions
     return (motions[at[1]][0] if motions else "turn") == what
 
 

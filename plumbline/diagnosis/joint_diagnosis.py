@@ -207,8 +207,8 @@ def _force_cause(
         every.model, lambda models: _vectors_at(several, models), several.values, states, several.accepted
     )
     if not found:
-        values, kinds = several.values, enumerate(every.model.kind)
-        rows = {k: [several.effect(one) for one in velocity_terms(k)] for k, kind in kinds if kind != "free"}
+        values, free = several.values, every.model.free
+        rows = {k: [several.effect(one) for one in velocity_terms(k)] for k in np.flatnonzero(~free).tolist()}
         found = [
             f"the velocity term of joint {k + 1} were another"
             for k, some in rows.items()
@@ -465,7 +465,7 @@ def _carrying_points(model: Model, near: Array) -> Array:
     """Of each weld the near point (N, 3) of the joint within its branch that moves, of others their own."""
     points = near.copy()
     for k, far in enumerate(model.body[:, 0]):
-        if model.kind[k] == "weld" and far >= 0:
+        if model.kinds[k].is_rigid and far >= 0:
             points[k] = points[far]
     return points
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from plumbline.diagnosis.joint_causes import element_words, one_number
 from plumbline.diagnosis.joint_prediction import Seen
-from plumbline.model.datatypes import JOINT_ELEMENTS, KINDS, SPRING_FIELDS, Array, Model, State
+from plumbline.model.datatypes import JOINT_ELEMENTS, SPRING_FIELDS, Array, Model, State
 from plumbline.model.kinematics import (
     complete_state,
     own_rates,
@@ -101,16 +101,16 @@ def _single_misreadings(model: Model) -> Iterator[tuple[str, Misreading]]:
     """What may be read in another way of one body, joint or spring."""
     for k in range(model.n):
         of = f"of body {k + 1}"
-        if KINDS[model.kind[k]].has_attitude:
+        if model.kinds[k].has_attitude:
             yield f"the world-frame angular velocity {of} were used", _turned_state("omega", k, False)
-        if model.kind[k] == "free":
+        if model.free[k]:
             yield f"the velocity {of} were given in the body frame", _turned_state("v", k, False)
             yield f"the body-frame velocity {of} were used", _turned_state("v", k, True)
         if np.any(model.force[k]):
             yield f"the applied force {of} were given in the body frame", _turned_load("force", k, False)
         if np.any(model.moment[k]):
             yield f"the applied moment {of} were given in the world frame", _turned_load("moment", k, True)
-        for i, (what, _) in enumerate(KINDS[model.kind[k]].motions):
+        for i, (what, _) in enumerate(model.kinds[k].motions):
             if what == "turn":
                 words = f"angle {i + 1} of joint {k + 1} were its principal value"
                 yield words, _coordinate("x", k, i, lambda x: float(np.arctan2(np.sin(x), np.cos(x))))
@@ -121,7 +121,7 @@ def _single_misreadings(model: Model) -> Iterator[tuple[str, Misreading]]:
                     f"{words} {i + 1} of joint {k + 1} were its absolute value",
                     _coordinate(name, k, i, abs),
                 )
-        if len(KINDS[model.kind[k]].motions) == 2:
+        if len(model.kinds[k].motions) == 2:
             for name, words in (("x", "coordinates"), ("xdot", "rates")):
                 yield f"the {words} of joint {k + 1} were exchanged", _exchanged(name, k)
             for name in JOINT_ELEMENTS:
@@ -130,10 +130,10 @@ def _single_misreadings(model: Model) -> Iterator[tuple[str, Misreading]]:
                     words = f"{element_words(name)} of the two coordinates of joint {k + 1} were exchanged"
                     yield words, _number(name, k, pair[::-1])
         yield from _body_misreadings(model, k)
-        for i in range(len(KINDS[model.kind[k]].motions)):
+        for i in range(len(model.kinds[k].motions)):
             if model.stiffness[k, i]:
                 yield f"spring {i + 1} of joint {k + 1} did not count its coordinate", _unmoved_spring(k, i)
-        for times, how in TURNS.items() if not KINDS[model.kind[k]].has_attitude else ():
+        for times, how in TURNS.items() if not model.kinds[k].has_attitude else ():
             turn = np.linalg.matrix_power(rotation_matrix(model.turn[k, 1]), times)
             inertia = turn @ model.inertia[k] @ turn.T
             if np.max(np.abs(inertia - model.inertia[k])) > EQUAL * np.max(np.abs(inertia)):
@@ -158,12 +158,12 @@ def other_branches(model: Model) -> Iterator[tuple[str, list[Misreading]]]:
     turns = [
         (k, i)
         for k in range(model.n)
-        for i, motion in enumerate(KINDS[model.kind[k]].motions)
+        for i, motion in enumerate(model.kinds[k].motions)
         if motion[0] == "turn"
     ]
     guesses: list[Callable[[Array], Array]] = [lambda x: -x, *map(_turned_over, turns)]
     for given in map(int, np.flatnonzero(model.body[: model.n, 0] < 0)):
-        if len(KINDS[model.kind[given]].motions) == 1:
+        if len(model.kinds[given].motions) == 1:
             words = f"the loops were closed on another branch at the coordinate of joint {given + 1}"
             yield words, [_branch(given, guess) for guess in guesses]
 
@@ -282,7 +282,7 @@ def _spring_misreadings(model: Model) -> Iterator[tuple[str, Misreading]]:
 
 def _point_misreadings(model: Model) -> Iterator[tuple[str, Misreading]]:
     """Points of joints negated, exchanged, left out, or in other axes."""
-    for k, kind in enumerate(model.kind):
+    for k in range(len(model.kind)):
         far, near = points = model.point[k]
         readings = {
             f"the points of joint {k + 1} in the two bodies were exchanged": (near, far),
@@ -299,15 +299,15 @@ def _point_misreadings(model: Model) -> Iterator[tuple[str, Misreading]]:
             ):
                 pair = (point, near) if side == 0 else (far, point)
                 readings[f"the {where} point of joint {k + 1} {words}"] = pair
-        if kind != "free":
+        if not model.free[k]:
             yield from _different("point", k, points, readings)
 
 
 def _axes_misreadings(model: Model) -> Iterator[tuple[str, Misreading]]:
     """Frames of joints left out, turned the other way, exchanged or misread; axes reversed or exchanged."""
-    for k, kind in enumerate(model.kind):
-        motions = [axis for _, axis in KINDS[kind].motions]
-        if not motions and kind != "weld":
+    for k, kind in enumerate(model.kinds):
+        motions = [axis for _, axis in kind.motions]
+        if kind.has_attitude:
             continue
         far, near = frames = model.turn[k]
         axes = f"the axes of joint {k + 1}"
@@ -327,11 +327,12 @@ def _axes_misreadings(model: Model) -> Iterator[tuple[str, Misreading]]:
         readings[f"{axes} in the two bodies were exchanged"] = near, far
         readings[f"{axes} in the far body were those of the near body"] = near, near
         readings[f"{axes} in the near body were those of the far body"] = far, far
-        for i, j in ((0, 1), (0, 2), (1, 2)) if kind == "universal" else ((0, 2), (1, 2)) if motions else ():
+        pairs = ((0, 2), (1, 2)) if kind.is_about_z else ((0, 1), (0, 2), (1, 2))
+        for i, j in pairs if motions else ():
             half = np.array([0.0, *(np.sqrt(0.5) * (np.eye(3)[i] + np.eye(3)[j]))])
             pair = (quaternion_product(far, half), quaternion_product(near, half))
             readings[f"axes {'xyz'[i]} and {'xyz'[j]} of joint {k + 1} were exchanged"] = pair
-        yield from _different("turn", k, frames, readings, kind == "weld")
+        yield from _different("turn", k, frames, readings, kind.is_rigid)
 
 
 QUATERNIONS: dict[str, Callable[[Array], Array]] = {
@@ -418,7 +419,7 @@ def _has_place(model: Model, name: str) -> Array:
     if name not in JOINT_ELEMENTS:
         return np.ones(1)
     is_idle = name in ("rest", "effort")
-    counts = [len(KINDS[kind].motions) or int(kind == "ball" and not is_idle) for kind in model.kind]
+    counts = [len(kind.motions) or int(kind.is_spherical and not is_idle) for kind in model.kinds]
     return np.asarray(np.arange(2) < np.array(counts)[:, None], float)
 
 

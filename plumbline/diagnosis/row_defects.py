@@ -8,7 +8,7 @@ import numpy as np
 
 from plumbline.diagnosis.joint_prediction import Seen
 from plumbline.diagnosis.misreadings import Misreading
-from plumbline.model.datatypes import KINDS, Array, Model, State
+from plumbline.model.datatypes import Array, Model, State
 from plumbline.model.kinematics import complete_state, rotation_matrix
 from plumbline.truth.rounding_bound_tree import RowChange
 
@@ -22,8 +22,8 @@ def row_defects(model: Model) -> Iterator[tuple[str, Misreading]]:
         Words that complete "behaves as if", and what the engine evaluates.
 
     """
-    for k, kind in enumerate(model.kind):
-        if kind != "free":
+    for k in range(len(model.kind)):
+        if not model.free[k]:
             yield f"the velocity term of joint {k + 1} were missing", _changed(_without_bend(k))
             yield f"joint {k + 1} were left out", _changed(_without_rows(k, np.eye(6)))
             yield from _single_rows(model, k)
@@ -58,8 +58,8 @@ def missing_gammas(model: Model) -> Iterator[tuple[str, Misreading]]:
         Words that complete "behaves as if", and what the engine evaluates.
 
     """
-    for k, kind in enumerate(model.kind):
-        if kind != "free":
+    for k in range(len(model.kind)):
+        if not model.free[k]:
             yield f"γ of the rows of joint {k + 1} were missing", _without_gamma(k)
 
 
@@ -98,7 +98,7 @@ def _without_rows(joint: int, directions: Array) -> RowChange:
 def _single_rows(model: Model, k: int) -> Iterator[tuple[str, Misreading]]:
     """Rows of the table of kinds: of points along axes of several frames, of attitudes about u × w."""
     far, near = model.body[k]
-    kind = KINDS[model.kind[k]]
+    kind = model.kinds[k]
 
     def frames(state: State) -> dict[str, Array]:
         turns = rotation_matrix(complete_state(model, state).p)

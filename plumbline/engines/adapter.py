@@ -12,17 +12,18 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from typing import ClassVar
 
 import numpy as np
 
 from plumbline.engines.answers import check_declarations, check_evaluation, check_record, check_version
 from plumbline.model.datatypes import (
-    KINDS,
     Array,
     BadInput,
     EngineFailure,
     Integrator,
+    JointKind,
     Model,
     State,
     StateQuantities,
@@ -47,19 +48,21 @@ UNSUPPORTED_KINDS = {
     "loads": "the engine refuses models with applied forces, moments and drag, or some of them",
     "integrators": "the engine evaluates states and does not simulate",
 }
+_BALLS: Callable[[JointKind], bool] = attrgetter("is_spherical")
+_TWO_TURNS: Callable[[JointKind], bool] = attrgetter("exchanges_axes")
 # Mechanisms that an adapter may declare as gaps: it is not asked about them, and must not refuse others so.
 MODEL_GAPS: Mapping[str, Callable[[Model], bool]] = {
     "rods": lambda model: bool(np.any(model.rods)),
-    "balls": lambda model: "ball" in model.kind,
+    "balls": lambda model: any(kind.is_spherical for kind in model.kinds),
     "chains": lambda model: model.n > 1,
     "loads": lambda model: model.has_loads or model.has_drag,
     "rotors": lambda model: bool(np.any(model.armature)),
-    "ball elements": lambda model: _has_elements(model, "ball", "armature", "damping", "stiffness"),
-    "ball springs": lambda model: _has_elements(model, "ball", "damping", "stiffness"),
-    "universal springs": lambda model: _has_elements(model, "universal", "stiffness"),
+    "ball elements": lambda model: _has_elements(model, _BALLS, "armature", "damping", "stiffness"),
+    "ball springs": lambda model: _has_elements(model, _BALLS, "damping", "stiffness"),
+    "universal springs": lambda model: _has_elements(model, _TWO_TURNS, "stiffness"),
     "point masses": lambda model: model.lacks_inertia,
     "bodies": lambda model: model.n > 1,
-    "angles": lambda model: any(KINDS[kind].has_attitude for kind in model.kind),
+    "angles": lambda model: any(kind.has_attitude for kind in model.kinds),
 }
 PARTIAL_GAPS = {"bodies", "angles"}  # of some such mechanisms, which the adapter refuses itself
 
@@ -272,8 +275,8 @@ class Adapter(ABC):
             raise
 
 
-def _has_elements(model: Model, kind: str, *elements: str) -> bool:
-    joints = [k for k, own in enumerate(model.kind) if own == kind]
+def _has_elements(model: Model, is_meant: Callable[[JointKind], bool], *elements: str) -> bool:
+    joints = [k for k, kind in enumerate(model.kinds) if is_meant(kind)]
     return any(bool(np.any(getattr(model, element)[joints])) for element in elements)
 
 

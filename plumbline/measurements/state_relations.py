@@ -28,7 +28,7 @@ import numpy as np
 from plumbline.engines.metamorphic_hooks import MetamorphicHooks
 from plumbline.engines.registry import load_adapter
 from plumbline.measurements.relation_result import OPTION_PREFIX, OTHER_FORMULATION_PREFIX, RelationResult
-from plumbline.model.datatypes import KINDS, Array, Model, State, StateQuantities, Unsupported
+from plumbline.model.datatypes import Array, Model, State, StateQuantities, Unsupported
 from plumbline.model.equivalent import (
     BODY_VECTORS,
     WORLD_VECTORS,
@@ -147,8 +147,8 @@ def _halve_forces(answers: StateQuantities) -> dict[str, Array]:
 def _scale_lengths(model: Model, state: State) -> tuple[Model, State]:
     """Lengths × 4 and times × 2."""
     slides = np.zeros((len(model.kind), 2), bool)
-    for k, kind in enumerate(model.kind):
-        slides[k, : len(KINDS[kind].motions)] = [what == "slide" for what, _ in KINDS[kind].motions]
+    for k, kind in enumerate(model.kinds):
+        slides[k, : len(kind.motions)] = [what == "slide" for what, _ in kind.motions]
 
     def of_joint(turn: float, slide: float) -> Array:
         return np.where(slides, slide, turn)

@@ -17,15 +17,23 @@ import numpy as np
 
 from plumbline.model.step_methods import StepMethod
 from plumbline.processes.errors import PlumblineError
+from reference_impl.joint_kinds import BALL as BALL
+from reference_impl.joint_kinds import CYLINDRICAL as CYLINDRICAL
+from reference_impl.joint_kinds import FREE as FREE
+from reference_impl.joint_kinds import HINGE as HINGE
+from reference_impl.joint_kinds import KINDS as KINDS
+from reference_impl.joint_kinds import ROD as ROD
+from reference_impl.joint_kinds import WELD as WELD
+from reference_impl.joint_kinds import AxesKind as AxesKind
+from reference_impl.joint_kinds import JointKind as JointKind
+from reference_impl.joint_kinds import Kind as Kind
 from reference_impl.mechanism import BODY_FIELDS as BODY_FIELDS
 from reference_impl.mechanism import CHAIN_FIELDS as CHAIN_FIELDS
 from reference_impl.mechanism import JOINT_ELEMENTS as JOINT_ELEMENTS
 from reference_impl.mechanism import JOINT_FIELDS as JOINT_FIELDS
-from reference_impl.mechanism import KINDS as KINDS
 from reference_impl.mechanism import SPRING_FIELDS as SPRING_FIELDS
 from reference_impl.mechanism import ZERO_INERTIA as ZERO_INERTIA
 from reference_impl.mechanism import Array as Array
-from reference_impl.mechanism import Kind as Kind
 from reference_impl.mechanism import Mechanism
 
 Model = Mechanism

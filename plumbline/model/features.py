@@ -133,12 +133,14 @@ def _values(model: Model) -> Iterator[_Value]:
 def _joint_values(model: Model, k: int) -> Iterator[tuple[str, str, Index, Array | float]]:
     """Of joint k and the body that it holds in the tree: field, array, index and neutral value."""
     far, near = model.body[k]
-    if far >= 0 or (near and model.kind[k] != "free"):  # another parent: the world, or the body before
+    if far >= 0 or (
+        near and not model.kinds[k].holds_nothing
+    ):  # another parent: the world, or the body before
         yield "parent", "body", (k, 0), -1 if far >= 0 else near - 1
     for side, end in enumerate(("parent", "body")):
         yield f"point of the {end}", "point", (k, side), 0.0
         yield f"axes in the {end}", "turn", (k, side), _IDENTITY
-    if model.kind[k] == "rod" and k < model.n:  # of a closing rod it follows from the state
+    if model.rods[k] and k < model.n:  # of a closing rod it follows from the state
         yield "length", "length", (k,), 1.0
     for name in JOINT_ELEMENTS:
         for i in range(2):

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.polynomial.legendre import legder, leggauss, legvander
 
-from plumbline.model.datatypes import JOINT_ELEMENTS, KINDS, ZERO_INERTIA, Array, Model, Trajectory
+from plumbline.model.datatypes import JOINT_ELEMENTS, ZERO_INERTIA, Array, Model, Trajectory
 from plumbline.model.kinematics import (
     angular_velocity,
     ball_spring_rest,
@@ -379,22 +379,22 @@ def element_energies(model: Model, run: Trajectory, omega: Array) -> ElementEner
             A[:, b] @ rotation_matrix(model.turn[k, 1]),
         )
         relative, turning = far_axes.mT @ near_axes, spin[:, b] - far_spin
-        if model.kind[k] == "ball":
+        if model.kinds[k].is_spherical:
             rest = ball_spring_rest(model, k)
             unloaded = quaternion_product(run.p[:, far], rest) if far >= 0 else np.tile(rest, (len(run.t), 1))
             turn = rotation_vector(quaternion_product(quaternion_conjugate(unloaded), run.p[:, b]))
             pairs = [(0, turn, turning)]
         else:
             pairs = []
-            for i, (what, axis) in enumerate(KINDS[model.kind[k]].motions):
-                along = far_axes[..., axis] if i == 0 or what == "slide" else near_axes[..., axis]
+            turned = 0
+            for i, (what, axis) in enumerate(model.kinds[k].motions):
+                along = near_axes[..., axis] if turned else far_axes[..., axis]
                 if what == "slide":
                     x, rate = _dot(along, d[:, k]), _dot(along, d_rate[:, k] - cross(far_spin, d[:, k]))
                 else:
                     one, two = (axis + 1) % 3, (axis + 2) % 3
-                    kept = (
-                        two if model.kind[k] == "universal" and i == 1 else one
-                    )  # perpendicular to both axes
+                    kept = two if turned else one  # perpendicular to both axes
+                    turned += 1
                     x = np.arctan2(relative[:, two, one], relative[:, kept, kept])
                     known = run.initial_x
                     start = x[0] if known is None or k >= model.n else known[k, i]
@@ -454,18 +454,19 @@ def joint_vector_rates(model: Model, run: Trajectory, omega: Array) -> Array:
 def _across_slides(model: Model, p: Array, omega: Array, d: Array, ddot: Array) -> tuple[Array, Array]:
     """Return d and ḋ (T, N, 3) without their part along slides, and 0 of free bodies."""
     d, ddot = d.copy(), ddot.copy()
-    for k, (kind, far) in enumerate(zip(model.kind, model.body[:, 0], strict=True)):
-        if kind == "free":
+    for k, (kind, far) in enumerate(zip(model.kinds, model.body[:, 0], strict=True)):
+        if kind.holds_nothing:
             d[:, k] = ddot[:, k] = 0.0
-        if not any(what == "slide" for what, _ in KINDS[kind].motions):
+        if not kind.slide_axes:
             continue
-        axis, spin = rotation_matrix(model.turn[k, 0])[:, 2] * np.ones_like(d[:, k]), np.zeros_like(d[:, k])
+        axes, spin = rotation_matrix(model.turn[k, 0]) * np.ones((len(d), 1, 1)), np.zeros_like(d[:, k])
         if far >= 0:
             above = rotation_matrix(p[:, far])
-            axis, spin = np.matvec(above, axis), np.matvec(above, omega[:, far])
+            axes, spin = above @ axes, np.matvec(above, omega[:, far])
         ddot[:, k] -= cross(spin, d[:, k])
-        for y in (d, ddot):
-            y[:, k] -= axis * np.sum(axis * y[:, k], axis=-1, keepdims=True)
+        for axis in (axes[..., i] for i in kind.slide_axes):
+            for y in (d, ddot):
+                y[:, k] -= axis * np.sum(axis * y[:, k], axis=-1, keepdims=True)
     return d, ddot
 
 
@@ -473,13 +474,11 @@ def _turns_freely_about_gravity(model: Model) -> bool:
     """Whether no joint at the world has a moment about the axis along gravity through the origin."""
     along = model.gravity / np.linalg.norm(model.gravity)
     for k in np.flatnonzero(model.body[:, 0] < 0):
-        kind, at = model.kind[k], model.point[k, 0]
-        if kind == "free":
+        kind, at = model.kinds[k], model.point[k, 0]
+        if kind.holds_nothing:
             continue
         axis = rotation_matrix(model.turn[k, 0])[:, 2]
-        turns = kind in ("rod", "ball") or (
-            kind in ("hinge", "cylindrical") and np.linalg.norm(cross(axis, along)) < 1e-14
-        )
+        turns = kind.holds_no_turn or (kind.turn_axes == (2,) and np.linalg.norm(cross(axis, along)) < 1e-14)
         if not turns or np.linalg.norm(cross(at, along)) > 1e-14 * np.linalg.norm(at):
             return False
     return True

@@ -12,7 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from plumbline.model.datatypes import KINDS, Array, Kind, Model, State
+from plumbline.model.datatypes import Array, JointKind, Model, State
 
 _NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])  # of each axis the next and the one after
 
@@ -285,8 +285,8 @@ def forward_kinematics(
     x, xdot = (np.zeros((*omega.shape[:-1], 2)) if given is None else given for given in (x, xdot))
     p, omega = p.copy(), omega.copy()
     A = rotation_matrix(p)  # (..., N, 3, 3)
-    for k, (kind, far) in enumerate(zip(model.kind, model.body[:, 0], strict=True)):
-        if kind == "free":
+    for k, (kind, far) in enumerate(zip(model.kinds, model.body[:, 0], strict=True)):
+        if kind.holds_nothing:
             continue
         above = A[..., far, :, :] if far >= 0 else np.eye(3)
         tip, tip_v, spin = model.point[k, 0], np.zeros(3), np.zeros(3)
@@ -296,7 +296,7 @@ def forward_kinematics(
             tip_v = v[..., far, :] + rotate_vectors(above, swing)
             spin = rotate_vectors(above, omega[..., far, :])
         d, d_rate = model.length[k] * u[..., k, :], model.length[k] * udot[..., k, :]
-        if not KINDS[kind].has_attitude:
+        if not kind.has_attitude:
             (d, relative), (d_rate, turning) = JointFrame(model, k, above).motion(
                 x[..., k, :], xdot[..., k, :]
             )
@@ -318,7 +318,7 @@ class JointFrame:
     """
 
     def __init__(self, model: Model, k: int, above: Array) -> None:
-        self.motions = KINDS[model.kind[k]].motions
+        self.motions = model.kinds[k].motions
         self.turn_far, self.turn_near = model.turn[k]
         self.above = above
 
@@ -409,8 +409,8 @@ def elastic_energy(model: Model, state: State) -> float:
     """
     x = joint_coordinates(model, state)[2]
     energy = np.sum(model.stiffness * (x - model.rest) ** 2)
-    for k, kind in enumerate(model.kind):
-        if kind == "ball" and model.stiffness[k, 0]:
+    for k, kind in enumerate(model.kinds):
+        if kind.is_spherical and model.stiffness[k, 0]:
             rest, (far, near) = ball_spring_rest(model, k), model.body[k]
             turned = quaternion_product(state.p[far], rest) if far >= 0 else rest
             turn = rotation_vector(quaternion_product(quaternion_conjugate(turned), state.p[near]))
@@ -429,7 +429,7 @@ def kinetic_energy_of_rotors(model: Model, state: State) -> float:
     rates = joint_coordinates(model, state)[3]
     energy = np.sum(model.armature * rates**2)
     spin = rotate_vectors(rotation_matrix(state.p), state.omega)
-    for k in [k for k, kind in enumerate(model.kind) if kind == "ball"]:
+    for k in [k for k, kind in enumerate(model.kinds) if kind.is_spherical]:
         far, near = model.body[k]
         relative = spin[near] - (spin[far] if far >= 0 else 0.0)
         energy += model.armature[k, 0] * (relative @ relative - rates[k, 0] ** 2)
@@ -443,17 +443,17 @@ def rate_count(model: Model) -> int:
         Their number: the size of `StateQuantities.mass_matrix`.
 
     """
-    return 3 * int(model.tree.rods.sum()) + sum(map(_own_rate_count, model.tree.kind))
+    return 3 * int(model.tree.rods.sum()) + sum(map(_own_rate_count, model.tree.kinds))
 
 
-def _own_rate_count(kind: Kind) -> int:
+def _own_rate_count(kind: JointKind) -> int:
     """Rates in ν that are a body's own: ω′, (ṙ, ω′) of a free body, else those of its joint."""
-    return 6 if kind == "free" else 3 if KINDS[kind].has_attitude else len(KINDS[kind].motions)
+    return 6 if kind.holds_nothing else 3 if kind.has_attitude else len(kind.motions)
 
 
 def own_rates(model: Model) -> list[slice]:
     """Return where each body's own rates are in ν, behind those of the rods."""
-    first = 3 * int(model.tree.rods.sum()) + np.cumsum([0, *map(_own_rate_count, model.tree.kind)])
+    first = 3 * int(model.tree.rods.sum()) + np.cumsum([0, *map(_own_rate_count, model.tree.kinds)])
     return [slice(int(start), int(end)) for start, end in pairwise(first)]
 
 
@@ -465,9 +465,9 @@ def minimal_rates(model: Model, state: State) -> Array:
 
     """
     model, own = model.tree, list[Array]()
-    for k, kind in enumerate(model.kind):
-        own += [state.v[k]] if kind == "free" else []
-        own += [state.omega[k] if KINDS[kind].has_attitude else state.xdot[k, : len(KINDS[kind].motions)]]
+    for k, kind in enumerate(model.kinds):
+        own += [state.v[k]] if kind.holds_nothing else []
+        own += [state.omega[k] if kind.has_attitude else state.xdot[k, : len(kind.motions)]]
     return np.concatenate([state.udot[model.rods].ravel(), *own])
 
 
@@ -491,8 +491,8 @@ def velocity_jacobian(model: Model, state: State) -> Array:
     a = rotation_matrix(state.p)
     near = cross(model.proximal[:, None, :], a)  # −A s̃ (N, 3, 3), row i: aᵢ·(ω′ × s) = (s × aᵢ)·ω′
     out = np.zeros((*a.shape[:-3], n, 6, rate_count(model)))
-    for k, (kind, far, own) in enumerate(zip(model.kind, model.body[:, 0], own_rates(model), strict=True)):
-        if kind == "free":
+    for k, (kind, far, own) in enumerate(zip(model.kinds, model.body[:, 0], own_rates(model), strict=True)):
+        if kind.holds_nothing:
             out[..., k, :, own] = np.eye(6)
             continue
         # velocity of the near point, angular velocity, world
@@ -501,11 +501,11 @@ def velocity_jacobian(model: Model, state: State) -> Array:
         if far >= 0:
             tip = out[..., far, :3, :] + cross(model.point[k, 0], above) @ out[..., far, 3:, :]
             spin = above @ out[..., far, 3:, :]
-        if kind == "rod":
+        if kind.holds_distance:
             at, u = 3 * int(np.searchsorted(rods, k)), state.u[..., k, :]
             across = np.eye(3) - u[..., :, None] * u[..., None, :]
             tip[..., at : at + 3] = model.length[k] * across
-        if KINDS[kind].has_attitude:
+        if kind.has_attitude:
             out[..., k, 3:, own] = np.eye(3)
         else:
             joint, x = JointFrame(model, k, above), state.x[..., k, :]
@@ -535,8 +535,8 @@ def mass_matrix(model: Model, state: State) -> Array:
     out = np.sum(model.mass[:, None, None] * (linear.mT @ linear), axis=-3)
     out += np.sum(angular.mT @ model.inertia @ angular, axis=-3)
     for k, own in enumerate(own_rates(model) if np.any(model.armature) else ()):
-        if model.kind[k] != "ball":
-            for i in range(len(KINDS[model.kind[k]].motions)):
+        if not model.kinds[k].is_spherical:
+            for i in range(len(model.kinds[k].motions)):
                 out[..., own.start + i, own.start + i] += model.armature[k, i]
         elif model.armature[k, 0]:
             a, far = rotation_matrix(state.p), model.body[k, 0]
@@ -597,11 +597,11 @@ def coordinates_of_joints(
             for i, point in zip((far, near), model.point[k], strict=True)
         ]
         rate = ends[1] - ends[0]
-        if model.kind[k] == "rod":
+        if model.kinds[k].holds_distance:
             u[at] = d[k] / np.linalg.norm(d[k])
             udot[at] = (rate - u[at] * (u[at] @ rate)) / model.length[k]
             continue
-        motions = KINDS[model.kind[k]].motions
+        motions = model.kinds[k].motions
         frame = rotation_matrix(model.turn[k, 0]).T @ above.T
         relative = frame @ a[near] @ rotation_matrix(model.turn[k, 1])
         x[at, : len(motions)] = _coordinates(motions, frame @ d[k], relative)

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from plumbline.model.datatypes import (
     BODY_FIELDS,
     JOINT_FIELDS,
-    KINDS,
     ZERO_INERTIA,
     Array,
     Model,
@@ -215,11 +214,11 @@ def displaced(model: Model, state: State, step: Array) -> State:
     p, r, x, u = state.p.copy(), state.r.copy(), state.x.copy(), state.u.copy()
     u[model.rods] += step[: 3 * int(model.rods.sum())].reshape(-1, 3)
     u[model.rods] /= np.linalg.norm(u[model.rods], axis=1, keepdims=True)
-    for k, (kind, own) in enumerate(zip(model.kind, own_rates(model), strict=True)):
+    for k, (kind, own) in enumerate(zip(model.kinds, own_rates(model), strict=True)):
         change = step[own]
-        if kind == "free":
+        if kind.holds_nothing:
             r[k] += change[:3]
-        if KINDS[kind].has_attitude:
+        if kind.has_attitude:
             p[k] = quaternion_product(p[k], np.concatenate([[1.0], change[-3:] / 2]))
             p[k] /= np.linalg.norm(p[k])
         else:
@@ -243,11 +242,11 @@ def with_rates(model: Model, state: State, rates: Array) -> State:
     u = state.u[model.rods]
     swing = rates[: 3 * int(model.rods.sum())].reshape(-1, 3)
     udot[model.rods] = swing - u * np.sum(u * swing, axis=1, keepdims=True)
-    for k, (kind, own) in enumerate(zip(model.kind, own_rates(model), strict=True)):
+    for k, (kind, own) in enumerate(zip(model.kinds, own_rates(model), strict=True)):
         value = rates[own]
-        if kind == "free":
+        if kind.holds_nothing:
             v[k] = value[:3]
-        if KINDS[kind].has_attitude:
+        if kind.has_attitude:
             omega[k] = value[-3:]
         else:
             xdot[k, : len(value)] = value
@@ -373,7 +372,7 @@ def immovable_joints(model: Model, state: State) -> list[int]:
     if size := float(np.linalg.norm(step)):
         nearby = closed_pose(cut, displaced(cut.model, there, np.asarray(NEARBY * step / size)))
         is_still &= _joints_at_rest(cut, nearby, allowed_rates(cut, nearby))
-    return [k for k, at in enumerate(cut.place) if is_still[at] and model.kind[k] != "weld"]
+    return [k for k, at in enumerate(cut.place) if is_still[at] and not model.kinds[k].is_rigid]
 
 
 def _joints_at_rest(cut: CutMechanism, state: State, rates: Array) -> NDArray[np.bool_]:

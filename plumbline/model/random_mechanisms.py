@@ -9,7 +9,18 @@ from typing import Any
 
 import numpy as np
 
-from plumbline.model.datatypes import JOINT_ELEMENTS, KINDS, Array, Kind, Model, State
+from plumbline.model.datatypes import (
+    BALL,
+    FREE,
+    HINGE,
+    JOINT_ELEMENTS,
+    KINDS,
+    WELD,
+    Array,
+    Kind,
+    Model,
+    State,
+)
 from plumbline.model.features import Place, Role
 from plumbline.model.kinematics import (
     complete_state,
@@ -21,7 +32,7 @@ from plumbline.model.loops import assembled, cut_open
 from plumbline.model.sampling import random_states
 
 ELEMENTS = ("armature", "damping", "stiffness", "effort", "springs")
-LOOP_KINDS: tuple[Kind, ...] = ("rod", "ball", "hinge", "universal", "slide", "cylindrical")
+LOOP_KINDS = tuple(name for name, kind in KINDS.items() if not (kind.holds_nothing or kind.is_rigid))
 SPRINGS = 4  # between points
 MIN_FIRST_SINGULAR_VALUE = 5e-2  # of the unit rows of a new loop's mechanism: away from singular poses
 
@@ -63,8 +74,8 @@ def random_tree(
         while path[-1] >= 0:
             path.append(far[path[-1]])
         far.append(int(rng.choice(path)))
-        fitting = [kind for kind in kinds if kind != ("free" if far[k] >= 0 else "weld")]
-        chosen.append(fitting[rng.integers(len(fitting))] if fitting else "hinge")
+        fitting = [kind for kind in kinds if kind != (FREE if far[k] >= 0 else WELD)]
+        chosen.append(fitting[rng.integers(len(fitting))] if fitting else HINGE)
     bare = _with_numbers(rng, chosen, far, loads)
     return with_elements(rng, bare, elements) if elements else bare
 
@@ -77,7 +88,7 @@ def _with_numbers(
     mass = 10 ** rng.uniform(-0.5, 0.5, n)
     inertia = random_inertias(rng, mass)
     point = 0.3 * rng.normal(size=(n, 2, 3))
-    point[[kind == "free" for kind in chosen]] = 0
+    point[[KINDS[kind].holds_nothing for kind in chosen]] = 0
     return Model(
         mass=mass,
         inertia=inertia,
@@ -85,7 +96,7 @@ def _with_numbers(
         body=np.stack([np.array(far), np.arange(n)], axis=1),
         point=point,
         turn=_unit(rng.normal(size=(n, 2, 4))),
-        length=np.where([kind == "rod" for kind in chosen], rng.uniform(0.2, 1.0, n), 0.0),
+        length=np.where([KINDS[kind].holds_distance for kind in chosen], rng.uniform(0.2, 1.0, n), 0.0),
         gravity=np.array([0.7, -0.4, -9.7]),
         force=loads * rng.normal(size=(n, 3)),
         moment=loads * 0.3 * rng.normal(size=(n, 3)),
@@ -105,8 +116,8 @@ def with_elements(rng: np.random.Generator, model: Model, elements: Sequence[str
 
     """
     n, count, fields = model.n, len(model.kind), dict[str, Any]()
-    scalar = np.array([[i < len(KINDS[kind].motions) for i in range(2)] for kind in model.kind])
-    balls = np.array([[kind == "ball", False] for kind in model.kind])
+    scalar = np.array([[i < len(kind.motions) for i in range(2)] for kind in model.kinds])
+    balls = np.array([[kind.is_spherical, False] for kind in model.kinds])
     for name in ("armature", "damping", "stiffness"):
         if name in elements:
             fields[name] = rng.uniform(0.1, 2.0, (count, 2)) * (scalar | balls)
@@ -152,7 +163,7 @@ def close_loop(
             axes = quaternion_product(axes, np.array([np.cos(half), *(np.sin(half) * np.eye(3)[axis])]))
         else:
             point = point + rng.normal() * rotation_matrix(axes)[:, axis]
-    if kind == "rod":
+    if KINDS[kind].holds_distance:
         step = rng.normal(size=3)
         point, length = point + step, float(np.linalg.norm(step))
     if far >= 0:
@@ -196,7 +207,7 @@ def random_loop_mechanism(
             path = {near}
             while (above := int(model.body[min(path), 0])) >= 0 and rng.random() < 0.7:
                 path.add(above)
-            world = [] if kind == "weld" else [-1]
+            world = [] if KINDS[kind].is_rigid else [-1]
             ends = [*world, *(b for b in range(n) if b not in path and b != model.body[near, 0])]
             if not ends:
                 break
@@ -243,40 +254,40 @@ def mechanism_with_places(
     """
     for attempt in count():
         rng = np.random.default_rng([seed, attempt])
-        world = _Node("weld")
+        world = _Node(WELD)
         shuffled = [places[i] for i in rng.permutation(len(places))]
         wanted: dict[Role, list[Kind]] = {"single": [], "beside": [], "loop": [], "closing": []}
         for kind, role in shuffled:
             wanted[role].append(kind)
-        is_base_free = "free" in wanted["single"]
-        singles = [kind for kind in wanted["single"] if kind != "free"]
+        is_base_free = FREE in wanted["single"]
+        singles = [kind for kind in wanted["single"] if kind != FREE]
         base = (
-            world.attach(["free" if is_base_free else "ball"])
+            world.attach([FREE if is_base_free else BALL])
             if singles or is_base_free or not is_hub_world
             else world
         )
         last = base.attach(singles)
-        if last is world and "weld" in (*wanted["beside"], *wanted["closing"], *wanted["loop"]):
-            last = world.attach(["ball"])
+        if last is world and WELD in (*wanted["beside"], *wanted["closing"], *wanted["loop"]):
+            last = world.attach([BALL])
         hub = world if is_hub_world else last
         for kind in wanted["beside"]:
-            (world if kind == "free" else last if kind == "weld" else hub).attach([kind])
+            (world if kind == FREE else last if kind == WELD else hub).attach([kind])
         if len(hub.children) == 1 and wanted["beside"]:
-            hub.attach(["hinge"])
+            hub.attach([HINGE])
         rings: list[tuple[_Node, _Node, Kind]] = []
         if wanted["loop"] and not wanted["closing"]:
-            wanted["closing"] = ["ball"]
+            wanted["closing"] = [BALL]
         for i, closing in enumerate(wanted["closing"]):
             own = wanted["loop"][i :: len(wanted["closing"])]
-            foot = world if "free" in own or (rng.random() < 0.5 and not is_base_free) else hub
-            if closing == "weld" and foot is world:
+            foot = world if FREE in own or (rng.random() < 0.5 and not is_base_free) else hub
+            if closing == WELD and foot is world:
                 foot = last
             freedom = sum(_freedom(kind) for kind in own)
             while freedom < 6 - _freedom(closing) + 2:
-                own.insert(int(rng.integers(len(own) + 1)), "ball")
+                own.insert(int(rng.integers(len(own) + 1)), BALL)
                 freedom += 3
-            own.sort(key=lambda kind: (kind != "free", kind == "weld"))  # free bodies first, welds last
-            rings.append((foot, (world if "free" in own else foot).attach(own), closing))
+            own.sort(key=lambda kind: (kind != FREE, kind == WELD))  # free bodies first, welds last
+            rings.append((foot, (world if FREE in own else foot).attach(own), closing))
         kinds, far = list[Kind](), list[int]()
         _number(world, kinds, far)
         model = _with_numbers(rng, kinds, far)

@@ -25,10 +25,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plumbline.model.datatypes import (
+    BALL,
     BODY_FIELDS,
+    CYLINDRICAL,
+    FREE,
+    HINGE,
     JOINT_ELEMENTS,
     JOINT_FIELDS,
     KINDS,
+    ROD,
     SPRING_FIELDS,
     Kind,
     Model,
@@ -43,8 +48,10 @@ from plumbline.model.kinematics import (
     spring_vectors,
 )
 
-# of the cylindrical joints in their place
-ADDED_MOTIONS: dict[Kind, tuple[int, ...]] = {"hinge": (0,), "slide": (1,), "weld": (0, 1)}
+_CYLINDER = KINDS[CYLINDRICAL].motions
+HELD_KINDS = tuple(  # made of cylindrical joints by holding some of their motions
+    name for name, kind in KINDS.items() if not kind.has_attitude and {*kind.motions} < {*_CYLINDER}
+)
 EXCHANGE = np.array([0.0, 1.0, 1.0, 0.0]) / np.sqrt(2)  # half a turn that exchanges x and y
 
 
@@ -65,9 +72,9 @@ class Rearranged:
             for k, value in enumerate(getattr(state, name)):
                 place = self.joint[k]
                 if 0 <= place < self.model.n:
-                    is_universal = self.model.kind[place] == "universal" and name.startswith("x")
+                    is_swapped = self.model.kinds[place].exchanges_axes and name.startswith("x")
                     if self.is_reversed[k]:
-                        value = -value[::-1] if is_universal else -value
+                        value = -value[::-1] if is_swapped else -value
                     values[place] = value
             fields[name] = values
         return complete_state(self.model, State(**fields))
@@ -77,8 +84,8 @@ def moved_root(model: Model) -> Rearranged | None:
     """Make the last body of the first branch the root, a free body.
 
     Returns:
-        The same mechanism; None where the root's joint has elements, or there is no other body to be the root
-        of a free one.
+        The same mechanism; None where the root's joint has elements, a joint cannot be reversed, or there is
+        no other body to be the root of a free one.
 
     """
     n, far = model.n, model.body[: model.n, 0]
@@ -87,7 +94,7 @@ def moved_root(model: Model) -> Rearranged | None:
     while far[path[-1]] >= 0:
         path.append(int(far[path[-1]]))
     root = path[-1]
-    is_free = model.kind[root] == "free"
+    is_free = model.free[root]
     if any(np.any(getattr(model, name)[root]) for name in JOINT_ELEMENTS) or (is_free and last == root):
         return None
     above = far.copy()
@@ -101,6 +108,8 @@ def moved_root(model: Model) -> Rearranged | None:
     for k in path[:-1]:
         joint[k], is_reversed[k] = place[far[k]], True
     joint[root] = -1 if is_free else count
+    if not all(kind.is_reversible for kind, flip in zip(model.kinds, is_reversed, strict=True) if flip):
+        return None
     return _rearranged(model, joint, is_reversed, place)
 
 
@@ -111,7 +120,7 @@ def rods_taken_out(model: Model) -> Rearranged:
         The mechanism without rods.
 
     """
-    n, is_rod = model.n, np.array([kind == "rod" for kind in model.kind])
+    n, is_rod = model.n, model.rods
     place = np.argsort(_depth_first(np.where(is_rod[:n], -1, model.body[:n, 0])))
     closing = n + np.cumsum(~is_rod[n:]) - 1
     joint = np.where(is_rod, -1, np.concatenate([place, closing]))
@@ -138,14 +147,14 @@ def _rearranged(
     world = np.append(place, -1)  # the world is −1 in both
     for to in range(max(model.n, int(np.max(joint)) + 1)):
         if to not in sources:
-            free = ("free", [-1, to], np.zeros((2, 3)), np.tile([1.0, 0, 0, 0], (2, 1)), 0.0)
+            free = (FREE, [-1, to], np.zeros((2, 3)), np.tile([1.0, 0, 0, 0], (2, 1)), 0.0)
             for name, value in zip(JOINT_FIELDS, (*free, *np.zeros((5, 2))), strict=True):
                 fields[name].append(value)
             continue
         k = sources[to]
         flip = -1 if is_reversed[k] else 1
         turn, swap = model.turn[k][::flip], slice(None)
-        if is_reversed[k] and model.kind[k] == "universal":  # its axes x and y change places
+        if is_reversed[k] and model.kinds[k].exchanges_axes:  # its axes x and y change places
             turn, swap = quaternion_product(turn, EXCHANGE), slice(None, None, -1)
         fields["kind"].append(model.kind[k])
         fields["body"].append(world[model.body[k]][::flip])
@@ -172,10 +181,19 @@ def joints_as_cylinders(model: Model) -> Model:
         The tree, whose joints have motions in addition.
 
     """
-    kinds: list[Kind] = ["cylindrical" if kind in ADDED_MOTIONS else kind for kind in model.kind]
-    turns = _are_hinges(model)
-    elements: dict[str, Any] = {name: _exchanged(getattr(model, name), turns) for name in JOINT_ELEMENTS}
-    return replace(model, kind=tuple(kinds), **elements)
+    kinds = tuple(CYLINDRICAL if kind in HELD_KINDS else kind for kind in model.kind)
+    elements: dict[str, Any] = {name: _of_cylinders(model, getattr(model, name)) for name in JOINT_ELEMENTS}
+    return replace(model, kind=kinds, **elements)
+
+
+def added_motions(model: Model) -> list[tuple[int, ...]]:
+    """List the coordinates that each joint has in addition where it is a cylindrical one."""
+    return [
+        tuple(i for i, motion in enumerate(_CYLINDER) if motion not in kind.motions)
+        if name in HELD_KINDS
+        else ()
+        for name, kind in zip(model.kind, model.kinds, strict=True)
+    ]
 
 
 def state_of_cylinders(model: Model, cylinders: Model, state: State) -> State:
@@ -190,20 +208,18 @@ def state_of_cylinders(model: Model, cylinders: Model, state: State) -> State:
         The same state; the coordinates that joints have in addition are zero.
 
     """
-    own = np.ones((model.n, 2))
-    for k, kind in enumerate(model.kind):
-        own[k, ADDED_MOTIONS.get(kind, ())] = 0.0
-    x, xdot = (own * _exchanged(values, _are_hinges(model)) for values in (state.x, state.xdot))
+    x, xdot = (_of_cylinders(model, values) for values in (state.x, state.xdot))
     return complete_state(cylinders, replace(state, x=x, xdot=xdot))
 
 
-def _are_hinges(model: Model) -> NDArray[np.bool_]:
-    return np.array([[kind == "hinge"] for kind in model.kind])
-
-
-def _exchanged(values: NDArray[np.float64], rows: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Exchange the two columns of some rows: a cylindrical joint's turn is its second coordinate."""
-    return np.where(rows, values[:, ::-1], values)
+def _of_cylinders(model: Model, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Numbers of coordinates in the columns of those of cylindrical joints, zeros of added ones."""
+    found = values.copy()
+    for k, kind in enumerate(model.kinds):
+        if model.kind[k] in HELD_KINDS:
+            found[k] = 0.0
+            found[k, [_CYLINDER.index(motion) for motion in kind.motions]] = values[k, : len(kind.motions)]
+    return found
 
 
 def joints_as_rods(model: Model) -> Model:
@@ -221,15 +237,15 @@ def joints_as_rods(model: Model) -> Model:
     body, point, kind = [], [], list[Kind](model.kind)
     for k in chosen:
         axes = rotation_matrix(model.turn[k]).mT * size  # [side, axis]: a vector in that side's body
-        for one, other in KINDS[model.kind[k]].rows[3:]:
+        for one, other in model.kinds[k].rows[3:]:
             ends = np.array([axes[0, "xyz".index(one)], axes[1, "XYZ".index(other)]])
             body.append(model.body[k])
             point.append(model.point[k] + ends)
-        kind[k] = "ball"
+        kind[k] = BALL
     if not chosen:
         return model
     new = len(body)
-    kind += ["rod"] * new
+    kind += [ROD] * new
     identity = np.tile([1.0, 0.0, 0.0, 0.0], (new, 2, 1))
     elements = {name: np.concatenate([getattr(model, name), np.zeros((new, 2))]) for name in JOINT_ELEMENTS}
     return replace(
@@ -244,9 +260,9 @@ def joints_as_rods(model: Model) -> Model:
 
 
 def _is_ball_and_rows(model: Model, k: int) -> bool:
-    rows = KINDS[model.kind[k]].rows
+    kind = model.kinds[k]
     has_elements = any(np.any(getattr(model, name)[k]) for name in JOINT_ELEMENTS)
-    return rows[:3] == KINDS["ball"].rows and len(rows) > 3 and not has_elements
+    return kind.holds_points and not kind.is_spherical and not has_elements
 
 
 def state_of_balls(model: Model, state: State) -> State:
@@ -256,7 +272,7 @@ def state_of_balls(model: Model, state: State) -> State:
         model: that mechanism.
 
     """
-    has_coordinates = np.array([not KINDS[kind].has_attitude for kind in model.kind[: model.n]])[:, None]
+    has_coordinates = np.array([not kind.has_attitude for kind in model.kinds[: model.n]])[:, None]
     x, xdot = (np.where(has_coordinates, values, 0.0) for values in (state.x, state.xdot))
     return complete_state(model, replace(state, x=x, xdot=xdot))
 
@@ -270,7 +286,7 @@ def inertia_as_rotors(model: Model) -> Model:
     """
     inertia, armature = model.inertia.copy(), model.armature.copy()
     for k in range(model.n):
-        if model.kind[k] == "hinge" and model.body[k, 0] < 0:
+        if model.kind[k] == HINGE and model.body[k, 0] < 0:
             second = np.trace(inertia[k]) / 2 * np.eye(3) - inertia[k]  # moments of the mass, ∫ x xᵀ dm
             part = float(np.linalg.eigvalsh(second)[0])
             z = rotation_matrix(model.turn[k, 1])[:, 2]
@@ -292,7 +308,7 @@ def springs_as_loads(model: Model, state: State) -> Model:
 
     """
     effort, stiffness, damping = model.effort.copy(), model.stiffness.copy(), model.damping.copy()
-    scalar = np.array([kind != "ball" for kind in model.kind[: model.n]])[:, None]
+    scalar = np.array([not kind.is_spherical for kind in model.kinds[: model.n]])[:, None]
     pull = -stiffness[: model.n] * (state.x - model.rest[: model.n]) - damping[: model.n] * state.xdot
     effort[: model.n] += np.where(scalar, pull, 0.0)
     for values in (stiffness, damping):

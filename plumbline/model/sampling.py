@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from plumbline.model.datatypes import KINDS, Model, State
+from plumbline.model.datatypes import Model, State
 from plumbline.model.kinematics import cross, forward_kinematics, rate_count
 from plumbline.model.loops import (
     closed_pose,
@@ -84,11 +84,11 @@ def random_states(model: Model, count: int, seed: int) -> list[State]:
     p /= np.linalg.norm(p, axis=-1, keepdims=True)
     u /= np.linalg.norm(u, axis=-1, keepdims=True)
     u, udot = (np.where(model.rods[:, None], x, 0.0) for x in (u, cross(udot, u)))
-    free = np.array([kind == "free" for kind in model.kind])[:, None]
+    free = model.free[:, None]
     x, xdot, r, v = (np.zeros((count, model.n, size)) for size in (2, 2, 3, 3))
-    for k in range(count if set(model.kind) - {"rod", "ball"} else 0):
-        for i, kind in enumerate(model.kind):
-            for j, (motion, _) in enumerate(KINDS[kind].motions):
+    for k in range(count if not all(kind.holds_no_turn for kind in model.kinds) else 0):
+        for i, kind in enumerate(model.kinds):
+            for j, (motion, _) in enumerate(kind.motions):
                 x[k, i, j] = rng.uniform(-3, 3) if motion == "turn" else rng.normal()
         spread = own_rate * 10 ** rng.uniform(-1.0, np.log10(4.0))
         xdot[k] = spread * rng.normal(size=xdot[k].shape)

@@ -16,7 +16,7 @@ from typing import Any, overload
 
 import numpy as np
 
-from plumbline.model.datatypes import KINDS
+from plumbline.model.datatypes import BALL, FREE, KINDS, ROD, WELD
 from plumbline.model.features import ROLES, Place
 from plumbline.model.random_mechanisms import (
     ELEMENTS,
@@ -37,7 +37,7 @@ MOTION_MOMENT = 0.02  # moments of loads and drag in a random motion, over those
 MOTION_PREFIX = "random-motion-"
 MECHANISM_PREFIX = "random-mechanism-"
 PLACES = [
-    Place(kind, role) for role in ROLES for kind in KINDS if (kind, role) != ("free", "closing")
+    Place(kind, role) for role in ROLES for kind in KINDS if (kind, role) != (FREE, "closing")
 ]  # of joints in random mechanisms
 MAX_PLACES = 12  # of a random mechanism; it has a few joints more
 MAX_LOOP_BODIES = 8  # of random mechanisms with loops
@@ -175,7 +175,7 @@ def random_mechanism(seed: int, index: int) -> Scenario:
         n = model.n
     elif index % 4 == 1:
         n = int(np.clip(1 + rng.geometric(0.3), 2, MAX_LOOP_BODIES))
-        closing = (*LOOP_KINDS, "weld")
+        closing = (*LOOP_KINDS, WELD)
         count = 1 if n < 4 else int(rng.integers(1, 3))
         chosen = [closing[i] for i in rng.integers(len(closing), size=count)]
         model, state = random_loop_mechanism(own, n, chosen, tuple(KINDS), elements)
@@ -241,11 +241,11 @@ def _random_body(
         "proximal": (0.3 * rng.normal(size=3)).tolist(),
         "attitude": {"quaternion": rng.normal(size=4).tolist()},
         "angular_velocity": (rate * rng.normal(size=3)).tolist(),
-        "joint": {"kind": "ball"},
+        "joint": {"kind": BALL},
     }
     if rng.random() < 0.4:
         found["joint"] = {
-            "kind": "rod",
+            "kind": ROD,
             "length": 10 ** rng.uniform(-1.0, 0.3),
             "direction": rng.normal(size=3).tolist(),
             "angular_velocity": (rate * rng.normal(size=3)).tolist(),
@@ -316,7 +316,7 @@ def _set_zeros(rng: np.random.Generator, body: dict[str, Any]) -> None:
             body[name] = np.where(kept, body[name], 0.0).tolist()
     if rng.random() < 0.3:
         body["angular_velocity"] = [0.0, 0.0, 0.0]
-    if body["joint"]["kind"] == "rod":
+    if body["joint"]["kind"] == ROD:
         axis = np.eye(3)[rng.integers(3)] * rng.choice([-1.0, 1.0])
         body["joint"] |= {"direction": axis.tolist()}
         if rng.random() < 0.3:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from plumbline.model.datatypes import JOINT_ELEMENTS, Array, Model, State
+from plumbline.model.datatypes import FREE, JOINT_ELEMENTS, KINDS, Array, Model, State
 from plumbline.model.kinematics import (
     own_rates,
     quaternion_product,
@@ -376,7 +376,7 @@ def _written_places(document: Document) -> Iterator[tuple[PathKey, ...]]:
 
 def _is_free(item: dict[str, Any]) -> bool:
     joint = item.get("joint")
-    return isinstance(joint, dict) and joint.get("kind") == "free"
+    return isinstance(joint, dict) and joint.get("kind") == FREE
 
 
 def _resolve_parents(source: YamlSource, document: Document, bodies: list[Body]) -> list[int]:
@@ -402,7 +402,7 @@ def _resolve_parents(source: YamlSource, document: Document, bodies: list[Body])
 def _parent_of(bodies: list[Body], k: int, far: list[int]) -> tuple[int, str, str, str]:
     """The parent of body k, or a field, what is wrong with it, and what would be valid."""
     body, names = bodies[k], [body.name for body in bodies]
-    parent = -1 if body.parent == "world" or body.joint.kind == "free" else k - 1
+    parent = -1 if body.parent == "world" or body.joint.kind == FREE else k - 1
     if body.parent not in (None, "world"):
         given, earlier = repr(body.parent), [i for i, name in enumerate(names[:k]) if name == body.parent]
         if not earlier:
@@ -419,7 +419,7 @@ def _parent_of(bodies: list[Body], k: int, far: list[int]) -> tuple[int, str, st
         if parent not in branch:
             valid = f"this body inside the branch of {given}: the bodies of a branch follow each other"
             return -1, "parent", f"is {given}, whose branch ended above", valid
-    if body.joint.kind == "weld" and parent < 0:
+    if KINDS[body.joint.kind].is_rigid and parent < 0:
         return (
             parent,
             "joint",
@@ -456,7 +456,7 @@ def _resolve_closes(source: YamlSource, document: Document, bodies: list[Body]) 
             valid = "the name of a body"
             if side and not message and found[k, 0] == found[k, 1]:
                 message, valid = f"is {name!r} like the parent", "two different bodies"
-            if side and not message and joint.joint.kind == "weld" and found[k, 0] < 0:
+            if side and not message and KINDS[joint.joint.kind].is_rigid and found[k, 0] < 0:
                 message, valid = f"is {name!r}, welded to the world, where it never moves", "another joint"
             if message:
                 problems.append(source.problem(("closes", k, ("parent", "body")[side]), message, valid))
@@ -554,7 +554,7 @@ def _joint_turns(joint: Any) -> tuple[Array, Array]:
 def _build_model(
     document: Document, bodies: list[Body], far: list[int], spring_body: NDArray[np.intp]
 ) -> Model:
-    free = np.array([body.joint.kind == "free" for body in bodies])
+    free = np.array([body.joint.kind == FREE for body in bodies])
     points = [[_far_point(bodies, k, far[k]), body.proximal] for k, body in enumerate(bodies)]
     return Model(
         kind=tuple(body.joint.kind for body in bodies),

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from plumbline.model.datatypes import JOINT_ELEMENTS, KINDS, Model, State
+from plumbline.model.datatypes import JOINT_ELEMENTS, Model, State
 
 
 def mechanism_document(model: Model, state: State) -> dict[str, Any]:
@@ -55,7 +55,7 @@ def _name(body: int) -> str:
 
 
 def _body(model: Model, state: State, k: int) -> dict[str, Any]:
-    kind, joint = model.kind[k], _joint(model, k)
+    kind, joint = model.kinds[k], _joint(model, k)
     found: dict[str, Any] = {
         "name": _name(k),
         "mass": float(model.mass[k]),
@@ -63,18 +63,18 @@ def _body(model: Model, state: State, k: int) -> dict[str, Any]:
         "joint": joint,
         "proximal": model.point[k, 1].tolist(),
     }
-    if kind == "free":
+    if kind.holds_nothing:
         joint |= {"position": (state.r[k]).tolist(), "velocity": state.v[k].tolist()}
     else:
         found |= {"parent": _name(int(model.body[k, 0])), "anchor": model.point[k, 0].tolist()}
-    if kind == "rod":
+    if kind.holds_distance:
         spin = np.cross(state.u[k], state.udot[k])
         joint |= {"direction": state.u[k].tolist(), "angular_velocity": spin.tolist()}
-    if KINDS[kind].has_attitude:
+    if kind.has_attitude:
         found["attitude"] = {"quaternion": state.p[k].tolist()}
         found["angular_velocity"] = state.omega[k].tolist()
-    elif KINDS[kind].motions:
-        count = len(KINDS[kind].motions)
+    elif kind.motions:
+        count = len(kind.motions)
         joint |= {"coordinates": state.x[k, :count].tolist(), "rates": state.xdot[k, :count].tolist()}
     if np.any(model.force[k]) or np.any(model.moment[k]):
         found["load"] = {"force": model.force[k].tolist(), "moment": model.moment[k].tolist()}
@@ -85,16 +85,15 @@ def _body(model: Model, state: State, k: int) -> dict[str, Any]:
 
 def _joint(model: Model, k: int) -> dict[str, Any]:
     """The joint without what depends on the state."""
-    kind = model.kind[k]
-    found: dict[str, Any] = {"kind": kind}
-    if kind == "rod":
+    kind = model.kinds[k]
+    found: dict[str, Any] = {"kind": model.kind[k]}
+    if kind.holds_distance:
         found["length"] = float(model.length[k])
-    elif not KINDS[kind].has_attitude:
+    elif not kind.has_attitude:
         frames = ({"quaternion": turn.tolist()} for turn in model.turn[k])
         found |= zip(("frame", "body_frame"), frames, strict=True)
-    count = 1 if kind == "ball" else len(KINDS[kind].motions)
     for name in JOINT_ELEMENTS:
-        values = getattr(model, name)[k, :count]
+        values = getattr(model, name)[k, : kind.element_count]
         if np.any(values):
             found[name] = values.tolist()
     if "stiffness" not in found:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import sys
 import unicodedata
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self, get_args
 
 import numpy as np
 from annotated_types import Len
@@ -28,7 +28,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from plumbline.model.datatypes import JOINT_ELEMENTS, KINDS, Array
+from plumbline.model.datatypes import FREE, JOINT_ELEMENTS, KINDS, Array, AxesKind
 from plumbline.model.kinematics import quaternion_product, rotation_matrix
 
 SCHEMA_VERSION = 1
@@ -320,7 +320,7 @@ class JointElements(SchemaModel):
         kind = info.data.get("kind")
         if value is None or kind is None:
             return value
-        count = 1 if kind == "ball" else len(KINDS[kind].motions)
+        count = KINDS[kind].element_count
         if not count:
             raise invalid_value_error(f"is given for a {kind} joint, which does not move", "nothing")
         if len(value) != count:
@@ -401,15 +401,14 @@ class Rod(SchemaModel):
 
 
 class Articulated(JointElements):
-    """A joint with axes: `hinge`, `universal`, `slide`, `cylindrical` or `weld`.
+    """A joint with axes in both bodies.
 
     Its axes x, y, z are fixed in the parent by `frame` and in the body by `body_frame`; at coordinates 0 both
-    coincide.  A hinge turns about z, a slide moves along z, a cylindrical joint does both (slide first), a
-    universal joint turns about x of the parent and then about y of the body, a weld does nothing.
+    coincide.  A second motion is about or along the axes as the first has left them.
     """
 
-    kind: Literal["hinge", "universal", "slide", "cylindrical", "weld"] = _field(
-        "`hinge`, `universal`, `slide`, `cylindrical` or `weld`."
+    kind: AxesKind = _field(
+        "; ".join(f"`{kind}`: {KINDS[kind].description}" for kind in get_args(AxesKind)) + "."
     )
     axis: Vector | None = _field(
         "z of the joint's axes in the parent's frame, parallel to the body's at coordinates 0. Of any length "
@@ -424,8 +423,7 @@ class Articulated(JointElements):
         "Attitude of the joint's axes in the body's frame. Absent: as in the parent's.", default=None
     )
     coordinates: list[float] | None = _field(
-        "At t = 0 the angle [rad] of a hinge, the shift [m] of a slide, both of a cylindrical joint (shift "
-        "first), the two angles of a universal joint. Absent: 0.",
+        "At t = 0, in the order of the motions: angles [rad] of turns, shifts [m] of slides. Absent: 0.",
         default=None,
     )
     rates: list[float] | None = _field(
@@ -456,7 +454,7 @@ class Articulated(JointElements):
     def _check_axes(self) -> Articulated:
         if self.axis is not None and (self.frame is not None or self.body_frame is not None):
             raise invalid_value_error("gives axis and a frame", "one of them")
-        if self.axis is not None and self.kind in ("universal", "weld"):
+        if self.axis is not None and not KINDS[self.kind].is_about_z:
             raise invalid_value_error(f"gives an axis to a {self.kind} joint", "`frame` and `body_frame`")
         return self
 
@@ -558,7 +556,7 @@ class Body(SchemaModel):
     @classmethod
     def _check_parent(cls, value: str | None, info: ValidationInfo) -> str | None:
         joint = info.data.get("joint")
-        if joint is not None and joint.kind == "free" and value not in (None, "world"):
+        if joint is not None and joint.kind == FREE and value not in (None, "world"):
             raise invalid_value_error("is given for a free body", "no parent, or `world`")
         return value
 
@@ -587,7 +585,7 @@ class BodySequence(SchemaModel):
     @field_validator("cycle")
     @classmethod
     def _check_cycle(cls, value: list[Body]) -> list[Body]:
-        if any(body.parent is not None or body.joint.kind in ("free", "weld") for body in value):
+        if any(body.parent is not None or not (6 > len(KINDS[body.joint.kind].rows) > 0) for body in value):
             raise invalid_value_error(
                 "has a parent, a weld or a free body", "bodies whose parent is the one before"
             )

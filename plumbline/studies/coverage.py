@@ -9,7 +9,7 @@ import pyarrow as pa
 
 from plumbline.judging.coverage import COVERED_LEVELS, CoverageEntry, scenario_coverage
 from plumbline.judging.rows import Level, Row
-from plumbline.model.datatypes import CHAIN_FIELDS
+from plumbline.model.datatypes import BALL, CHAIN_FIELDS, ROD
 from plumbline.model.sampling import compared_states
 from plumbline.processes.cpu_time import CpuTimes
 from plumbline.processes.errors import PlumblineError
@@ -156,7 +156,7 @@ def blind_spots(entries: Iterable[CoverageEntry]) -> list[str]:
     seen: dict[tuple[str, ...], bool] = {}
     for entry in entries:
         place = "body" if entry.body else "gravity"
-        if entry.joint in ("rod", "ball") and entry.kind in _CHAIN_KINDS:
+        if entry.joint in (ROD, BALL) and entry.kind in _CHAIN_KINDS:
             place = "first body" if entry.body == 1 else "later body"
         key = entry.level, entry.parameter, place, entry.joint
         counts = entry.is_seen and (entry.scale == abs(entry.value) or entry.unit == "rad")

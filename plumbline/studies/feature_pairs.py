@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from plumbline.model.datatypes import KINDS, Model, State
+from plumbline.model.datatypes import FREE, KINDS, Model, State
 from plumbline.model.features import ROLES, Feature, Place, features, without_feature
 from plumbline.model.kinematics import complete_state
 from plumbline.model.random_mechanisms import mechanism_with_places
@@ -57,8 +57,8 @@ def legal_pairs(size: int = EXAMPLE_PLACES) -> set[Pair]:
             by themselves, as one alone on the world excludes others.
 
     """
-    places = sorted(legal_places(), key=lambda place: (place.kind != "free", place.role != "single"))
-    free = sum(place.kind == "free" for place in places)
+    places = sorted(legal_places(), key=lambda place: (place.kind != FREE, place.role != "single"))
+    free = sum(place.kind == FREE for place in places)
     groups = [places[:1], places[1:free], *(places[i : i + size] for i in range(free, len(places), size))]
     found = set[Pair]()
     for one, other in itertools.combinations_with_replacement(groups, 2):

@@ -1,0 +1,52 @@
+"""Joint kinds are named in their table alone; other files ask its entries what a joint does."""
+
+import ast
+import re
+
+import pytest
+
+from reference_impl.joint_kinds import KINDS
+from tests.architecture.test_layers import MODULES
+
+OWN_TABLES = r"""
+    reference_impl\.joint_kinds      # the table
+    | plumbline\.truth\.enclosure_(file|checker)  # certificates are checked without the code that made them
+    | plumbline\.(importers|model_files|cli)\..*  # elementary joints of robots' files; --base free
+    | plumbline\.storage\.results_store  # the base of a model file
+    | adapters\..* | bench\..*
+"""
+REPLACED = r"""
+    plumbline\.truth\.(
+        taylor_tree | link_tree | step_comparison | rounding_bound_tree | parameter_effects | parameters
+        | tendon_equalities | element_terms | enclosure | closed_form\..*
+    )
+"""
+OTHER_MEANINGS = {"slide": "a motion", "hinge": "a family of scenarios"}
+FILES = [
+    name
+    for name in MODULES
+    if name.split(".")[0] != "reports" and not re.fullmatch(f"{OWN_TABLES} | {REPLACED}", name, re.VERBOSE)
+]
+
+
+def kinds_named(tree):
+    """Words of kinds that stand as text by themselves, but in types."""
+    types = [node for node in ast.walk(tree) if isinstance(node, ast.Subscript)]
+    literals = [node for node in types if isinstance(node.value, ast.Name) and node.value.id == "Literal"]
+    in_types = {id(constant) for node in literals for constant in ast.walk(node)}
+    texts = [node for node in ast.walk(tree) if isinstance(node, ast.Constant) and id(node) not in in_types]
+    return {node.value for node in texts if node.value in KINDS.keys() - OTHER_MEANINGS.keys()}
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_file_names_no_joint_kind(name):
+    tree = ast.parse(MODULES[name].read_text(encoding="utf-8"))
+    assert not kinds_named(tree), "ask the entry of the table what the joint does"
+
+
+@pytest.mark.parametrize(
+    "text", ['kind == "ball"', 'kind in {"rod", "free"}', '{"cylindrical": 1}', 'f(x, "weld")']
+)
+def test_a_named_kind_is_found(text):
+    assert kinds_named(ast.parse(text))
+    assert not kinds_named(ast.parse('kind: Literal["ball"] = "a ball joint"'))
