@@ -10,9 +10,9 @@ roundings.  Each kind is propagated through the inverse of the system, and the r
     tJ  joint-space engines: the terms of M q̈ + h, as torque pairs at the joints
     d   accumulation of accelerations and forces along the chain
 
-A fifth part tX, for rods held as differences of positions, changed no worst ratio in 1,500 random chains
-(masses over 1e±3, rods of 1e-5 … 1e-2 m, needles, tiny inertias, long levers) and is left out: tJ is above
-it.  Without tJ joint-space engines exceed the bound by 1e7, without tS maximal coordinates by 1e4 (needles).
+Arms that an engine finds as differences of positions are off by a rounding of these: terms of tB count a
+share of the position too, which is the larger one where it is above 32 arms (rods of 100 m and more).
+Without tJ joint-space engines exceed the bound by 1e7, without tS maximal coordinates by 1e4 (needles).
 
 Every part is homogeneous in each unit, so the ratio of the bound to its quantity's scale does not change when
 lengths, masses or times are measured in other units.  World frame throughout: A ω̇′ has the norm of ω̇′.
@@ -30,7 +30,7 @@ from plumbline.model.datatypes import Array, Model, State
 from plumbline.model.kinematics import cross, cross_matrix, rotate_vectors, rotation_matrix
 from plumbline.model.welding import BodyParts, part_offsets
 from plumbline.processes.workers import Pickled
-from plumbline.truth.rounding_bound_tree import tree_tolerances
+from plumbline.truth.rounding_bound_tree import POSITION_SHARE, tree_tolerances
 
 EPS = 2.0**-53
 ROUNDING_FACTOR = 64  # state quantities; the worst error of a sound engine is about a sixth of it (tests)
@@ -154,6 +154,9 @@ def state_rounding_bound(model: Model, state: State, parts: BodyParts | None = N
             terms.sd * terms.F_next,
             terms.torque,
             terms.arm * terms.weld,
+            terms.place * terms.F,
+            terms.place * terms.F_next,
+            POSITION_SHARE * m * np.linalg.norm(state.v, axis=1) ** 2,
         ],
         0,
     )
@@ -172,10 +175,11 @@ def state_rounding_bound(model: Model, state: State, parts: BodyParts | None = N
     rod_torque += np.where(model.rods, joints.torque[model.rods.sum() :], 0.0)
 
     rate, speed = joints.is_below.T @ joints.rate, joints.D.T @ joints.rate
+    with_place = np.maximum(speed, terms.place * rate)
     lever = np.cumsum(terms.sp + model.length) + _from_previous(np.cumsum(terms.sd))
-    kinetic = float(0.5 * np.sum(m * speed**2 + J * rate**2))
+    kinetic = float(0.5 * np.sum(m * speed * with_place + J * rate**2))
     potential = float(g * np.sum(m * lever))
-    momentum = float(np.sum(m * lever * speed + J * rate))
+    momentum = float(np.sum(m * lever * with_place + J * rate))
     mass_entry = float(np.max(joints.mass_matrix))
     return RoundingBound(
         acceleration=total[:, 0],
@@ -223,6 +227,7 @@ class _TermSizes:
         self.m, self.g, self.J = model.mass, float(norm(model.gravity)), norm(model.inertia, axis=(1, 2))
         vectors = system.acceleration, system.alpha, system.omega, system.F, system.sp, system.sd
         self.a, self.alpha, self.omega, self.F, self.sp, self.sd = (norm(x, axis=1) for x in vectors)
+        self.place = POSITION_SHARE * norm(state.r, axis=1)
         self.load, self.torque = norm(system.load, axis=1), norm(system.torque, axis=1)
         self.lightest, self.least_inertia = self.m, np.linalg.eigvalsh(model.inertia)[:, 0]
         self.arm = self.weld = np.zeros(n)  # lever and force of the weld
@@ -247,7 +252,10 @@ class _TermSizes:
 
     def joint(self) -> Array:
         """Largest term of each joint's acceleration equation [m/s²]."""
-        near, far = (np.max([self.a, s * self.alpha, s * self.omega * self.W], 0) for s in (self.sp, self.sd))
+        near, far = (
+            np.max([self.a, s * self.alpha, s * self.omega * self.W], 0)
+            for s in (np.maximum(self.sp, self.place), self.sd)
+        )
         return np.asarray(np.max([near, _from_previous(far), self.centripetal_rod], 0))
 
     def elimination(self) -> Array:

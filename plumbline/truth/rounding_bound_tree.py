@@ -36,6 +36,8 @@ from plumbline.model.kinematics import (
 from plumbline.model.loops import cut_open, smallest_singular_value, wrench_length
 from plumbline.truth.element_terms import joint_elements, spring_terms
 
+POSITION_SHARE = 1 / 32  # positions are rounded once or twice, where the bound counts 64 roundings of a term
+
 EndRows = Literal["accelerations", "twists", "without velocity terms"]
 RowChange = Callable[[int, Array, Array], tuple[Array, Array]]
 
@@ -226,6 +228,8 @@ class _TreeTerms:
         self.g, self.m, self.J = float(norm(model.gravity)), model.mass, norm(model.inertia, axis=(1, 2))
         self.a, self.alpha, self.F, self.moment = norm(self.solution, axis=-1)
         self.arm, self.reach = norm(self.near, axis=1), norm(self.far_arm, axis=1) + norm(self.d, axis=1)
+        # arms that are differences of positions far from the origin, which some engines use
+        self.place = POSITION_SHARE * norm(self.state.r, axis=1)
         own = norm(self.omega, axis=1) + norm(self.state.udot, axis=1) + norm(self.state.xdot, axis=1)
         # largest rate of any body or joint between the world and here, per body
         self.W = np.max(np.where(self.below.T, own, 0.0), axis=1)
@@ -274,10 +278,13 @@ class _TreeTerms:
             self.arm * self.F,
             self.torque_size,
             self.moment,
+            self.place * self.F,
+            self.place * self.F_children,
         ]
         far_a, far_alpha = self.of_far(self.a), self.of_far(self.alpha)
         linear = [self.a, self.arm * self.alpha, self.arm * self.W**2, far_a, self.reach * far_alpha,
-                  self.reach * self.W**2, self.W * self.slide_rate]  # fmt: skip
+                  self.reach * self.W**2, self.W * self.slide_rate,
+                  self.place * self.alpha, self.place * self.W**2]  # fmt: skip
         angular = [self.alpha, far_alpha, self.W**2]
         sizes = (weights, [*moments, self.moment_children], linear, angular)
         force, moment, linear_size, angular_size = (np.max(terms, 0) for terms in sizes)
@@ -513,15 +520,16 @@ def _tolerances(t: _TreeTerms) -> tuple[Array, dict[str, Array | float], dict[st
     total += np.stack([swing + t.a + t.transport, turning, t.below @ carried, carried_moment], 1)
 
     rate, speed = joints.turns.T @ joints.rate, joints.lever.T @ joints.rate
+    with_place = np.maximum(speed, t.place * rate)
     steps = np.linalg.norm(model.point, axis=2).sum(1) + np.linalg.norm(t.d, axis=1)
     steps += np.linalg.norm(state.r, axis=1) * [kind == "free" for kind in model.kind]
     height = t.below.T @ steps
     sums = {
-        "kinetic_energy": float(0.5 * np.sum(t.m * speed**2 + t.J * rate**2))
+        "kinetic_energy": float(0.5 * np.sum(t.m * speed * with_place + t.J * rate**2))
         + sum(element.kinetic for element in t.elements),
         "potential_energy": float(t.g * np.sum(t.m * height))
         + sum((element.potential for element in t.elements), t.springs.potential),
-        "angular_momentum": float(np.sum(t.m * height * speed + t.J * rate)),
+        "angular_momentum": float(np.sum(t.m * height * with_place + t.J * rate)),
         "mass_matrix": float(np.max(joints.mass_matrix, initial=0.0)),
     }
     scale: dict[str, Array | float] = {

@@ -11,9 +11,9 @@ import pytest
 from plumbline.engines.registry import ENGINES, load_adapter
 from plumbline.model.datatypes import Unsupported
 from plumbline.model.kinematics import rotation_matrix, state_from_minimal
-from plumbline.model.sampling import random_states
+from plumbline.model.sampling import compared_states, random_states
 from plumbline.model.welding import split_bodies, undivided_bodies
-from plumbline.scenario.loader import find_scenario_file, load_scenario
+from plumbline.scenario.loader import find_scenario_file, load_scenario, scenario_from_dict
 from plumbline.truth.rounding_bound import (
     EPS,
     MAX_RELATIVE_BOUND,
@@ -22,6 +22,7 @@ from plumbline.truth.rounding_bound import (
     RoundingBound,
     state_rounding_bound,
 )
+from plumbline.truth.rounding_bound_tree import POSITION_SHARE
 from tests.helpers.random_chains import in_other_units, norms_per_body, random_chain
 
 VECTORS = ("acceleration", "angular_acceleration", "joint_reaction")
@@ -36,7 +37,9 @@ def error_ratios(reported, true, bound):
             continue
         difference = np.asarray(value) - np.asarray(expected)
         size = (
-            norms_per_body(difference) if quantity in (*VECTORS, "angular_momentum") else np.abs(difference)
+            norms_per_body(difference)
+            if quantity in (*VECTORS, "joint_moment", "angular_momentum")
+            else np.abs(difference)
         )
         tolerance = np.maximum(bound.tolerance(quantity), np.finfo(float).tiny)
         ratios[quantity] = float(np.max(size / tolerance))
@@ -118,6 +121,44 @@ def check_errors_within_bound(name, count):
     print(name, checks, {quantity: f"{ratio:.3f}" for quantity, ratio in worst.items()})
     assert checks > count
     assert max(worst.values()) < 0.5, worst
+
+
+BALL = {"kind": "ball"}
+HINGE = {"kind": "hinge", "axis": [0, 1, 0]}
+UPRIGHT = {"attitude": {"quaternion": [1, 0, 0, 0]}}
+FAR = {  # the joint of the first body, its other fields, and the joint of the second one
+    "rod of a kilometre": ({"kind": "rod", "length": 1e3, "direction": [0.3, 0, -1]}, UPRIGHT, BALL, UPRIGHT),
+    "rod of a megametre": ({"kind": "rod", "length": 1e6, "direction": [0.3, 0, -1]}, UPRIGHT, BALL, UPRIGHT),
+    "ten kilometres away": (HINGE, {"parent": "world", "anchor": [1e4, 0, 0]}, {"kind": "universal"}, {}),
+}
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "pinocchio", "pinocchio-maximal", "exudyn-tree"])
+@pytest.mark.parametrize("case", FAR)
+def test_positions_far_from_the_origin_lose_digits_of_arms_within_the_bound(case, engine):
+    """An arm that an engine finds as a difference of positions is off by a rounding of these."""
+    pytest.importorskip("flint")
+    from plumbline.truth.certified import certify_state
+
+    inertia = {"six": [0.021, 0.034, 0.042, 0.004, -0.003, 0.005]}
+    joint, more, second, its = FAR[case]
+    bodies = [
+        {
+            "mass": 1.3,
+            "inertia": inertia,
+            "joint": joint,
+            "proximal": [0.05, -0.08, 0.17],
+            "distal": [0.1, 0, -0.2],
+        }
+        | more,
+        {"mass": 0.7, "inertia": inertia, "joint": second, "proximal": [0, 0.1, 0.2]} | its,
+    ]
+    content = {"schema_version": 1, "family": "own", "title": "t", "purpose": "p", "bodies": bodies}
+    s, adapter = scenario_from_dict(content, "far"), load_adapter(engine)
+    for state in compared_states(s.model, s.state, "far", 12):
+        true, bound = certify_state(s.model, state).quantities, state_rounding_bound(s.model, state)
+        ratios = error_ratios(adapter.evaluate(s.model, [state])[0], true, bound)
+        assert max(ratios.values()) < 1, ratios
 
 
 def test_a_real_loss_of_digits_exceeds_the_bound():
@@ -364,8 +405,9 @@ class BoundByDefinition:
         for k in range(n):
             force.append(max(m[k] * a[k], m[k] * g, F[k], after[k], load[k]))
             terms = [J[k] * alpha[k], J[k] * rate[k] * W[k], sp[k] * F[k], sd[k] * after[k], torque[k]]
-            moment.append(max(*terms, arm[k] * weld[k]))
-            joint.append(max(a[k], sp[k] * alpha[k], sp[k] * rate[k] * W[k]))
+            place, square = POSITION_SHARE * size(state.r[k]), POSITION_SHARE * m[k] * state.v[k] @ state.v[k]
+            moment.append(max(*terms, arm[k] * weld[k], place * F[k], place * after[k], square))
+            joint.append(max(a[k], max(sp[k], place) * alpha[k], max(sp[k], place) * rate[k] * W[k]))
             if k:
                 i = k - 1
                 joint[k] = max(joint[k], a[i], sd[i] * alpha[i], sd[i] * rate[i] * W[i])
@@ -410,11 +452,12 @@ class BoundByDefinition:
         tolerance = ROUNDING_FACTOR * EPS * total
 
         speed, spin = (sum(x[i] * spd[i] for i in D) for x in (D, below))
+        with_place = np.maximum(speed, POSITION_SHARE * np.linalg.norm(state.r, axis=1) * spin)
         lever = np.cumsum(np.add(sp, model.length)) + [sum(sd[:k]) for k in range(n)]
         scalars = {
-            "kinetic_energy": 0.5 * np.sum(m * speed**2 + J * spin**2),
+            "kinetic_energy": 0.5 * np.sum(m * speed * with_place + J * spin**2),
             "potential_energy": g * np.sum(m * lever),
-            "angular_momentum": np.sum(m * lever * speed + J * spin),
+            "angular_momentum": np.sum(m * lever * with_place + J * spin),
             "mass_matrix": max(matrix.values()),
         }
         scale = {
