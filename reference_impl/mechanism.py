@@ -174,7 +174,7 @@ class Mechanism:
     @property
     def n(self) -> int:
         """Number of bodies."""
-        return len(self.mass)
+        return int(self.mass.shape[-1])
 
     @property
     def kinds(self) -> tuple[JointKind, ...]:

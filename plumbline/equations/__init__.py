@@ -1,5 +1,5 @@
 """The equations of motion of every mechanism, once, in several kinds of numbers.
 
 `tree.Tree` evaluates them over an `Arithmetic` (`arithmetic`): doubles or long doubles in a batch, balls
-(`balls`).  Nothing here asks whether a mechanism is a chain or a tree.
+(`balls`), jets (`jets`).  Nothing here asks whether a mechanism is a chain or a tree.
 """

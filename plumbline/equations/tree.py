@@ -343,10 +343,9 @@ class Tree:
             unit = num.vector(np.eye(3)[number])
             axis = num.mul(A, unit)
             effort, armature = num.scalar(0.0), None
-            if any(np.any(getattr(model, name)[..., k, i]) for name in elements):
-                a, d, stiffness, rest, push = (
-                    num.scalar(getattr(model, name)[..., k, i]) for name in elements
-                )
+            numbers = [getattr(model, name)[..., k, i] for name in elements]
+            if any(map(np.any, numbers)):
+                a, d, stiffness, rest, push = map(num.scalar, numbers)
                 stretch = x - rest
                 effort, armature = push - stiffness * stretch - d * rate, a
                 self._kinetic = self._kinetic + a * rate * rate / 2
@@ -376,7 +375,7 @@ class Tree:
         """Moment of spring and damper of a joint with all turns, and its rotor; None where there is none."""
         num, model = self.num, self.model
         numbers = [getattr(model, name)[..., k, 0] for name in ("armature", "damping", "stiffness")]
-        if not any(np.any(x) for x in numbers):
+        if not any(map(np.any, numbers)):
             return None, None
         a, damping, stiffness = (num.scalar(x) for x in numbers)
         effort = -spin * damping
@@ -527,6 +526,27 @@ class Tree:
             swing = num.widened(num.cross(w, num.cross(w, s)), a)
             acceleration.append(a + num.mul(num.cross_matrix(s), alpha) - swing)
         return Solution(acceleration, turning, forces, moments, rates)
+
+    def quantities(self, solution: Solution) -> dict[str, Any]:
+        """Return the state quantities but the mass matrix, by name: of those per body a list.
+
+        Accelerations, forces and moments are in world axes, angular accelerations in those of their bodies.
+        """
+        kinetic, potential, momentum = self.totals()
+        return {
+            "acceleration": solution.acceleration,
+            "angular_acceleration": self.in_bodies(solution.turning),
+            "joint_reaction": solution.force,
+            "joint_moment": [self.zero if moment is None else moment for moment in solution.moment],
+            "kinetic_energy": kinetic,
+            "potential_energy": potential,
+            "angular_momentum": momentum,
+        }
+
+    def in_bodies(self, vectors: Sequence[Any]) -> list[Any]:
+        """Turn a vector of each body from world axes to the body's."""
+        num = self.num
+        return [num.mul(num.transpose(A), x) for A, x in zip(self.A, vectors, strict=True)]
 
     def _carry(self, k: int, x: Articulated, far: Articulated) -> Articulated:
         """Add to the far body what joint k and all beyond need of it."""

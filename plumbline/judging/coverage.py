@@ -31,20 +31,18 @@ from plumbline.model.invariants import (
 )
 from plumbline.model.kinematics import angular_velocity, with_joint_coordinates
 from plumbline.model.step_methods import classical_runge_kutta
-from plumbline.truth.parameter_effects import (
+from plumbline.truth.parameter_effects import difference_effects, effects_at_states
+from plumbline.truth.parameters import STATE_KINDS, Parameter, list_parameters, perturb
+from plumbline.truth.perturbed_motions import (
     MOTION_MISTAKE,
     AccurateMotion,
     PerturbedMotion,
-    StateSensitivity,
     accurate_motion,
     accurate_runs,
-    difference_effects,
-    effects_at_states,
     perturbed_motions,
     resolved_motions,
 )
-from plumbline.truth.parameters import STATE_KINDS, Parameter, list_parameters, perturb
-from plumbline.truth.rounding_bound import EPS, state_rounding_bound
+from plumbline.truth.rounding_bound import EPS, remembered_rounding_bound
 from plumbline.truth.sensitivity import project_to_manifold
 from plumbline.truth.step_comparison import FormulaSteps
 
@@ -65,18 +63,6 @@ STEP_METHOD = classical_runge_kutta("joint rotations", free_coordinates="rigid m
 _PLACES: dict[str, str] = {
     "state": "at every compared state",
     "step": "at every state that a compared step starts from",
-}
-_TERMS = {  # the term of the equations of motion that contains a parameter, by kind
-    "gravity": "m g",
-    "mass": "m (r̈ − g)",
-    "inertia": "J ω̇′ + ω′ × J ω′",
-    "proximal": "s × F and ω̇ × s + ω × (ω × s)",
-    "distal": "s × F and ω̇ × s + ω × (ω × s)",
-    "length": "ℓ |u̇|²",
-    "force": "the force",
-    "moment": "the moment",
-    "drag_force": "c ṙ",
-    "drag_moment": "c ω′",
 }
 
 
@@ -228,17 +214,17 @@ def _state_ratios(
     of_state = [i for i, one in enumerate(parameters) if one.kind in STATE_KINDS]
     ratios = {quantity: _Ratios(len(parameters)) for quantity in STATE_UNITS}
     effects_of_model = effects_at_states(model, states, [parameters[i] for i in of_model])
-    of_initial = difference_effects(
-        model, states[:1], [parameters[i] for i in of_state] if is_initial_first else []
-    )
+    of_initial = effects_at_states(model, states[:1], [parameters[i] for i in of_state])
     for number, state in enumerate(states):
-        bounds = state_rounding_bound(model, state)
+        bounds = remembered_rounding_bound(model, state)
         found = [(of_model, effects_of_model[number])]
         if number == 0 and is_initial_first:
             found.append((of_state, of_initial[0]))
         for indices, effects in found:
             for quantity, effect in effects.items():
-                bound = np.maximum(np.asarray(bounds.tolerance(quantity)), TINY)
+                if (tolerance := getattr(bounds, quantity)) is None:
+                    continue
+                bound = np.maximum(np.asarray(tolerance), TINY)
                 with np.errstate(over="ignore"):  # a bound of zero, as that of the energy at rest
                     worst = np.max(effect / bound, axis=1)
                 for i, value in zip(indices, worst, strict=True):
@@ -547,12 +533,7 @@ def _proofs(
     model: Model, states: Sequence[State], parameters: Sequence[Parameter], by_engine: Mapping[str, _Ratios],
     level: Level,
 ) -> dict[int, str]:  # fmt: skip
-    """Why parameters that are not seen cannot be seen, by index; those without a reason are left out.
-
-    The equations are linear in each parameter and in the joint forces at given accelerations. Where a
-    parameter's term vanishes, or joint forces alone take it up, the true accelerations solve the equations
-    with the mistake too, however large it is; along a whole motion, the true motion does.
-    """
+    """Why parameters that are not seen cannot be seen, by index; those without a reason are left out."""
     found = {}
     if level == "invariants":
         found = {
@@ -564,26 +545,8 @@ def _proofs(
     of_state = np.array([one.kind in STATE_KINDS for one in parameters])
     if level == "state":
         found = _vanishing(model, states[:1], parameters, of_state & (ratio <= 1 / MAX_MISTAKE), level)
-    if not model.is_chain:
-        blunt = ratio <= 1 / (MAX_MISTAKE if level == "state" else DOUBTFUL_MISTAKE)
-        return found | _vanishing(model, states, parameters, blunt & ~of_state, level)
-    unseen = [int(i) for i in np.flatnonzero((ratio <= 1 / DOUBTFUL_MISTAKE) & ~of_state)]
-    if not unseen:
-        return found
-    where = _PLACES.get(level, "along the whole motion")
-    some = [parameters[i] for i in unseen]
-    terms, pull = np.zeros(len(unseen)), np.zeros(len(unseen))  # largest, over what they could be
-    for state in states:
-        sensitivity = StateSensitivity(model, state)
-        own, moved = _relative_terms(sensitivity, some)
-        terms, pull = np.maximum(terms, own), np.maximum(pull, moved)
-    for k, i in enumerate(unseen):
-        term = _TERMS[parameters[i].kind]
-        if terms[k] <= NO_EFFECT:
-            found[i] = f"its term in the equations of motion, {term}, is zero {where}"
-        elif pull[k] <= NO_EFFECT and level != "state":
-            found[i] = f"joint forces alone take up its term, {term}, {where}: no acceleration changes"
-    return found
+    blunt = ratio <= 1 / (MAX_MISTAKE if level == "state" else DOUBTFUL_MISTAKE)
+    return found | _vanishing(model, states, parameters, blunt & ~of_state, level)
 
 
 def _uncompared_initial_state(parameters: Sequence[Parameter]) -> dict[int, str]:
@@ -626,27 +589,9 @@ def _vanishing(
 
 def _natural_sizes(model: Model, state: State, level: Level) -> dict[str, Array]:
     """What a change must pass to count, by quantity: bounds, or fractions of the accelerations."""
-    bounds = state_rounding_bound(model, state)
+    bounds = remembered_rounding_bound(model, state)
     if level == "state":
         names = [name for name in STATE_UNITS if getattr(bounds, name) is not None]
         return {name: np.maximum(np.asarray(bounds.tolerance(name)), TINY) for name in names}
     names = ["acceleration", "angular_acceleration"]
     return {name: MAX_MISTAKE * NO_EFFECT * np.max(np.asarray(bounds.scale[name])) for name in names}
-
-
-def _relative_terms(sensitivity: StateSensitivity, parameters: Sequence[Parameter]) -> tuple[Array, Array]:
-    """Of each parameter (P,) its terms, and the accelerations that they cause, over natural sizes."""
-    model, system, norm = sensitivity.model, sensitivity.system, np.linalg.norm
-    g = float(norm(model.gravity))
-    a, alpha = np.maximum(norm(system.acceleration, axis=1), g), norm(system.alpha, axis=1)
-    force = model.mass * a + norm(system.F, axis=1) + TINY
-    span = np.sqrt(np.trace(model.inertia, axis1=1, axis2=2) / (2 * model.mass))
-    span = np.max([span, norm(model.proximal, axis=1), norm(model.distal, axis=1)], axis=0)
-    natural = np.stack([force, span * force, a + TINY], axis=1)  # of the three kinds of rows
-    scale = np.array([one.scale for one in parameters])
-    rows = np.array([sensitivity.terms(one) for one in parameters]).reshape(-1, model.n, 3, 3)
-    terms = np.max(norm(rows, axis=-1) / natural, axis=(1, 2)) * scale
-    moved = sensitivity.effects(parameters)
-    turning = np.maximum(alpha, a / span) + TINY
-    pull = [moved["acceleration"] / (a + TINY), moved["angular_acceleration"] / turning]
-    return terms, np.max(pull, axis=(0, 2)) * scale

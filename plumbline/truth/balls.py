@@ -186,24 +186,11 @@ def tree_quantities(tree: Tree, solution: Solution) -> dict[str, Any]:
         By quantity, as `plumbline.truth.certified.enclose_quantities`, without mass matrix and scales.
 
     """
-    kinetic, potential, momentum = tree.totals()
-
-    def in_body(vectors: list[Any]) -> list[list[Any]]:
-        return [entries(A.transpose() * x) for A, x in zip(tree.A, vectors, strict=True)]
-
-    return {
-        "acceleration": [entries(a) for a in solution.acceleration],
-        "angular_acceleration": in_body(solution.turning),
-        "joint_reaction": [entries(f) for f in solution.force],
-        "joint_moment": [entries(tree.zero if m is None else m) for m in solution.moment],
-        "kinetic_energy": [kinetic],
-        "potential_energy": [potential],
-        "angular_momentum": entries(momentum),
-        "r": [entries(r) for r in tree.r],
-        "v": [entries(v) for v in tree.v],
-        "attitude": [entries(A) for A in tree.A],
-        "angular_velocity": in_body(tree.w),
-    }
+    vectors = tree.quantities(solution)
+    found: dict[str, Any] = {name: [vectors.pop(name)] for name in ("kinetic_energy", "potential_energy")}
+    found["angular_momentum"] = entries(vectors.pop("angular_momentum"))
+    vectors |= {"r": tree.r, "v": tree.v, "attitude": tree.A, "angular_velocity": tree.in_bodies(tree.w)}
+    return found | {name: [entries(x) for x in each] for name, each in vectors.items()}
 
 
 def quantity_scales(c: Any, balls: dict[str, Any]) -> dict[str, float]:

@@ -210,77 +210,116 @@ def perturb(model: Model, state: State, parameter: Parameter, size: float) -> tu
         The changed model, and the changed state of the same minimal coordinates.
 
     """
-    change = size * parameter.scale
-    if parameter.kind in STATE_KINDS:
-        return model, _perturb_state(model, state, parameter, change)
-    changed = perturb_model(model, parameter, size)
-    return changed, complete_state(changed, state)
+    model = perturb_model(model, parameter, size)
+    if parameter.kind not in STATE_KINDS:
+        return model, complete_state(model, state)
+    rate, k = derivative(model, state, parameter), parameter.body
+    fields = {
+        name: value + size * parameter.scale * rate.get(name, 0.0) for name, value in vars(state).items()
+    }
+    if parameter.kind == "attitude":
+        fields["p"][k] /= np.linalg.norm(fields["p"][k])
+    if parameter.kind == "direction":
+        u, udot = fields["u"], fields["udot"]
+        u[k] /= np.linalg.norm(u[k])
+        udot[k] -= (udot[k] @ u[k]) * u[k]
+    return model, complete_state(model, State(**fields))
 
 
 def perturb_model(model: Model, parameter: Parameter, size: float) -> Model:
-    """Change one parameter of a model.
+    """Change one parameter of a model; those of a state leave it as it is.
 
     Args:
-        parameter: of `list_parameters` for this model, not of the state.
+        parameter: of `list_parameters` for this model.
         size: the change, as a fraction of the parameter's scale.
 
     """
-    kind, k, change = parameter.kind, parameter.body, size * parameter.scale
-    field = {"anchor": "point", "frame": "turn", "body_frame": "turn"}.get(kind, kind)
-    array = getattr(model, field).copy()
-    if kind == "gravity":
-        array[AXES.index(parameter.entry)] += change
-    elif kind == "inertia":
-        i, j = INERTIA_ENTRIES[parameter.entry]
-        array[k, i, j] += change
-        array[k, j, i] = array[k, i, j]
-    elif field == "turn":
+    if parameter.kind in STATE_KINDS:
+        return model
+    ((name, rate),) = _model_derivative(model, parameter).items()
+    value = getattr(model, name) + size * parameter.scale * rate
+    if name == "turn":
+        value[parameter.body] /= np.linalg.norm(value[parameter.body], axis=-1, keepdims=True)
+    return model.changed(**{name: value})
+
+
+def derivative(model: Model, state: State, parameter: Parameter) -> dict[str, Array]:
+    """Differentiate the fields of a model and its state by a parameter.
+
+    Args:
+        state: a state of it, of which the minimal coordinates count.
+        parameter: of `list_parameters` for this model.
+
+    Returns:
+        By the name of the field an array of its shape, per unit of the parameter; the other fields keep
+        their values, but for positions and velocities that follow from the minimal coordinates.
+
+    """
+    kind, k = parameter.kind, parameter.body
+    if kind not in STATE_KINDS:
+        return _model_derivative(model, parameter)
+    if kind in ("coordinate", "rate"):
+        name = "x" if kind == "coordinate" else "xdot"
+        return {name: _unit(getattr(state, name), k, _column(model, parameter))}
+    i = AXES.index(parameter.entry)
+    if kind == "attitude":
+        return {"p": _placed(state.p, _turning(state.p[k], i), k)}
+    if kind in _FIELDS:
+        return {_FIELDS[kind]: _unit(state.r, k, i)}
+    axis = rod_axes(state.u[k])[i]
+    if kind == "rod_rate":
+        return {"udot": _placed(state.udot, axis, k)}
+    return {name: _placed(x, np.cross(axis, x[k]), k) for name, x in (("u", state.u), ("udot", state.udot))}
+
+
+_FIELDS = {  # where they are not named as the kind
+    "proximal": "point", "distal": "point", "anchor": "point", "frame": "turn", "body_frame": "turn",
+    "omega": "omega", "position": "r", "velocity": "v",
+}  # fmt: skip
+
+
+def _model_derivative(model: Model, parameter: Parameter) -> dict[str, Array]:
+    """As `derivative`, of a parameter of the model."""
+    kind, k, entry = parameter.kind, parameter.body, parameter.entry
+    name = _FIELDS.get(kind, kind)
+    array = getattr(model, name)
+    if kind == "inertia":
+        i, j = INERTIA_ENTRIES[entry]
+        return {name: np.maximum(_unit(array, k, i, j), _unit(array, k, j, i))}
+    if name == "turn":
         side = int(kind == "body_frame")
-        array[k, side] = _turned(array[k, side], AXES.index(parameter.entry), change)
-    elif kind == "spring_point":
-        which, axis = parameter.entry.split()
-        array[k, int(which == "second"), AXES.index(axis)] += change
-    elif kind == "anchor":
-        array[k, 0, AXES.index(parameter.entry)] += change
-    elif kind in JOINT_ELEMENTS:
-        array[k, _column(model, parameter)] += change
-    elif parameter.entry:
-        array[k, AXES.index(parameter.entry)] += change
-    else:
-        array[k] += change
-    return model.changed(**{field: array})
+        return {name: _placed(array, _turning(array[k, side], AXES.index(entry)), k, side)}
+    if kind in JOINT_ELEMENTS:
+        return {name: _unit(array, k, _column(model, parameter))}
+    *where, axis = entry.split() or [""]
+    place: list[int] = [] if kind == "gravity" else [k]
+    if kind == "distal":  # where the next body hangs
+        place = [k + 1, 0]
+    elif name == "point":
+        place.append(int(kind == "proximal"))
+    elif where:
+        place.append(int(where == ["second"]))
+    return {name: _unit(array, *place, *([AXES.index(axis)] if axis else []))}
+
+
+def _unit(array: Array, *place: int) -> Array:
+    """Zeros but for a 1."""
+    return _placed(array, np.array(1.0), *place)
+
+
+def _placed(array: Array, value: Array, *place: int) -> Array:
+    """Zeros but for a value."""
+    found = np.zeros_like(array)
+    found[place] = value
+    return found
+
+
+def _turning(p: Array, axis: int) -> Array:
+    """The derivative of a quaternion (4,) that turns about one of its own axes, per rad."""
+    return quaternion_product(p, np.concatenate([[0.0], np.eye(3)[axis] / 2]))
 
 
 def _column(model: Model, parameter: Parameter) -> int:
     """Which coordinate of its joint a parameter belongs to."""
     motions = _motions(model, parameter.body)
     return motions.index(parameter.entry) if motions else 0
-
-
-def _turned(p: Array, axis: int, angle: float) -> Array:
-    """A quaternion turned about one of its own axes."""
-    turned = quaternion_product(p, np.concatenate([[1.0], angle / 2 * np.eye(3)[axis]]))
-    return np.asarray(turned / np.linalg.norm(turned))
-
-
-def _perturb_state(model: Model, state: State, parameter: Parameter, change: float) -> State:
-    """The state with one of its minimal coordinates or rates changed."""
-    kind, k = parameter.kind, parameter.body
-    names = ("p", "omega", "u", "udot", "r", "v", "x", "xdot")
-    p, omega, u, udot, r, v, x, xdot = (getattr(state, name).copy() for name in names)
-    if kind in ("coordinate", "rate"):
-        (x if kind == "coordinate" else xdot)[k, _column(model, parameter)] += change
-        return complete_state(model, State(p, omega, u, udot, r, v, x, xdot))
-    i = AXES.index(parameter.entry)
-    if kind == "attitude":
-        p[k] = _turned(p[k], i, change)
-    elif kind in ("omega", "position", "velocity"):
-        {"omega": omega, "position": r, "velocity": v}[kind][k, i] += change
-    elif kind == "rod_rate":
-        udot[k] += change * rod_axes(u[k])[i]
-    else:
-        axis = rod_axes(u[k])[i]
-        u[k], udot[k] = u[k] + change * np.cross(axis, u[k]), udot[k] + change * np.cross(axis, udot[k])
-        u[k] /= np.linalg.norm(u[k])
-        udot[k] -= (udot[k] @ u[k]) * u[k]
-    return complete_state(model, State(p, omega, u, udot, r, v, x, xdot))
