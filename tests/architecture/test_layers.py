@@ -5,76 +5,15 @@ import re
 import sys
 import tomllib
 from graphlib import CycleError, TopologicalSorter
-from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
-LAYERS = (  # from the top; a package imports only what follows it
-    "cli", "studies", "model_files", "execution", "reproduce", "storage", "judging", "measurements",
-    "diagnosis", "truth", "equations", "engines", "importers", "scenario", "model", "processes",
-)  # fmt: skip
-OUTSIDE = {  # packages beside the core, and what of the project each may import
-    "reference_impl": ("reference_impl",),
-    "adapters": (
-        "adapters", "reference_impl", "plumbline.model", "plumbline.engines", "plumbline.processes",
-        "plumbline.importers.importer", "plumbline.importers.neutral_model",
-    ),
-    "reports": (
-        "reports", "plumbline.storage", "plumbline.judging.rows", "plumbline.model", "plumbline.processes",
-    ),
-    "bench": ("bench", "plumbline", "reference_impl", "adapters", "tests.helpers.random_chains"),
-}  # fmt: skip
-PROJECT = ("plumbline", "reference_impl", "adapters", "reports", "bench", "tests", "tools")
+from tests.helpers.import_graph import MODULES, OUTSIDE, PROJECT, ROOT, imports, layer, picture
 
 
-def module_name(path):
-    parts = path.relative_to(ROOT).with_suffix("").parts
-    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
-
-
-def modules():
-    folders = ("plumbline", *OUTSIDE)
-    files = [
-        path
-        for folder in folders
-        for path in (ROOT / folder).rglob("*.py")
-        if "node_modules" not in path.parts
-    ]
-    return {module_name(path): path for path in files}
-
-
-MODULES = modules()
-
-
-def imports(name, *, at_import):
-    """Modules of the project that a module imports; with at_import only those that loading it imports."""
-    tree = ast.parse(MODULES[name].read_text(encoding="utf-8"))
-    found = set()
-
-    def visit(node):
-        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test) and at_import:
-            return
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda) and at_import:
-            return
-        if isinstance(node, ast.Import):
-            found.update(alias.name for alias in node.names)
-        if isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{name} imports relatively"
-            members = {f"{node.module}.{alias.name}" for alias in node.names}
-            found.update(members & MODULES.keys() or {node.module})
-        for child in ast.iter_child_nodes(node):
-            visit(child)
-
-    visit(tree)
-    return {module for module in found if module.split(".")[0] in PROJECT}
-
-
-def layer(module):
-    parts = module.split(".")
-    return (
-        LAYERS.index(parts[1]) if parts[0] == "plumbline" and len(parts) > 1 and parts[1] in LAYERS else None
-    )
+def test_the_picture_of_the_packages_is_today_s():
+    page = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
+    assert f"```mermaid\n{picture()}\n```" in page, f"docs/architecture.md needs the picture\n{picture()}"
 
 
 def test_every_module_of_the_core_is_in_a_layer():
