@@ -68,9 +68,13 @@ class JointKind:
 
     @cached_property
     def motion_names(self) -> tuple[str, ...]:
-        """A name for each motion: what it does; of several that do the same, the letter of the axis."""
+        """A name for each motion: what it does; of several that do the same, with the letter of the axis."""
         names = [what for what, _ in self.motions]
-        return tuple(what if names.count(what) == 1 else "xyz"[axis] for what, axis in self.motions)
+        of_several = {"turn": "{}", "slide": "slide {}"}
+        return tuple(
+            what if names.count(what) == 1 else of_several[what].format("xyz"[axis])
+            for what, axis in self.motions
+        )
 
     @cached_property
     def is_about_z(self) -> bool:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from plumbline.model.datatypes import JOINT_ELEMENTS, KINDS, Array, Model, State
+from plumbline.model.datatypes import JOINT_ELEMENTS, Array, Model, State
 from plumbline.model.kinematics import (
     JointFrame,
     ball_spring_rest,
@@ -103,15 +103,15 @@ def _coordinates(
     model: Model, state: State, k: int, bend: Array, spins: tuple[Array, ...]
 ) -> list[tuple[str, Array, int, float, float, float]]:
     """What moves, the axis, the column of the elements, x, ẋ and the bias of every coordinate of joint k."""
-    kind, far = model.kind[k], model.body[k, 0]
-    if kind == "ball":
+    kind, far = model.kinds[k], model.body[k, 0]
+    if kind.is_spherical:
         rest = ball_spring_rest(model, k)
         unloaded = quaternion_product(state.p[far], rest) if far >= 0 else rest
         turn = rotation_vector(quaternion_product(quaternion_conjugate(unloaded), state.p[k]))
         values = rotation_matrix(unloaded) @ turn, spins[0] - spins[1], -cross(spins[1], spins[0])
         of_axis = zip(np.eye(3), *(value.tolist() for value in values), strict=True)
         return [("turn", axis, 0, x, rate, bias) for axis, x, rate, bias in of_axis]
-    if KINDS[kind].has_attitude:
+    if kind.has_attitude:
         return []
     axes = JointFrame(model, k, rotation_matrix(state.p[far]) if far >= 0 else np.eye(3)).axes(state.x[k])
     biases = [float(axis @ bend[3 * (what == "turn") :][:3]) for what, axis in axes]

@@ -165,7 +165,7 @@ def checked_numbers(model: Model, state: State) -> dict[str, Array]:
     """
     names = ("p", "omega", "u", "udot", "x", "xdot")
     found = {name: getattr(state if name in names else model, name) for name in SHAPES}
-    free = np.array([kind == "free" for kind in model.kind])
+    free = model.free
     own: dict[str, Any] = {
         "u": state.r,
         "udot": state.v,

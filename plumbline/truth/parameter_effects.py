@@ -35,7 +35,7 @@ def effects_at_states(
     """Return the effects of unit changes of parameters of the model or of the states, state by state."""
     if model.has_loops:
         # the spring of a ball joint jumps at half a turn, which a smaller difference hardly ever meets
-        small = [one.kind.endswith("frame") and model.kind[one.body] == "ball" for one in parameters]
+        small = [one.kind.endswith("frame") and model.kinds[one.body].is_spherical for one in parameters]
         sizes = [
             STATE_MISTAKE if is_small or one.kind in STATE_KINDS else LOOP_MISTAKE
             for one, is_small in zip(parameters, small, strict=True)

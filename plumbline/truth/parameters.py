@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from plumbline.model.datatypes import JOINT_ELEMENTS, KINDS, SPRING_FIELDS, Array, Model, State
+from plumbline.model.datatypes import JOINT_ELEMENTS, SPRING_FIELDS, Array, Model, State
 from plumbline.model.kinematics import complete_state, quaternion_product
 from plumbline.truth.ground_truth import stretched_length
 
@@ -58,7 +58,7 @@ class Parameter:
     @property
     def unit(self) -> str:
         """Unit of value and scale."""
-        return (SLIDE_UNITS if self.entry == "slide" else UNITS)[self.kind]
+        return (SLIDE_UNITS if self.entry.startswith("slide") else UNITS)[self.kind]
 
 
 def list_parameters(model: Model, state: State) -> list[Parameter]:
@@ -105,8 +105,8 @@ def _span(model: Model, k: int) -> float:
 
 def _geometry(model: Model, k: int, span: float) -> Iterator[Parameter]:
     """Points and axes of a body's joint, and of a chain the point where the next body hangs."""
-    kind = model.kind[k]
-    if kind == "free":
+    kind = model.kinds[k]
+    if kind.holds_nothing:
         return
     yield from _components("proximal", k, model.proximal[k], span)
     if not model.is_chain:
@@ -115,15 +115,9 @@ def _geometry(model: Model, k: int, span: float) -> Iterator[Parameter]:
         yield from _components("distal", k, model.distal[k], span)
     if model.rods[k]:
         yield _parameter("length", k, "", model.length[k], model.length[k])
-    if not KINDS[kind].has_attitude or (kind == "ball" and model.stiffness[k, 0]):
+    if not kind.has_attitude or (kind.is_spherical and model.stiffness[k, 0]):
         for frame in ("frame", "body_frame"):
             yield from (Parameter(frame, k, axis, 0.0, 1.0) for axis in AXES)
-
-
-def _motions(model: Model, k: int) -> list[str]:
-    """Names of the scalar coordinates of a joint: what each does, or of two turns their axes."""
-    names: list[str] = [what for what, _ in KINDS[model.kind[k]].motions]
-    return names if len(set(names)) == len(names) else list(AXES[: len(names)])
 
 
 def _joint_elements(model: Model, k: int, rate: float) -> Iterator[Parameter]:
@@ -132,10 +126,11 @@ def _joint_elements(model: Model, k: int, rate: float) -> Iterator[Parameter]:
         return
     near = model.body[k, 1]
     inertia = float(np.trace(model.inertia[near])) / 3, float(model.mass[near])
-    is_ball = model.kind[k] == "ball"
-    for i, what in enumerate(["turn"] if is_ball else _motions(model, k)):
-        size, arm = inertia[what == "slide"], float(np.sqrt(3 * inertia[0] / inertia[1]))
-        natural = (size, size * rate, size * rate**2, arm if what == "slide" else 1.0, size * rate**2)
+    is_ball = model.kinds[k].is_spherical
+    for i, what in enumerate(["turn"] if is_ball else model.kinds[k].motion_names):
+        is_slide = what.startswith("slide")
+        size, arm = inertia[is_slide], float(np.sqrt(3 * inertia[0] / inertia[1]))
+        natural = (size, size * rate, size * rate**2, arm if is_slide else 1.0, size * rate**2)
         for name, own in zip(JOINT_ELEMENTS, natural, strict=True):
             if (name in ("rest", "effort") and is_ball) or (name == "rest" and not model.stiffness[k, i]):
                 continue
@@ -144,18 +139,18 @@ def _joint_elements(model: Model, k: int, rate: float) -> Iterator[Parameter]:
 
 def _initial_state(model: Model, state: State, k: int, span: float, spin: float) -> Iterator[Parameter]:
     """Minimal coordinates and rates of a body."""
-    if KINDS[model.kind[k]].has_attitude:
+    if model.kinds[k].has_attitude:
         yield from (Parameter("attitude", k, axis, 0.0, 1.0) for axis in AXES)
         yield from _components("omega", k, state.omega[k], spin)
     if model.rods[k]:
         yield from (Parameter("direction", k, axis, 0.0, 1.0) for axis in AXES[:2])
         across = rod_axes(state.u[k]) @ state.udot[k]
         yield from (_parameter("rod_rate", k, AXES[i], across[i], spin) for i in range(2))
-    if model.kind[k] == "free":
+    if model.free[k]:
         yield from _components("position", k, state.r[k], span)
         yield from _components("velocity", k, state.v[k], span * spin)
-    for i, what in enumerate(_motions(model, k)):
-        is_slide = what == "slide"
+    for i, what in enumerate(model.kinds[k].motion_names):
+        is_slide = what.startswith("slide")
         angle = Parameter("coordinate", k, what, 0.0, 1.0)
         yield _parameter("coordinate", k, what, state.x[k, i], span) if is_slide else angle
         yield _parameter("rate", k, what, state.xdot[k, i], span * spin if is_slide else spin)
@@ -321,5 +316,5 @@ def _turning(p: Array, axis: int) -> Array:
 
 def _column(model: Model, parameter: Parameter) -> int:
     """Which coordinate of its joint a parameter belongs to."""
-    motions = _motions(model, parameter.body)
+    motions = model.kinds[parameter.body].motion_names
     return motions.index(parameter.entry) if motions else 0

@@ -24,7 +24,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from plumbline.model.datatypes import KINDS, ZERO_INERTIA, Array, Model, State
+from plumbline.model.datatypes import ZERO_INERTIA, Array, Model, State
 from plumbline.model.kinematics import (
     JointFrame,
     cross,
@@ -79,18 +79,18 @@ class _TreeTerms:
 
     def _held_and_bend(self, k: int) -> tuple[Array, Array]:
         """E (6, c) of joint k, and the relative acceleration (6,) that the velocities alone cause."""
-        model, state, kind, far = self.model, self.state, self.model.kind[k], self.far[k]
+        model, state, kind, far = self.model, self.state, self.model.kinds[k], self.far[k]
         bend = np.zeros(6)
         spin = self.omega[far] if far >= 0 else np.zeros(3)
         bend[:3] = cross(self.omega[k], cross(self.omega[k], self.near[k])) - cross(
             spin, cross(spin, self.far_arm[k])
         )
-        if kind == "rod":
+        if kind.holds_distance:
             bend[:3] += cross(spin, cross(spin, self.d[k]))  # the far point is not where the near point is
             bend[:3] += model.length[k] * state.udot[k] @ state.udot[k] * state.u[k]
             return np.concatenate([state.u[k], np.zeros(3)])[:, None], bend
-        if KINDS[kind].has_attitude:
-            return np.eye(6, 3 if kind == "ball" else 0), bend
+        if kind.has_attitude:
+            return np.eye(6, 3 if kind.is_spherical else 0), bend
         axes = JointFrame(model, k, self.A[far] if far >= 0 else np.eye(3)).axes(state.x[k])
         carried = spin
         for (what, axis), rate in zip(axes, state.xdot[k], strict=False):
@@ -176,7 +176,7 @@ class _TreeTerms:
         rows = np.zeros((E.shape[1], self.n, 6))
         rows[:, k, :3], rows[:, k, 3:] = E[:3].T, E[3:].T - E[:3].T @ cross_matrix(self.near[k])
         if self.far[k] >= 0:
-            arm = self.far_arm[k] - (self.d[k] if self.model.kind[k] == "rod" else 0.0)
+            arm = self.far_arm[k] - (self.d[k] if self.model.rods[k] else 0.0)
             rows[:, self.far[k], :3] = -E[:3].T
             rows[:, self.far[k], 3:] = E[:3].T @ cross_matrix(arm) - E[3:].T
         return rows
@@ -240,8 +240,8 @@ class _TreeTerms:
         for element in self.elements:
             self.element_size[element.k] += element.size
         self.spin = self.J * norm(self.omega, axis=1) * self.W
-        slides = [[what == "slide" for what, _ in KINDS[kind].motions] + [False] * 2 for kind in model.kind]
-        self.slide_rate = np.abs(self.state.xdot) @ [1, 1] * [any(some) for some in slides]
+        slides = [bool(kind.slide_axes) for kind in model.kinds]
+        self.slide_rate = np.sum(np.abs(self.state.xdot), axis=1) * slides
         children = [np.flatnonzero(self.far == k) for k in range(self.n)]
         self.F_children = np.array([np.sum(self.F[kids]) for kids in children])
         self.moment_children = np.array(
@@ -330,12 +330,12 @@ class _JointSpace:
         turns: list[Any] = []
         rates: list[Any] = []
         accelerations: list[Any] = []
-        for k, kind in enumerate(model.kind):
+        for k, kind in enumerate(model.kinds):
             far = terms.far[k]
             below = terms.below[k].astype(float)
             tip = state.r[k] + terms.near[k]
             above_w, above_a = (omega[far], alpha[far]) if far >= 0 else (np.zeros(3), np.zeros(3))
-            if kind == "rod":
+            if kind.holds_distance:
                 spin = cross(state.u[k], state.udot[k])
                 swing = self._rod_acceleration(k)
                 self._add(
@@ -352,16 +352,15 @@ class _JointSpace:
                 self._add(lever, turns, rates, accelerations, tip, below, omega[k] - spin, alpha[k] - swing)
                 self.pairs.append(("lower", k))
                 continue
-            motions = {what for what, _ in KINDS[kind].motions}
-            if KINDS[kind].has_attitude or "turn" in motions:
+            if kind.has_attitude or kind.turn_axes:
                 self._add(
                     lever, turns, rates, accelerations, tip, below, omega[k] - above_w, alpha[k] - above_a
                 )
                 self.pairs.append(("turn", k))
-            if kind == "free" or "slide" in motions:
+            if kind.holds_nothing or kind.slide_axes:
                 lever.append(below)
                 turns.append(0 * below)
-                rates.append(terms.slide_rate[k] if kind != "free" else np.linalg.norm(state.v[k]))
+                rates.append(np.linalg.norm(state.v[k]) if kind.holds_nothing else terms.slide_rate[k])
                 accelerations.append(np.linalg.norm(self._slide_acceleration(k)))
                 self.pairs.append(("slide", k))
         shape = (len(lever), terms.n)
@@ -514,7 +513,7 @@ def _tolerances(t: _TreeTerms) -> tuple[Array, dict[str, Array | float], dict[st
     carried_moment = t.below @ (t.J * (t.alpha + turning) + t.spin + t.torque_size) + lever @ carried
     result = np.stack([np.maximum(t.a, t.g), t.alpha, t.F, t.moment], 1)
     total += result
-    free = np.array([kind == "free" for kind in model.kind])  # its wrench is what rounding leaves
+    free = model.free  # its wrench is what rounding leaves
     total[free, 2:] += np.stack([t.below @ force, t.below @ moment], 1)[free]
     total[:, 2:] += t.element_size[:, None] * _directions_used(t)
     total += np.stack([swing + t.a + t.transport, turning, t.below @ carried, carried_moment], 1)
@@ -522,7 +521,7 @@ def _tolerances(t: _TreeTerms) -> tuple[Array, dict[str, Array | float], dict[st
     rate, speed = joints.turns.T @ joints.rate, joints.lever.T @ joints.rate
     with_place = np.maximum(speed, t.place * rate)
     steps = np.linalg.norm(model.point, axis=2).sum(1) + np.linalg.norm(t.d, axis=1)
-    steps += np.linalg.norm(state.r, axis=1) * [kind == "free" for kind in model.kind]
+    steps += np.linalg.norm(state.r, axis=1) * model.free
     height = t.below.T @ steps
     sums = {
         "kinetic_energy": float(0.5 * np.sum(t.m * speed * with_place + t.J * rate**2))

@@ -272,7 +272,7 @@ class FormulaSteps:
         arm = path @ stretched_length(model)
         if np.any(slides):
             arm = arm + np.max([np.max(np.where(path, norm(s.r, axis=1), 0.0), axis=1) for s in ends], axis=0)
-        links = [max(1, len(KINDS[kind].motions)) + (kind == "rod") for kind in kinds]
+        links = [max(1, len(KINDS[kind].motions)) + KINDS[kind].holds_distance for kind in kinds]
         rounding = STEP_ROUNDINGS * EPS * (path @ np.array(links))
         turning, acceleration, torque = (
             np.max([getattr(b, name) for b in bounds], axis=0)
@@ -293,7 +293,7 @@ class FormulaSteps:
         velocity += rounding * np.maximum(V, W * arm)
         if self.method.free_coordinates == "rigid motion" and self.method.formula == "Runge-Kutta":
             # closed forms of dexp⁻¹ of a rigid motion divide differences by the square of the turn
-            free = np.array([kind == "free" for kind in kinds])
+            free = np.array([KINDS[kind].holds_nothing for kind in kinds])
             turn = np.clip(h * rate, 1e-4, 1.0)  # rad
             velocity += path @ np.where(free, STEP_ROUNDINGS * EPS * speed / turn**2, 0.0)
         return {
@@ -330,7 +330,7 @@ def _paths(far: NDArray[np.intp]) -> NDArray[np.bool_]:
 
 
 def _slides(kind: Kind) -> bool:
-    return kind == "free" or any(what == "slide" for what, _ in KINDS[kind].motions)
+    return KINDS[kind].holds_nothing or bool(KINDS[kind].slide_axes)
 
 
 def _pick(links: BodyStates, i: int) -> BodyStates:

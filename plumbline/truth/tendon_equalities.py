@@ -70,7 +70,7 @@ def _lengthening(model: Model, state: State, u: Array, udot: Array) -> dict[int,
         tree, there, place = cut.model, cut.state(there), np.append(cut.place, -1)[place]
     A, spin, a, alpha = _at_constant_rates(tree, there)
     found = {}
-    for k in np.flatnonzero([kind == "rod" for kind in model.kind]):
+    for k in np.flatnonzero(model.rods):
         ends = np.zeros((2, 3))
         for side, (body, point) in enumerate(zip(model.body[k], model.point[k], strict=True)):
             if body >= 0:
@@ -85,14 +85,14 @@ def _at_constant_rates(tree: Model, state: State) -> tuple[Array, Array, Array, 
     A = rotation_matrix(state.p)
     spin = rotate_vectors(A, state.omega)
     a, alpha = np.zeros((tree.n, 3)), np.zeros((tree.n, 3))
-    for k, (kind, far) in enumerate(zip(tree.kind, tree.body[:, 0], strict=True)):
-        if kind == "free":
+    for k, (kind, far) in enumerate(zip(tree.kinds, tree.body[:, 0], strict=True)):
+        if kind.holds_nothing:
             continue
         above, turning, swing, tip = np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3)
         if far >= 0:
             above, turning, swing = A[far], spin[far], alpha[far]
             tip = a[far] + _carried(swing, turning, above @ tree.point[k, 0])
-        if kind == "ball":
+        if kind.is_spherical:
             swing = swing + cross(turning, spin[k])
         for i, (what, axis) in enumerate(JointFrame(tree, k, above).axes(state.x[k])):
             rate, shift = axis * state.xdot[k, i], axis * state.x[k, i]

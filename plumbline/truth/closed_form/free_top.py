@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from plumbline.model.datatypes import Array, Model, State
+from plumbline.model.datatypes import FREE, Array, Model, State
 from plumbline.model.kinematics import quaternion_conjugate, quaternion_product
 from plumbline.truth.closed_form.motion import (
     ClosedFormMotion,
@@ -31,7 +31,7 @@ def free_top(model: Model, state: State) -> ClosedFormMotion:
 
     """
     require_no_loads(model)
-    is_free = model.kind == ("free",)
+    is_free = model.kind == (FREE,)
     if not is_free:
         require_single_body(model, rod=False)
         require(not np.any(model.proximal[0]), "a pivot at the centre of mass")

@@ -28,13 +28,14 @@ def damped_oscillator(model: Model, state: State) -> ClosedFormMotion:
         ClosedFormMismatch: the scenario is not a linear oscillator.
 
     """
-    require(model.kind in (("slide",), ("hinge",)), "one body on a slide or a hinge")
+    kinds = model.kinds
+    require(len(kinds) == 1 and len(kinds[0].rows) == 5, "one body on a slide or a hinge")
     require_no_loads(model)
     require(not len(model.spring_body), "no springs between points")
     axis = rotation_matrix(model.turn[0, 0])[:, 2]
     A = rotation_matrix(state.p[0])
     arm = -(A @ model.proximal[0])  # from the joint's near point to the centre of mass
-    mass, slides = float(model.mass[0]), model.kind == ("slide",)
+    mass, slides = float(model.mass[0]), bool(kinds[0].slide_axes)
     across = arm - (arm @ axis) * axis
     weight_across = np.linalg.norm(np.cross(model.gravity, axis))
     size = np.linalg.norm(arm) * np.linalg.norm(model.gravity)

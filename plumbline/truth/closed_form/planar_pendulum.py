@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from plumbline.model.datatypes import Array, Model, State
+from plumbline.model.datatypes import HINGE, ROD, Array, Model, State
 from plumbline.model.kinematics import quaternion_product, rotation_matrix
 from plumbline.truth.closed_form.motion import (
     CONDITION_RTOL,
@@ -45,7 +45,7 @@ def planar_pendulum(model: Model, state: State) -> ClosedFormMotion:
 
     """
     kind = model.kind[0] if model.n == len(model.kind) == 1 else ""
-    pendulum = {"hinge": _on_hinge, "rod": _on_rod}.get(kind, _on_ball)(model, state)
+    pendulum = (_on_hinge if kind == HINGE else _on_rod if kind == ROD else _on_ball)(model, state)
     axis, lever = pendulum.axis, float(np.linalg.norm(pendulum.arm))
     across_axis = model.gravity - (model.gravity @ axis) * axis
     gravity = float(np.linalg.norm(across_axis))
