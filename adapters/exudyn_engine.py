@@ -46,9 +46,9 @@ from adapters.exudyn_common import (
     silence_engine,
 )
 from plumbline.model.datatypes import (
-    KINDS,
     Array,
     Integrator,
+    JointKind,
     Model,
     State,
     StateQuantities,
@@ -68,14 +68,6 @@ from plumbline.model.loops import independent_rows
 from plumbline.model.step_methods import ConstrainedMethod, generalized_alpha
 from plumbline.model.welding import BodyParts, RigidPart, undivided_bodies
 
-# Of ObjectJointGeneric: three displacements and three rotations, in the joint's axes of the far body.
-CONSTRAINED_AXES = {
-    "hinge": [1, 1, 1, 1, 1, 0],
-    "universal": [1, 1, 1, 0, 0, 1],
-    "slide": [1, 1, 0, 1, 1, 1],
-    "cylindrical": [1, 1, 0, 1, 1, 0],
-    "weld": [1, 1, 1, 1, 1, 1],
-}
 SECOND_AXIS = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # columns x, −z, y of the joint's axes
 SPECTRAL_RADIUS = 0.9
 STEP_SETTINGS = {
@@ -155,19 +147,19 @@ class ExudynChain:
         self.body_of_piece.append(k)
 
     def _add_joint(self, k: int) -> None:
-        model, kind, (far, near) = self.model, self.model.kind[k], self.model.body[k]
+        model, kind, (far, near) = self.model, self.model.kinds[k], self.model.body[k]
         ends = [
             self._end_marker(far, model.point[k, 0]),
             self._add_marker(self.first_piece[near], model.proximal[k]),
         ]
-        if kind == "free":
+        if kind.holds_nothing:
             self.joints.append(None)
             return
-        held = enumerate(CONSTRAINED_AXES.get(kind, [1] * 3))
+        held = enumerate(_constrained_axes(kind) or [1] * 3)
         rows = [int(is_held and (k, i) not in self.left_out) for i, is_held in held]
-        if kind == "rod":
+        if kind.holds_distance:
             joint = items.ObjectConnectorDistance(markerNumbers=ends, distance=model.length[k])
-        elif kind == "ball":
+        elif kind.is_spherical:
             joint = items.ObjectJointSpherical(markerNumbers=ends, constrainedAxes=rows)
         else:
             turns = rotation_matrix(model.turn[k])
@@ -185,7 +177,7 @@ class ExudynChain:
         model, far = self.model, self.model.body[k, 0]
         above = rotation_matrix(self.state.p[far]) if far >= 0 else np.eye(3)
         axes = JointFrame(model, k, above).axes(self.x[k])
-        for i, ((what, number), (_, axis)) in enumerate(zip(KINDS[model.kind[k]].motions, axes, strict=True)):
+        for i, ((what, number), (_, axis)) in enumerate(zip(model.kinds[k].motions, axes, strict=True)):
             stiffness, damping, effort = (x[k, i] for x in (model.stiffness, model.damping, model.effort))
             if not (stiffness or damping or effort):
                 continue
@@ -221,7 +213,7 @@ class ExudynChain:
         if self.joints[k] is None:
             return []
         rows = list(self.mbs.systemData.GetObjectLTGAE(self.joints[k]))
-        held = CONSTRAINED_AXES.get(self.model.kind[k], [1] * len(rows))
+        held = _constrained_axes(self.model.kinds[k]) or [1] * len(rows)
         return [row for row, is_held in zip(rows, held, strict=True) if is_held]
 
     def _add_marker(self, piece: int, point: Array) -> Any:
@@ -410,7 +402,7 @@ def _chain_that_moves(model: Model, state: State) -> ExudynChain:
     if not model.has_loops:
         return chain
     _, _, C = _system_matrices(chain)
-    for k in [k for k, kind in enumerate(model.kind) if CONSTRAINED_AXES.get(kind, [])[:3] == [1, 1, 1]]:
+    for k in [k for k, kind in enumerate(model.kinds) if kind.holds_points and not kind.is_spherical]:
         # of some displacements the engine holds those along the joint's axes, of all those along the world's
         rows, far = chain.joint_rows(k)[:3], model.body[k, 0]
         above = rotation_matrix(state.p[far]) if far >= 0 else np.eye(3)
@@ -540,7 +532,7 @@ def _system_matrices(chain: ExudynChain) -> tuple[Array, Array, Array]:
 
         C = constraint_jacobian()
         chain.jacobian_rate = np.zeros_like(C)
-        if set(chain.model.kind) & set(CONSTRAINED_AXES):
+        if not all(kind.has_attitude for kind in chain.model.kinds):
             chain.jacobian_rate = _rate_along_velocity(chain, constraint_jacobian)
         return M, f, C
 
@@ -557,6 +549,13 @@ def _rate_along_velocity(chain: ExudynChain, jacobian: Callable[[], Array]) -> A
     return np.asarray((values[0] - 8 * values[1] + 8 * values[2] - values[3]) / (12 * step))
 
 
+def _constrained_axes(kind: JointKind) -> list[int]:
+    """Of ObjectJointGeneric: three displacements and three rotations, in the joint's axes of the far body."""
+    if kind.has_attitude:
+        return []
+    return [int(axis not in axes) for axes in (kind.slide_axes, kind.turn_axes) for axis in range(3)]
+
+
 def _constraint_accelerations(chain: ExudynChain, C: Array) -> Array:
     """Return γ (nc,) of C q̈ = γ.
 
@@ -568,7 +567,7 @@ def _constraint_accelerations(chain: ExudynChain, C: Array) -> Array:
     for i, node in enumerate(chain.nodes):
         gamma[data.GetNodeLTGAE(node)] = -2 * chain.qdot[i, 3:] @ chain.qdot[i, 3:]
     for k, joint in enumerate(chain.joints):
-        if model.kind[k] not in ("rod", "ball"):
+        if not model.kinds[k].holds_no_turn:
             rows = chain.joint_rows(k)
             gamma[rows] = -chain.jacobian_rate[rows] @ chain.qdot.ravel()
             continue

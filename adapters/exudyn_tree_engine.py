@@ -50,7 +50,6 @@ from adapters.exudyn_common import (
     silence_engine,
 )
 from plumbline.model.datatypes import (
-    KINDS,
     Array,
     Integrator,
     Model,
@@ -133,16 +132,16 @@ class _Linkage:
         # its angular velocity in the world as a matrix on ν.
         self._last, self._axes, self._hang = -1, np.eye(3), np.zeros(3)
         self._spin = np.zeros((3, len(self.nu)))
-        for k, (kind, own) in enumerate(zip(model.kind, own_rates(model), strict=True)):
+        for k, (kind, own) in enumerate(zip(model.kinds, own_rates(model), strict=True)):
             self._go_to_far_body(k)
-            if kind == "weld":
+            if kind.is_rigid:
                 self._weld_body(k)
                 continue
-            if kind == "rod":
+            if kind.holds_distance:
                 self._add_rod(k)
-            if kind == "free":
+            if kind.holds_nothing:
                 self._add_shifts(own)
-            if KINDS[kind].has_attitude:
+            if kind.has_attitude:
                 self._add_turned_body(k)
             else:
                 self._add_jointed_body(k, own)
@@ -177,7 +176,7 @@ class _Linkage:
 
     def _add_turned_body(self, k: int) -> None:
         model, A = self.model, self.attitude[k]
-        near = model.proximal[k] * (model.kind[k] != "free")
+        near = model.proximal[k] * (not model.free[k])
         relative = self._body_spins[k] - self._spin
         z = _unit_vector(relative @ self.nu, _fallback_axis(A @ near, model.gravity))
         x = _perpendicular_unit(z)
@@ -193,13 +192,16 @@ class _Linkage:
         joint = JointFrame(self.model, k, above)
         (shift, _), _ = joint.motion(self.state.x[k], self.state.xdot[k])
         axes = A @ rotation_matrix(self.model.turn[k, 1])
-        if self.model.kind[k] == "universal":  # the link between has x of the far and y of the near body
+        kind = self.model.kinds[k]
+        if kind.exchanges_axes:  # the link between has x of the far and y of the near body
             x, y = joint.axes(self.state.x[k])[0][1], axes[:, 1]
             axes = np.stack([x, y, np.cross(x, y)], axis=1)
         self._hang = self._hang + self._axes.T @ shift
         for i, (what, axis) in enumerate(joint.motions):
             name = ("Revolute" if what == "turn" else "Prismatic") + "XYZ"[axis]
-            self._add_link(name, axes, own.start + i)
+            is_carried = what == "slide" and not kind.is_about_z  # by the far body, as the turn comes later
+            link_axes = above @ rotation_matrix(self.model.turn[k, 0]) if is_carried else axes
+            self._add_link(name, link_axes, own.start + i)
             self.motions.append((self._last, k, i))
         self._finish_body(k, A.T @ axes, self.model.proximal[k])
 
@@ -216,7 +218,7 @@ class _Linkage:
         self.body_axes.append(B)
         self.origins.append(origin)
         self.link_axes.append(self._axes)
-        self.link_spins.append(self._spin if KINDS[self.model.kind[k]].has_attitude else self._body_spins[k])
+        self.link_spins.append(self._spin if self.model.kinds[k].has_attitude else self._body_spins[k])
         link = self.links[-1]
         link.centre, link.mass = -B.T @ origin, float(self.model.mass[k])
         link.inertia = B.T @ self.model.inertia[k] @ B
@@ -481,7 +483,7 @@ def _evaluate_state(tree: _KinematicTree) -> StateQuantities:
     tree.mbs.systemData.SetODE2Coordinates_tt(np.linalg.solve(M, f))
     momentum = M @ tree.initial_angle_rates
     masses = np.array(tree.mbs.GetObjectParameter(tree.tree, "linkMasses"))[tree.linkage.link_of_body]
-    if "weld" in tree.model.kind:  # links with several bodies
+    if any(kind.is_rigid for kind in tree.model.kinds):  # links with several bodies
         masses = tree.model.mass
     gravity = np.array(tree.mbs.GetObjectParameter(tree.tree, "gravity"))
     W = tree.linkage.W

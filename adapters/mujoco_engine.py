@@ -59,7 +59,6 @@ from numpy.typing import NDArray
 from plumbline.engines.metamorphic_hooks import MetamorphicHooks
 from plumbline.model import kinematics
 from plumbline.model.datatypes import (
-    KINDS,
     ROD,
     Array,
     EngineFailure,
@@ -274,9 +273,9 @@ class _MujocoChain:
         self.mass: list[float] = [0.0]
         self.inertia: list[Array] = [np.zeros(3)]
         links: list[Any] = []
-        for k, (kind, far) in enumerate(zip(model.kind, model.body[:, 0], strict=True)):
+        for k, (kind, far) in enumerate(zip(model.kinds, model.body[:, 0], strict=True)):
             parent, hang = links[far] if far >= 0 else spec.worldbody, model.point[k, 0]
-            if kind == "rod":
+            if kind.holds_distance:
                 axial = np.array([0, 0, ROD_AXIAL_INERTIA * _principal_inertia(model.inertia[k])[0].mean()])
                 parent = self._add_body(parent, hang, 0.0, axial, joint=np.zeros(3))
                 hang = np.array([0, 0, -model.length[k]])
@@ -309,18 +308,18 @@ class _MujocoChain:
     def _add_link(self, parent: Any, k: int, hang: Array, pieces: tuple[RigidPart, ...]) -> Any:
         """Add a body of one part, or a massless one with its parts welded to it, on its joint."""
         one = pieces[0] if len(pieces) == 1 else RigidPart(0.0, np.zeros(3), np.zeros((3, 3)))
-        kind, near = self.model.kind[k], self.model.proximal[k]
-        if kind in ("rod", "ball"):
+        kind, near = self.model.kinds[k], self.model.proximal[k]
+        if kind.holds_no_turn:
             link = self._add_body(parent, hang - near, one.mass, *_principal_inertia(one.inertia), joint=near)
         else:
             q_far, q_near = self.model.turn[k]
             quat = kinematics.quaternion_product(q_far, kinematics.quaternion_conjugate(q_near))
             pos = hang - kinematics.rotation_matrix(quat) @ near
-            pos, quat = (np.zeros(3), IDENTITY_QUATERNION) if kind == "free" else (pos, quat)
+            pos, quat = (np.zeros(3), IDENTITY_QUATERNION) if kind.holds_nothing else (pos, quat)
             link = self._add_body(parent, pos, one.mass, *_principal_inertia(one.inertia), quat=quat)
-            if kind == "free":
+            if kind.holds_nothing:
                 _set_attributes(link.add_joint(), type=mujoco.mjtJoint.mjJNT_FREE)
-            for what, axis in KINDS[kind].motions:
+            for what, axis in kind.motions:
                 along = kinematics.rotation_matrix(q_near)[:, axis]
                 _set_attributes(link.add_joint(), type=JOINT_TYPES[what], pos=near, axis=along)
         self.link_ids.append(len(self.mass) - 1)
@@ -354,12 +353,13 @@ class _MujocoChain:
     def _set_elements(self) -> None:
         """Set rotors, dampers, springs and efforts of the joints, and the springs between points."""
         m, model = self.m, self.model
-        for k, (kind, b) in enumerate(zip(model.kind, self.link_ids, strict=True)):
-            motions = KINDS[kind].motions
-            for i in range(1 if kind == "ball" else len(motions)):
+        for k, (kind, b) in enumerate(zip(model.kinds, self.link_ids, strict=True)):
+            for i in range(kind.element_count):
                 joint = m.body_jntadr[b] + i
-                dofs = m.jnt_dofadr[joint] + np.arange(3 if kind == "ball" else 1)
-                rest = kinematics.ball_spring_rest(model, k) if kind == "ball" else model.rest[k, i : i + 1]
+                dofs = m.jnt_dofadr[joint] + np.arange(3 if kind.is_spherical else 1)
+                rest = (
+                    kinematics.ball_spring_rest(model, k) if kind.is_spherical else model.rest[k, i : i + 1]
+                )
                 m.dof_armature[dofs], m.dof_damping[dofs] = model.armature[k, i], model.damping[k, i]
                 m.jnt_stiffness[joint], self.effort[dofs] = model.stiffness[k, i], model.effort[k, i]
                 m.qpos_spring[m.jnt_qposadr[joint] + np.arange(len(rest))] = rest
@@ -402,12 +402,12 @@ class _MujocoChain:
             kinematics.quaternion_conjugate(q[up]), q[own]
         )
         for k, (b, rates) in enumerate(zip(self.link_ids, kinematics.own_rates(self.model), strict=True)):
-            kind, count = self.model.kind[k], rates.stop - rates.start
-            if kind in ("rod", "ball", "weld"):
+            kind, count = self.model.kinds[k], rates.stop - rates.start
+            if kind.holds_no_turn or kind.is_rigid:
                 continue
             at, dof = m.jnt_qposadr[m.body_jntadr[b]], m.body_dofadr[b]
             T[dof : dof + count, rates] = np.eye(count)
-            x = np.concatenate([state.r[k], state.p[k]]) if kind == "free" else state.x[k, :count]
+            x = np.concatenate([state.r[k], state.p[k]]) if kind.holds_nothing else state.x[k, :count]
             d.qpos[at : at + len(x)] = x
         d.qvel = T @ kinematics.minimal_rates(self.model, state)
         d.xfrc_applied, d.qfrc_applied = self.applied_wrenches, self.effort

@@ -58,7 +58,7 @@ from adapters.pinocchio_common import (
     translation,
 )
 from plumbline.engines.integrators import dop853, rkmk4, sample_steps, semi_implicit_euler
-from plumbline.model.datatypes import KINDS, Array, Integrator, Model, State, StateQuantities, Trajectory
+from plumbline.model.datatypes import Array, Integrator, Model, State, StateQuantities, Trajectory
 from plumbline.model.kinematics import (
     elastic_energy,
     own_rates,
@@ -77,10 +77,8 @@ ROD_AXIAL_INERTIA = 1 / 3  # of a rod about its own axis, over the trace of the 
 PROXIMAL_DAMPING, MAX_PROXIMAL_STEPS = 1e-8, 50  # of constraintDynamics: any damping from 1e-12 to 1e-3 does
 MAX_DENSE_JOINTS = 10  # joints up to which their 3 × 3 blocks are solved faster as one matrix
 JOINT_MODELS = {
-    "hinge": pin.JointModelRZ,
-    "slide": pin.JointModelPZ,
-    "universal": lambda: composite(pin.JointModelRX(), pin.JointModelRY()),
-    "cylindrical": lambda: composite(pin.JointModelPZ(), pin.JointModelRZ()),
+    "turn": (pin.JointModelRX, pin.JointModelRY, pin.JointModelRZ),
+    "slide": (pin.JointModelPX, pin.JointModelPY, pin.JointModelPZ),
 }
 FIXED_STEPS = {"semi-implicit-euler": semi_implicit_euler, "rkmk4": rkmk4}
 
@@ -110,12 +108,12 @@ class PinocchioChain:
         self.body_joints: list[int] = []  # joint of body k
         self.com_frames: list[int] = []  # frame at body k's centre of mass
         self.placements: list[pin.SE3] = []  # of body k's frame in its joint's frame
-        for k, (kind, far) in enumerate(zip(model.kind, model.body[:, 0], strict=True)):
+        for k, (kind, far) in enumerate(zip(model.kinds, model.body[:, 0], strict=True)):
             joint = self.body_joints[far] if far >= 0 else 0
             hang = (self.placements[far] if far >= 0 else pin.SE3.Identity()) * translation(model.point[k, 0])
-            if kind in ("rod", "ball"):
+            if kind.holds_no_turn:
                 hang.rotation = np.eye(3)
-            if kind == "rod":
+            if kind.holds_distance:
                 joint = self._add_joint(joint, pin.JointModelSpherical(), hang, f"rod {k}")
                 # Any axial inertia does; this one keeps its place among the others when units change.
                 axial = np.diag([0.0, 0.0, ROD_AXIAL_INERTIA * np.trace(model.inertia[k])])
@@ -135,9 +133,7 @@ class PinocchioChain:
         self.joints = list(self.pin_model.joints)[1:]
         self.zero_torque = np.zeros(self.pin_model.nv)
         self.moving = [
-            (k, self.joints[row])
-            for k, row in enumerate(self.body_rows)
-            if model.kind[k] == "ball" or KINDS[model.kind[k]].motions
+            (k, self.joints[row]) for k, row in enumerate(self.body_rows) if model.kinds[k].element_count
         ]  # joints that can have elements
         self._init_elements()
         self.ends = ends
@@ -156,20 +152,22 @@ class PinocchioChain:
 
     def _add_body(self, k: int, parent: int, hang: pin.SE3) -> int:
         """Add the joint of body k, at ``hang`` with the far body's axes, and the body's placement in it."""
-        model, kind = self.source_model, self.source_model.kind[k]
-        if kind in ("rod", "ball"):
+        model, kind = self.source_model, self.source_model.kinds[k]
+        if kind.holds_no_turn:
             self.placements.append(translation(-model.proximal[k]))
             return self._add_joint(parent, pin.JointModelSpherical(), hang, f"body {k}")
-        if kind == "free":
+        if kind.holds_nothing:
             self.placements.append(pin.SE3.Identity())
             return self._add_joint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), f"body {k}")
         far, near = (pin.SE3(rotation_matrix(q), np.zeros(3)) for q in model.turn[k])
         place = near.inverse() * translation(-model.proximal[k])
-        if kind == "weld":
+        if kind.is_rigid:
             self.placements.append(hang * far * place)
             return parent
         self.placements.append(place)
-        return self._add_joint(parent, JOINT_MODELS[kind](), hang * far, f"body {k}")
+        joints = [JOINT_MODELS[what][axis]() for what, axis in kind.motions]
+        joint = joints[0] if len(joints) == 1 else composite(*joints)
+        return self._add_joint(parent, joint, hang * far, f"body {k}")
 
     def _init_elements(self) -> None:
         """Set the joints' rotors, dampers, springs and efforts, (nv,) each, and where springs read q."""
@@ -179,7 +177,7 @@ class PinocchioChain:
         balls: list[tuple[Array, Array]] = []  # quaternion, scalar first, and rates
         turns: list[Array] = []
         for k, joint in self.moving:
-            is_ball = model.kind[k] == "ball"
+            is_ball = model.kinds[k].is_spherical
             at, own = slice(joint.idx_v, joint.idx_v + joint.nv), slice(1 if is_ball else joint.nv)
             self.pin_model.armature[at] = model.armature[k, own]
             self.damping[at], self.effort[at] = model.damping[k, own], model.effort[k, own]
@@ -240,10 +238,10 @@ class PinocchioChain:
         model = self.source_model
         attitude, spin = np.zeros((self.joint_count, 4)), np.zeros((self.joint_count, 3))
         for k, row in enumerate(self.body_rows):
-            if model.kind[k] == "weld":
+            if model.kinds[k].is_rigid:
                 continue
             attitude[row], spin[row] = state.p[k], state.omega[k]
-            if not KINDS[model.kind[k]].has_attitude:
+            if not model.kinds[k].has_attitude:
                 attitude[row] = quaternion_product(state.p[k], model.turn[k, 1])
                 spin[row] = self.placements[k].rotation @ state.omega[k]
         for row, k in zip(self.rod_rows, np.flatnonzero(model.rods).tolist(), strict=True):
@@ -262,13 +260,13 @@ class PinocchioChain:
         """Put the coordinates of all joints into q and v: of balls and rods ``relative`` and ``spin``."""
         model = self.source_model
         q, v = pin.neutral(self.pin_model), np.zeros(self.pin_model.nv)
-        bodies = {j: k for k, j in enumerate(self.body_rows) if model.kind[k] != "weld"}
+        bodies = {j: k for k, j in enumerate(self.body_rows) if not model.kinds[k].is_rigid}
         for j, joint in enumerate(self.joints):
             k = bodies.get(j)
             at, to = slice(joint.idx_q, joint.idx_q + joint.nq), slice(joint.idx_v, joint.idx_v + joint.nv)
-            if k is None or model.kind[k] in ("rod", "ball"):
+            if k is None or model.kinds[k].holds_no_turn:
                 q[at], v[to] = relative[j], spin[j]
-            elif model.kind[k] == "free":
+            elif model.free[k]:
                 q[at] = *state.r[k], *np.roll(state.p[k], -1)
                 v[to] = *(rotation_matrix(state.p[k]).T @ state.v[k]), *state.omega[k]
             else:
@@ -278,11 +276,11 @@ class PinocchioChain:
     def _absolute_attitudes(self, q: Array) -> Array:
         """Return the attitudes (T, nj, 4) of the joints' frames, scalar first, at q (T, nq)."""
         model, frames = self.source_model, np.empty((len(q), self.joint_count, 4))
-        bodies = {row: k for k, row in enumerate(self.body_rows) if model.kind[k] != "weld"}
+        bodies = {row: k for k, row in enumerate(self.body_rows) if not model.kinds[k].is_rigid}
         for j, joint in enumerate(self.joints):
-            kind = model.kind[bodies[j]] if j in bodies else "rod"
+            is_jointed = j in bodies and bool(model.kinds[bodies[j]].motions)
             turn = np.roll(q[:, joint.idx_q : joint.idx_q + joint.nq][:, -4:], 1, axis=1)
-            if KINDS[kind].motions:
+            if is_jointed:
                 turn = _joint_turns(model, bodies[j], q[:, joint.idx_q :])
                 far = model.body[bodies[j], 0]
                 above = model.turn[bodies[j], 0]
@@ -294,11 +292,11 @@ class PinocchioChain:
     def _frame_in_joint(self, k: int, turn: Array) -> Array:
         """Return a quaternion given in body k, −1 the world, as one in the frame of the body's joint."""
         model = self.source_model
-        while k >= 0 and model.kind[k] == "weld":
+        while k >= 0 and model.kinds[k].is_rigid:
             far, near = model.turn[k]
             turn = quaternion_product(quaternion_product(far, quaternion_conjugate(near)), turn)
             k = int(model.body[k, 0])
-        if k >= 0 and KINDS[model.kind[k]].motions:
+        if k >= 0 and model.kinds[k].motions:
             turn = quaternion_product(quaternion_conjugate(model.turn[k, 1]), turn)
         return turn
 
@@ -515,7 +513,7 @@ class PinocchioChain:
                 state.u[k]
             )
         for k, row in enumerate(self.body_rows):
-            if model.kind[k] != "weld":
+            if not model.kinds[k].is_rigid:
                 spin[row] = self.placements[k].rotation @ jacobian[k, 3:]
         t = np.eye(3 * nj)  # takes absolute rates to those of spherical joints
         spherical = [j for j, joint in enumerate(self.joints) if joint.shortname() == "JointModelSpherical"]
@@ -529,11 +527,11 @@ class PinocchioChain:
         for row in spherical:
             rates[self.joints[row].idx_v :][:3] = relative_spin[row]
         for k, own in enumerate(own_rates(model)):
-            kind, joint = model.kind[k], self.joints[self.body_rows[k]]
-            if kind == "free":
+            kind, joint = model.kinds[k], self.joints[self.body_rows[k]]
+            if kind.holds_nothing:
                 rates[joint.idx_v :][:3, own][:, :3] = rotation_matrix(state.p[k]).T
                 rates[joint.idx_v + 3 :][:3, own][:, 3:] = np.eye(3)
-            elif KINDS[kind].motions:
+            elif kind.motions:
                 rates[joint.idx_v : joint.idx_v + joint.nv, own] = np.eye(joint.nv)
         return np.asarray(rates.T @ pin.crba(self.pin_model, self.data, q) @ rates)
 
@@ -545,7 +543,7 @@ class PinocchioChain:
         data, model = self.data, self.source_model
         wrench = [data.f[j].copy() for j in self.body_joints]
         for k in reversed(range(model.n)):
-            if model.kind[k] != "weld":
+            if not model.kinds[k].is_rigid:
                 continue
             j = self.body_joints[k]
             inertia = self.placements[k].act(pin.Inertia(model.mass[k], np.zeros(3), model.inertia[k]))
@@ -554,7 +552,7 @@ class PinocchioChain:
                 need = need + self._in_frame_of(j, self.body_joints[child], wrench[child])
             wrench[k] = need
         for k in range(model.n):
-            if model.kind[k] == "weld":
+            if model.kinds[k].is_rigid:
                 wrench[k] = translation(self.placements[k].act(model.proximal[k])).actInv(wrench[k])
         return wrench
 
@@ -600,7 +598,7 @@ class PinocchioChain:
 def _joint_turns(model: Model, k: int, x: Array) -> Array:
     """Return the quaternions (T, 4) of joint k at coordinates x (T, ≥ motions), its own axes."""
     turn = np.tile([1.0, 0.0, 0.0, 0.0], (len(x), 1))
-    for i, (what, axis) in enumerate(KINDS[model.kind[k]].motions):
+    for i, (what, axis) in enumerate(model.kinds[k].motions):
         if what == "turn":
             half = np.zeros_like(turn)
             half[:, 0], half[:, 1 + axis] = np.cos(x[:, i] / 2), np.sin(x[:, i] / 2)

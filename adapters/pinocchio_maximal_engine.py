@@ -38,7 +38,7 @@ from adapters.pinocchio_common import (
     point_acceleration,
     translation,
 )
-from plumbline.model.datatypes import KINDS, Array, Model, State, StateQuantities, Unsupported
+from plumbline.model.datatypes import Array, Model, State, StateQuantities, Unsupported
 from plumbline.model.kinematics import JointFrame, joint_coordinates, rotation_matrix, velocity_jacobian
 from plumbline.model.loops import independent_rows
 from plumbline.model.welding import BodyParts
@@ -85,7 +85,7 @@ class _FreeFlyerSystem:
         force = np.matvec(turn.mT, model.force) - model.drag_force[:, None] * local
         moment = model.moment - model.drag_moment[:, None] * state.omega
         tau = np.hstack([force, moment]).ravel()
-        if self.use_kkt_inverse or model.has_loops or set(model.kind) != {"ball"}:
+        if self.use_kkt_inverse or model.has_loops or not all(kind.is_spherical for kind in model.kinds):
             reaction, moment = self._solve_constraint_rows(state, q, v, tau)
         else:
             pin.constraintDynamics(engine, data, q, v, tau, self.contacts, self.contact_data)
@@ -152,7 +152,7 @@ class _FreeFlyerSystem:
             for f in frames
         )  # fmt: skip
         jacobian, drift = j_near - j_far, drift_near - drift_far
-        if KINDS[model.kind[k]].has_attitude:
+        if model.kinds[k].has_attitude:
             return jacobian, drift
         placements = [data.oMf[f] for f in frames]
         d = placements[0].translation - placements[1].translation
@@ -171,9 +171,9 @@ class _FreeFlyerSystem:
 
     def _held_directions(self, k: int, state: State) -> tuple[Array, Array]:
         """Unit vectors (c, 3) along which joint k holds the near point, and about which it holds the body."""
-        model, kind = self.source_model, self.source_model.kind[k]
-        if KINDS[kind].has_attitude:
-            push = {"rod": self.u[k : k + 1], "ball": np.eye(3), "free": np.zeros((0, 3))}[kind]
+        model, kind = self.source_model, self.source_model.kinds[k]
+        if kind.has_attitude:
+            push = self.u[k : k + 1] if kind.holds_distance else np.eye(3)[: len(kind.rows)]
             return push, np.zeros((0, 3))
         far = self.data.oMf[self.far_frames[k]].rotation
         axes = JointFrame(model, k, far).axes(self.x[k])

@@ -62,7 +62,8 @@ class Elements:
                     or m.stiffness[k, column]
                     or m.effort[k, column]
                 ):
-                    found.append((k, column, axis, what == "slide", i == 0 and not kind.is_spherical))
+                    is_far = not kind.is_spherical and (i == 0 or axis in kind.slide_axes[1:])
+                    found.append((k, column, axis, what == "slide", is_far))
         table = np.array(found, np.intp).reshape(-1, 5).T
         self.joint, self.column, self.axis = table[:3]
         self.is_slide, self.is_far = table[3:].astype(bool)  # is_far: its axis is fixed in the far body
@@ -92,7 +93,7 @@ class Elements:
             (J, 2) each [rad or m, and 1/s of it]; zeros where there are no elements.
 
         """
-        found, values = self.evaluate(r, p, v, pdot, x), np.zeros((2, len(self.mechanism.kind), 2))
+        found, values = self.evaluate(r, p, v, pdot, x), np.zeros((2, *self.mechanism.armature.shape))
         values[:, self.joint, self.column] = found.stretch + self.rest, found.rate
         return values[0], values[1]
 

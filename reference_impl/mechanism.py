@@ -75,10 +75,14 @@ class Mechanism:
     spring_length: Array = field(default_factory=_no_numbers)  # (K,) m, l₀
 
     def __post_init__(self) -> None:
-        """Give joints without passive elements zeros."""
-        for name in JOINT_ELEMENTS:
-            if not getattr(self, name).size:
-                object.__setattr__(self, name, np.zeros((len(self.kind), 2)))
+        """Give joints without passive elements zeros, and all elements a column per coordinate."""
+        given = [getattr(self, name) for name in JOINT_ELEMENTS]
+        columns = max(2, *(len(kind.motions) for kind in self.kinds), *(x.shape[1] for x in given))
+        for name, values in zip(JOINT_ELEMENTS, given, strict=True):
+            if values.shape != (len(self.kind), columns):
+                full = np.zeros((len(self.kind), columns))
+                full[: len(values), : values.shape[1]] = values
+                object.__setattr__(self, name, full)
 
     @classmethod
     def chain(
@@ -215,6 +219,11 @@ class Mechanism:
     def distal(self) -> Array:
         """(N, 3) m, body frame: the point of body k on which body k+1 of a chain hangs; 0 for the last."""
         return np.concatenate([self.point[1:, 0], np.zeros_like(self.point[:1, 0])])
+
+    @property
+    def columns(self) -> int:
+        """Columns of joint coordinates and elements: 2, or as many as a joint has motions."""
+        return int(self.armature.shape[1])
 
     @property
     def rods(self) -> NDArray[np.bool_]:

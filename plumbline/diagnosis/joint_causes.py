@@ -230,7 +230,7 @@ def _coordinates(model: Model) -> list[tuple[int, int]]:
 
 def _shift_is_askew(model: Model, k: int) -> bool:
     """Whether another origin of a slide is more than a coordinate of its far point."""
-    along = rotation_matrix(model.turn[k, 0])[:, 2]
+    along = rotation_matrix(model.turn[k, 0])[:, model.kinds[k].motions[0][1]]
     return bool(model.stiffness[k, 0] or np.count_nonzero(np.abs(along) > ACCEPTED_SHARE) > 1)
 
 
@@ -303,7 +303,7 @@ def _shifted_slide(k: int) -> Callable[[Model, float], Model]:
     """Count a slide's coordinate, spring included, from a point further along its axis."""
 
     def change(model: Model, x: float) -> Model:
-        along = rotation_matrix(model.turn[k, 0])[:, 2]
+        along = rotation_matrix(model.turn[k, 0])[:, model.kinds[k].motions[0][1]]
         moved = one_number("point", (k, 0))(model, model.point[k, 0] + x * along)
         return one_number("rest", (k, 0))(moved, model.rest[k, 0] - x)
 

@@ -128,7 +128,7 @@ def _single_misreadings(model: Model) -> Iterator[tuple[str, Misreading]]:
                 pair = getattr(model, name)[k]
                 if pair[0] != pair[1]:
                     words = f"{element_words(name)} of the two coordinates of joint {k + 1} were exchanged"
-                    yield words, _number(name, k, pair[::-1])
+                    yield words, _number(name, k, pair[[1, 0, *range(2, len(pair))]])
         yield from _body_misreadings(model, k)
         for i in range(len(model.kinds[k].motions)):
             if model.stiffness[k, i]:
@@ -420,7 +420,7 @@ def _has_place(model: Model, name: str) -> Array:
         return np.ones(1)
     is_idle = name in ("rest", "effort")
     counts = [len(kind.motions) or int(kind.is_spherical and not is_idle) for kind in model.kinds]
-    return np.asarray(np.arange(2) < np.array(counts)[:, None], float)
+    return np.asarray(np.arange(model.columns) < np.array(counts)[:, None], float)
 
 
 def _joint_field(name: str, k: int, value: Array) -> Misreading:

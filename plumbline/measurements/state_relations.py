@@ -146,7 +146,7 @@ def _halve_forces(answers: StateQuantities) -> dict[str, Array]:
 
 def _scale_lengths(model: Model, state: State) -> tuple[Model, State]:
     """Lengths × 4 and times × 2."""
-    slides = np.zeros((len(model.kind), 2), bool)
+    slides = np.zeros((len(model.kind), model.columns), bool)
     for k, kind in enumerate(model.kinds):
         slides[k, : len(kind.motions)] = [what == "slide" for what, _ in kind.motions]
 

@@ -143,7 +143,7 @@ def _joint_values(model: Model, k: int) -> Iterator[tuple[str, str, Index, Array
     if model.rods[k] and k < model.n:  # of a closing rod it follows from the state
         yield "length", "length", (k,), 1.0
     for name in JOINT_ELEMENTS:
-        for i in range(2):
+        for i in range(model.columns):
             yield f"{name} {i + 1}", name, (k, i), 0.0
     if k >= model.n:
         return

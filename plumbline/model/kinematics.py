@@ -224,7 +224,7 @@ def state_from_minimal(
         The state, on the constraint manifold to rounding.
 
     """
-    pair, vector = np.zeros((model.n, 2)), np.zeros((model.n, 3))
+    pair, vector = np.zeros((model.n, model.columns)), np.zeros((model.n, 3))
     start = State(
         p=p,
         omega=omega,
@@ -282,7 +282,9 @@ def forward_kinematics(
     """
     model = model.tree
     r, v = (np.zeros(omega.shape) if given is None else given.copy() for given in (r, v))
-    x, xdot = (np.zeros((*omega.shape[:-1], 2)) if given is None else given for given in (x, xdot))
+    x, xdot = (
+        np.zeros((*omega.shape[:-1], model.columns)) if given is None else given for given in (x, xdot)
+    )
     p, omega = p.copy(), omega.copy()
     A = rotation_matrix(p)  # (..., N, 3, 3)
     for k, (kind, far) in enumerate(zip(model.kinds, model.body[:, 0], strict=True)):
@@ -358,7 +360,7 @@ class JointFrame:
             "turn" or "slide" and the axis (3,), of every motion.
 
         """
-        rates = [self.motion(x, unit)[1] for unit in np.eye(2)]
+        rates = [self.motion(x, unit)[1] for unit in np.eye(len(self.motions))]
         return [(what, rate[what == "turn"]) for (what, _), rate in zip(self.motions, rates, strict=False)]
 
 
@@ -587,7 +589,7 @@ def coordinates_of_joints(
 
     """
     a = rotation_matrix(state.p)
-    u, udot, x, xdot = (np.zeros((len(joints), size)) for size in (3, 3, 2, 2))
+    u, udot, x, xdot = (np.zeros((len(joints), size)) for size in (3, 3, model.columns, model.columns))
     omega, d = rotate_vectors(a, state.omega), joint_vectors(model, state.r, state.p)
     for at, k in enumerate(joints):
         far, near = model.body[k]

@@ -115,16 +115,16 @@ def with_elements(rng: np.random.Generator, model: Model, elements: Sequence[str
         The mechanism with the elements.
 
     """
-    n, count, fields = model.n, len(model.kind), dict[str, Any]()
-    scalar = np.array([[i < len(kind.motions) for i in range(2)] for kind in model.kinds])
-    balls = np.array([[kind.is_spherical, False] for kind in model.kinds])
+    n, fields = model.n, dict[str, Any]()
+    scalar = np.array([[i < len(kind.motions) for i in range(model.columns)] for kind in model.kinds])
+    balls = np.array([[kind.is_spherical, *[False] * (model.columns - 1)] for kind in model.kinds])
     for name in ("armature", "damping", "stiffness"):
         if name in elements:
-            fields[name] = rng.uniform(0.1, 2.0, (count, 2)) * (scalar | balls)
+            fields[name] = rng.uniform(0.1, 2.0, scalar.shape) * (scalar | balls)
     if "stiffness" in elements:
-        fields["rest"] = rng.normal(size=(count, 2)) * scalar
+        fields["rest"] = rng.normal(size=scalar.shape) * scalar
     if "effort" in elements:
-        fields["effort"] = rng.normal(size=(count, 2)) * scalar
+        fields["effort"] = rng.normal(size=scalar.shape) * scalar
     if "springs" in elements and n > 1:
         ends = [rng.choice(n, 2, replace=False) for _ in range(SPRINGS)]
         ends[0][rng.integers(2)] = -1
@@ -176,7 +176,7 @@ def close_loop(
         point=np.concatenate([model.point, [[point, at]]]),
         turn=np.concatenate([model.turn, [[axes / np.linalg.norm(axes), turn]]]),
         length=np.append(model.length, length),
-        **{name: np.vstack([getattr(model, name), np.zeros((1, 2))]) for name in JOINT_ELEMENTS},
+        **{name: np.vstack([getattr(model, name), np.zeros((1, model.columns))]) for name in JOINT_ELEMENTS},
     )
 
 

@@ -74,7 +74,7 @@ class Rearranged:
                 if 0 <= place < self.model.n:
                     is_swapped = self.model.kinds[place].exchanges_axes and name.startswith("x")
                     if self.is_reversed[k]:
-                        value = -value[::-1] if is_swapped else -value
+                        value = -value[_swapped(len(value))] if is_swapped else -value
                     values[place] = value
             fields[name] = values
         return complete_state(self.model, State(**fields))
@@ -148,14 +148,14 @@ def _rearranged(
     for to in range(max(model.n, int(np.max(joint)) + 1)):
         if to not in sources:
             free = (FREE, [-1, to], np.zeros((2, 3)), np.tile([1.0, 0, 0, 0], (2, 1)), 0.0)
-            for name, value in zip(JOINT_FIELDS, (*free, *np.zeros((5, 2))), strict=True):
+            for name, value in zip(JOINT_FIELDS, (*free, *np.zeros((5, model.columns))), strict=True):
                 fields[name].append(value)
             continue
         k = sources[to]
         flip = -1 if is_reversed[k] else 1
-        turn, swap = model.turn[k][::flip], slice(None)
+        turn, swap = model.turn[k][::flip], list(range(model.columns))
         if is_reversed[k] and model.kinds[k].exchanges_axes:  # its axes x and y change places
-            turn, swap = quaternion_product(turn, EXCHANGE), slice(None, None, -1)
+            turn, swap = quaternion_product(turn, EXCHANGE), _swapped(model.columns)
         fields["kind"].append(model.kind[k])
         fields["body"].append(world[model.body[k]][::flip])
         fields["point"].append(model.point[k][::flip])
@@ -169,6 +169,11 @@ def _rearranged(
         changes[name] = getattr(model, name)[order]
     other = replace(model, kind=tuple(fields["kind"]), spring_body=world[model.spring_body], **changes)
     return Rearranged(other, order, joint, is_reversed)
+
+
+def _swapped(columns: int) -> list[int]:
+    """The columns of coordinates with the first two exchanged."""
+    return [1, 0, *range(2, columns)]
 
 
 def joints_as_cylinders(model: Model) -> Model:
@@ -247,7 +252,6 @@ def joints_as_rods(model: Model) -> Model:
     new = len(body)
     kind += [ROD] * new
     identity = np.tile([1.0, 0.0, 0.0, 0.0], (new, 2, 1))
-    elements = {name: np.concatenate([getattr(model, name), np.zeros((new, 2))]) for name in JOINT_ELEMENTS}
     return replace(
         model,
         kind=tuple(kind),
@@ -255,7 +259,7 @@ def joints_as_rods(model: Model) -> Model:
         point=np.concatenate([model.point, point]),
         turn=np.concatenate([model.turn, identity]),
         length=np.concatenate([model.length, np.full(new, np.sqrt(2.0) * size)]),
-        **elements,
+        **{name: np.pad(getattr(model, name), ((0, new), (0, 0))) for name in JOINT_ELEMENTS},
     )
 
 

@@ -85,7 +85,7 @@ def random_states(model: Model, count: int, seed: int) -> list[State]:
     u /= np.linalg.norm(u, axis=-1, keepdims=True)
     u, udot = (np.where(model.rods[:, None], x, 0.0) for x in (u, cross(udot, u)))
     free = model.free[:, None]
-    x, xdot, r, v = (np.zeros((count, model.n, size)) for size in (2, 2, 3, 3))
+    x, xdot, r, v = (np.zeros((count, model.n, size)) for size in (model.columns, model.columns, 3, 3))
     for k in range(count if not all(kind.holds_no_turn for kind in model.kinds) else 0):
         for i, kind in enumerate(model.kinds):
             for j, (motion, _) in enumerate(kind.motions):

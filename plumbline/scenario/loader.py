@@ -272,7 +272,7 @@ def build_scenario(source: YamlSource, path: Path) -> Scenario:
     with np.errstate(all="ignore"):
         tree = _build_model(document, [body for body, _ in bodies], far, springs)
         model = _add_closing_joints(tree, document, closed)
-        state = state_from_minimal(model, *_minimal_coordinates(bodies))
+        state = state_from_minimal(model, *_minimal_coordinates(bodies, model.columns))
         state = _closed_state(source, model, state, [body for body, _ in bodies])
         distances = np.linalg.norm(spring_vectors(model, state.r, state.p), axis=-1)
     for k in np.flatnonzero(distances <= INPUT_ROUNDING * np.max(np.abs(model.spring_point), initial=0.0)):
@@ -483,7 +483,7 @@ def _add_closing_joints(tree: Model, document: Document, closed: NDArray[np.intp
     if not len(closed):
         return tree
     joints = [end.joint for end in document.closes]
-    elements = _joint_elements(joints)
+    elements = _joint_elements(joints, tree.columns)
     points = np.array([[end.anchor, end.proximal] for end in document.closes], dtype=float)
     lengths = [joint.length if isinstance(joint, ClosingRod) else 0.0 for joint in joints]
     return replace(
@@ -524,9 +524,9 @@ def _closed_state(source: YamlSource, model: Model, state: State, bodies: list[B
     return without_still_rates(model, found)
 
 
-def _joint_elements(joints: Sequence[Any]) -> dict[str, Array]:
-    """The elements of all joints (N, 2), zeros where there are none."""
-    found = {name: np.zeros((len(joints), 2)) for name in JOINT_ELEMENTS}
+def _joint_elements(joints: Sequence[Any], columns: int) -> dict[str, Array]:
+    """The elements of all joints, zeros where there are none."""
+    found = {name: np.zeros((len(joints), columns)) for name in JOINT_ELEMENTS}
     for name, values in found.items():
         for k, joint in enumerate(joints):
             given = getattr(joint, name, None) or []
@@ -555,6 +555,8 @@ def _build_model(
     document: Document, bodies: list[Body], far: list[int], spring_body: NDArray[np.intp]
 ) -> Model:
     free = np.array([body.joint.kind == FREE for body in bodies])
+    joints = [*(body.joint for body in bodies), *(end.joint for end in document.closes)]
+    motions = [KINDS[joint.kind].motions for joint in joints]
     points = [[_far_point(bodies, k, far[k]), body.proximal] for k, body in enumerate(bodies)]
     return Model(
         kind=tuple(body.joint.kind for body in bodies),
@@ -569,7 +571,7 @@ def _build_model(
         moment=np.array([body.load.moment for body in bodies], dtype=float),
         drag_force=np.array([body.drag.force for body in bodies], dtype=float),
         drag_moment=np.array([body.drag.moment for body in bodies], dtype=float),
-        **_joint_elements([body.joint for body in bodies]),
+        **_joint_elements([body.joint for body in bodies], max(2, *map(len, motions))),
         spring_body=spring_body,
         spring_point=np.array([spring.points for spring in document.springs], dtype=float).reshape(-1, 2, 3),
         spring_stiffness=np.array([spring.stiffness for spring in document.springs], dtype=float),
@@ -578,11 +580,11 @@ def _build_model(
     )
 
 
-def _minimal_coordinates(bodies: list[tuple[Body, Array]]) -> tuple[Array, ...]:
+def _minimal_coordinates(bodies: list[tuple[Body, Array]], columns: int) -> tuple[Array, ...]:
     """p, omega, u, udot, x, xdot, r, v: unit and perpendicular to rounding."""
     n = len(bodies)
     p, u, udot, r, v = np.empty((n, 4)), *np.zeros((4, n, 3))
-    x, xdot = np.zeros((2, n, 2))
+    x, xdot = np.zeros((2, n, columns))
     for k, (body, turn) in enumerate(bodies):
         if body.attitude is None:
             p[k] = 1.0, 0.0, 0.0, 0.0

@@ -251,7 +251,7 @@ def perturbed_models(model: Model, state: State) -> list[tuple[Model, State]]:
 
 def _with_longer_slides(model: Model, state: State, size: float) -> dict[str, Array]:
     """The joint coordinates of a state with shifts ``size`` times as long."""
-    factors = np.ones((model.n, 2))
+    factors = np.ones_like(state.x)
     for k, kind in enumerate(model.kind[: model.n]):
         for i, (what, _) in enumerate(KINDS[kind].motions):
             factors[k, i] = size if what == "slide" else 1.0

@@ -345,7 +345,7 @@ def _disturbed(model: Model, state: State, bound: RoundingBound) -> State:
     omega = state.omega + (size * tolerance)[:, None] * rng.normal(size=(model.n, 3))
     if model.is_chain:
         return state_from_minimal(model, state.p, omega, state.u, state.udot)
-    xdot = state.xdot + (size * tolerance)[:, None] * rng.normal(size=(model.n, 2))
+    xdot = state.xdot + (size * tolerance)[:, None] * rng.normal(size=state.xdot.shape)
     v = state.v + (size * np.asarray(bound.acceleration))[:, None] * rng.normal(size=(model.n, 3))
     return complete_state(model, replace(state, omega=omega, xdot=xdot, v=v))
 

@@ -242,12 +242,10 @@ class _Stepper:
         self.q, self.v, self.rtol, self.sweep_tolerance = q, v, rtol, quiet
         self.dense, self.baumgarte = dense, baumgarte
         # joint coordinates near which the angles of springs are taken, carried on by their rates
-        self.x, self.x_rate = (
-            np.zeros((forest.joint_count, 2)),
-            np.zeros((len(table.c), forest.joint_count, 2)),
-        )
+        self.x = np.zeros((forest.joint_count, 2))
         if isinstance(forest, TreeSystem) and forest.winding:
             self.x = forest.winding.coordinates(q[:3].T, q[3:].T, v[:3].T, v[3:].T, forest.x)[0]
+        self.x_rate = np.zeros((len(table.c), *self.x.shape))
         self.q_compensation, self.v_compensation = (
             np.zeros_like(q),
             np.zeros_like(v),
@@ -337,7 +335,7 @@ class _Stepper:
                 rate = tile.winding.coordinates(r, p, v, pdot)[1]
                 self.x_rate[nodes] = rate.reshape(-1, *self.x.shape)
         for nodes, tile in systems:
-            tile.x = (self.x + np.tensordot(hA[nodes], self.x_rate, 1)).reshape(-1, 2)
+            tile.x = (self.x + np.tensordot(hA[nodes], self.x_rate, 1)).reshape(-1, self.x.shape[1])
 
     def _extrapolated_acceleration(self, ratio: float) -> Array:
         """The last step's polynomial at the nodes of the next one, cut where its terms there are smallest.
