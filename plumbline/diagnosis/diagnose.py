@@ -39,7 +39,7 @@ from plumbline.engines.registry import load_adapter
 from plumbline.model.datatypes import Array, Model, State, StateQuantities
 from plumbline.model.kinematics import state_from_minimal
 from plumbline.truth.ground_truth import StateTruth
-from plumbline.truth.rounding_bound import state_rounding_bound
+from plumbline.truth.rounding_bound import rounding_bounds
 
 QUANTITIES = (
     "acceleration", "angular_acceleration", "joint_reaction", "kinetic_energy", "potential_energy",
@@ -303,7 +303,7 @@ def _localise_difference(model: Model, difference: ObservedDifference, evaluate:
     def persists(changed: Model, at: list[State]) -> bool:
         answers = evaluate(changed, at)
         expected = evaluate_case(make_defect_case(changed, at))
-        bounds = [state_rounding_bound(changed, s) for s in at]
+        bounds = rounding_bounds(changed, at)
         return any(
             not max_error_ratio(
                 np.array([np.asarray(getattr(a, q), float) for a in answers]) - expected[q],

@@ -18,6 +18,7 @@ from plumbline.diagnosis.joint_causes import ACCEPTED_SHARE, FACTORS, JointCause
 from plumbline.diagnosis.joint_prediction import VECTORS, Predictor, Seen
 from plumbline.diagnosis.misreadings import Misreading, misreadings, other_branches
 from plumbline.diagnosis.row_defects import missing_gammas, row_defects, velocity_terms
+from plumbline.equations.responses import EndRows
 from plumbline.model.datatypes import Array, Model, State, StateQuantities
 from plumbline.model.kinematics import (
     JointFrame,
@@ -28,7 +29,6 @@ from plumbline.model.kinematics import (
 )
 from plumbline.truth.ground_truth import StateTruth
 from plumbline.truth.parameter_effects import evaluate_models, evaluate_to_first_order, stack_states
-from plumbline.truth.rounding_bound_tree import EndRows
 from reference_impl.errors import SingularSystem
 
 MAX_STATES = 2  # at which causes are fitted: those of the largest difference

@@ -6,11 +6,12 @@ state; an engine in maximal coordinates evaluates the bodies where they are, loo
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from plumbline.equations.responses import EndRows, Responses
 from plumbline.model.datatypes import Array, Model, State
 from plumbline.model.invariants import kinetic_energy, potential_energy
 from plumbline.model.kinematics import (
@@ -24,10 +25,14 @@ from plumbline.model.kinematics import (
     rotation_matrix,
 )
 from plumbline.model.loops import cut_open, determinate_projectors, wrench_length
-from plumbline.truth.rounding_bound_tree import EndRows, RowChange, tree_solution
 from reference_impl.direct import DirectSystem
 from reference_impl.joints import constraint_rows
 
+# What joint k holds, as a defect changes it: the directions E (6, c), and the relative acceleration (6,) that
+# velocities cause.
+RowChange = Callable[[int, Array, Array], tuple[Array, Array]]
+RELEASED = 1e-9  # of a direction: what a change of rows leaves of it
+MAX_CONDITION = 1e14  # of the inertia that released directions have
 VECTORS = ("acceleration", "angular_acceleration", "joint_reaction", "joint_moment")
 
 
@@ -54,7 +59,7 @@ class Predictor:
 
         Args:
             are_bodies_kept: whether bodies are where the states have them, not where coordinates put them.
-            end_rows: of `tree_solution`, of the loops.
+            end_rows: of `Responses`, of the loops.
 
         """
         self.model, self.states, self.are_bodies_kept = model, states, are_bodies_kept
@@ -109,7 +114,8 @@ def _of_cut(seen: Seen, end_rows: EndRows) -> dict[str, Array]:
     if change is not None:
         rows = lambda k, held, bend: change(int(joints[k]), held, bend)  # noqa: E731
     ends = [pair for i, pair in enumerate(cut.ends) if i != seen.open_loop]
-    values = _of_tree(cut.model, there, tree_solution(cut.model, there, ends, rows, end_rows))
+    solution = tree_solution(cut.model, there, ends, rows, end_rows, cut.row_scale)
+    values = _of_tree(cut.model, there, solution)
     for name in VECTORS:
         values[name] = values[name][cut.place if name.startswith("joint") else cut.place[: seen.model.n]]
     return values
@@ -131,3 +137,71 @@ def _of_bodies(seen: Seen) -> dict[str, Array]:
         "joint_moment": found.joint_moment,
     }
     return values | _energies(model, state)
+
+
+def tree_solution(
+    model: Model,
+    state: State,
+    ends: Sequence[tuple[int, int]] = (),
+    rows: RowChange | None = None,
+    end_rows: EndRows = "accelerations",
+    row_scale: Array | None = None,
+) -> Array:
+    """Solve the equations of a tree in doubles, with changed rows of its joints.
+
+    Args:
+        ends: pairs of bodies that are joined besides, parts of one body.
+        rows: changes what joints hold.
+        row_scale: factors that make the rows of the ends comparable.
+
+    Returns:
+        (4, N, 3): r̈ [m/s²], ω̇ [rad/s²], and force [N] and moment [N m] of the joints; world axes.
+
+    """
+    scale = None if row_scale is None else row_scale[: 6 * len(ends)]
+    found = Responses(model, [state], ends, scale, end_rows)
+    solution = found.solution[0]  # (N, 4, 3)
+    if rows is not None:
+        true = [(held[0], -own) for held, own in zip(found.held, found.velocity_terms()[0], strict=True)]
+        changed = [rows(k, *own) for k, own in enumerate(true)]
+        jumps = [-held.T @ (bend - old) for (held, old), (_, bend) in zip(true, changed, strict=True)]
+        responses = found.to_joints()[0]
+        solution = solution + responses @ np.concatenate(jumps)
+        solution = _released(solution, responses, found.indeterminate[0], true, changed)
+    return np.asarray(np.moveaxis(solution, 0, 1))
+
+
+def _released(
+    solution: Array,
+    responses: Array,
+    indeterminate: Array,
+    true: Sequence[tuple[Array, Array]],
+    changed: Sequence[tuple[Array, Array]],
+) -> Array:
+    """Let joints move where they no longer hold: by as much as makes their wrenches there 0."""
+    along = np.zeros((sum(held.shape[1] for held, _ in true), 0))  # directions that are released
+    wrench = np.zeros((0, 6 * len(true)))
+    first = 0
+    for k, ((held, _), (left, _)) in enumerate(zip(true, changed, strict=True)):
+        last = first + held.shape[1]
+        if left.shape[1] < held.shape[1]:
+            free = np.linalg.svd(held.T @ left)[0][:, left.shape[1] :]
+            own, rows = np.zeros((len(along), free.shape[1])), np.zeros((free.shape[1], 6 * len(true)))
+            own[first:last], rows[:, 6 * k : 6 * k + 6] = free, (held @ free).T
+            along, wrench = np.concatenate([along, own], 1), np.concatenate([wrench, rows])
+        first = last
+    if not len(wrench):
+        return solution
+    lost = wrench @ indeterminate  # released where others hold as well, a joint does not move
+    _, sizes, directions = np.linalg.svd(lost.T)
+    moving = directions[int(np.sum(sizes > RELEASED)) :].T
+    of_joints = responses[:, 2:].reshape(len(indeterminate), -1) @ along
+    now = wrench @ solution[:, 2:].ravel()
+    inertia = moving.T @ wrench @ of_joints @ moving
+    if inertia.size and np.linalg.cond(inertia) > MAX_CONDITION:
+        raise np.linalg.LinAlgError("a body can turn without inertia")
+    amounts = np.linalg.solve(inertia, -moving.T @ now)
+    solution = solution + responses @ (along @ moving @ amounts)
+    balance = indeterminate @ np.linalg.lstsq(lost, -(wrench @ solution[:, 2:].ravel()), RELEASED)[0]
+    solution[:, 2:] += balance.reshape(-1, 2, 3)
+    return solution

@@ -6,11 +6,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from plumbline.diagnosis.joint_prediction import Seen
+from plumbline.diagnosis.joint_prediction import RowChange, Seen
 from plumbline.diagnosis.misreadings import Misreading
 from plumbline.model.datatypes import Array, Model, State
 from plumbline.model.kinematics import complete_state, rotation_matrix
-from plumbline.truth.rounding_bound_tree import RowChange
 
 NOT_HELD = 1e-9  # of a direction: what the joint holds of it
 

@@ -454,12 +454,8 @@ class Tree:
         num, model, s, w = self.num, self.model, self.near[k], self.w[k]
         c, b, i = self._inertia(k)
         m = num.scalar(model.mass[..., k])
-        load = num.vector(model.gravity) * m + num.vector(model.force[..., k, :])
-        moment = num.mul(self.A[k], num.vector(model.moment[..., k, :])) - num.cross(w, self._spin(k))
-        if np.any(model.drag_force[..., k]):
-            load = load - self.v[k] * num.scalar(model.drag_force[..., k])
-        if np.any(model.drag_moment[..., k]):
-            moment = moment - w * num.scalar(model.drag_moment[..., k])
+        load, moment = self._own_load(k)
+        load, moment = load + num.vector(model.gravity) * m, moment - num.cross(w, self._spin(k))
         f = -num.cross(w, num.cross(w, s)) * m - load
         n = -num.cross(s, f) - moment
         if pull is not None:
@@ -469,6 +465,55 @@ class Tree:
             f = num.columns([f, *(-force for force, _ in own)])
             n = num.columns([n, *(num.cross(s, force) - moment for force, moment in own)])
         return Articulated(c, b, i, f, n)
+
+    def _own_load(self, k: int) -> tuple[Any, Any]:
+        """Load and drag of body k: force and moment about its centre of mass."""
+        num, model = self.num, self.model
+        load = num.vector(model.force[..., k, :])
+        moment = num.mul(self.A[k], num.vector(model.moment[..., k, :]))
+        if np.any(model.drag_force[..., k]):
+            load = load - self.v[k] * num.scalar(model.drag_force[..., k])
+        if np.any(model.drag_moment[..., k]):
+            moment = moment - self.w[k] * num.scalar(model.drag_moment[..., k])
+        return load, moment
+
+    def loads(self) -> list[tuple[Any, Any]]:
+        """Sum loads, drag and springs between points over each body.
+
+        Returns:
+            Forces, and moments about the centres of mass.
+
+        """
+        pulls, found = self._pulls()[0], list[tuple[Any, Any]]()
+        for k in range(self.model.n):
+            load, moment = self._own_load(k)
+            if k in pulls:
+                force, about_near = pulls[k]
+                load, moment = load + force, moment + about_near + self.num.cross(self.near[k], force)
+            found.append((load, moment))
+        return found
+
+    def coasting(self) -> tuple[list[Any], list[Any]]:
+        """Find what the velocities alone cause, where no coordinate of a joint accelerates.
+
+        Returns:
+            Accelerations of the centres of mass, and angular accelerations.
+
+        """
+        num, at, acceleration, turning = self.num, list[Any](), list[Any](), list[Any]()
+        for k, far in enumerate(self.far):
+            a, alpha = self._bias[k]
+            if far >= 0:
+                a = a + at[far] - num.mul(num.cross_matrix(self.arm[k]), turning[far])
+                alpha = alpha + turning[far]
+            if KINDS[self.model.kind[k]].holds_distance:
+                swing = self.blocks[k][0]
+                a = a + swing.u * swing.pull
+            s, w = self.near[k], self.w[k]
+            at.append(a)
+            turning.append(alpha)
+            acceleration.append(a + num.cross(s, alpha) - num.cross(w, num.cross(w, s)))
+        return acceleration, turning
 
     def _inertia(self, k: int) -> tuple[Any, Any, Any]:
         """c, b and i of body k by itself."""

@@ -47,7 +47,7 @@ from plumbline.model.redescription import (
     state_of_balls,
 )
 from plumbline.model.welding import split_bodies
-from plumbline.truth.rounding_bound import RoundingBound, state_rounding_bound
+from plumbline.truth.rounding_bound import RoundingBound, rounding_bounds, state_rounding_bound
 
 WELDED_HALVES = "two welded halves"
 ROOT_MOVED, JOINTS_AS_RODS = "root moved", "joints as rods"
@@ -275,7 +275,7 @@ def check_state_relations(
     """
     states = states[: MAX_STATES if model.n <= LONG_CHAIN_BODIES else MAX_STATES // 2]
     answers = [evaluate_or_refusal(engine.evaluate, model, state) for state in states]
-    bounds = [state_rounding_bound(model, state) for state in states]
+    bounds = rounding_bounds(model, states)
     others: list[tuple[Relation, Evaluate]] = [
         (relation, engine.evaluate)
         for relation in (*STATE_RELATIONS, *_redescriptions(model))
@@ -285,7 +285,7 @@ def check_state_relations(
         off = ("drag_force", "drag_moment", "damping", "spring_damping")
         lossless = scale_fields(model, **dict.fromkeys(off, 0.0))
         found = [evaluate_or_refusal(engine.evaluate, lossless, state) for state in states]
-        limits = [state_rounding_bound(lossless, state) for state in states]
+        limits = rounding_bounds(lossless, states)
         yield check_state_relation(TIME_REVERSED, found, engine.evaluate, lossless, states, limits, limits)
     if np.any(np.diff(siblings_reversed(model)) < 0):
         others.append((_permute_siblings(model), engine.evaluate))
@@ -306,7 +306,7 @@ def check_state_relations(
 
     if model.has_loops:  # an adapter may cut bodies where loops close, and weld them there
         return
-    welded_bounds = [state_rounding_bound(model, state, split_bodies(model)) for state in states]
+    welded_bounds = rounding_bounds(model, states, split_bodies(model))
     yield check_state_relation(
         Relation(WELDED_HALVES), answers, evaluate_welded, model, states, bounds, welded_bounds
     )

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from plumbline.equations.tree import Solution, Tree
-from plumbline.model.datatypes import Array, Model
+from plumbline.model.datatypes import Array, Model, State
 from plumbline.truth.element_terms import joint_elements, spring_terms
 
 
@@ -210,11 +210,12 @@ def quantity_scales(c: Any, balls: dict[str, Any]) -> dict[str, float]:
     rate = max(rate, float(np.max(np.abs(c.state.xdot))), float(np.max(np.abs(c.state.udot))))
     sizes = (0.0, 0.0, 0.0)
     if model.has_elements:
-        elements, springs = (
-            joint_elements(model, c.state, [np.zeros(6)] * model.n),
-            spring_terms(model, c.state),
+        state = State(**{name: value[None] for name, value in vars(c.state).items()})
+        elements, springs = joint_elements(model, state, np.zeros((1, model.n))), spring_terms(model, state)
+        push, turn = (
+            float(sum(np.sum(e.size) for e in elements if e.is_slide == is_slide))
+            for is_slide in (True, False)
         )
-        push, turn = (sum(e.size for e in elements if e.is_slide == is_slide) for is_slide in (True, False))
-        potential = springs.potential + sum(e.potential for e in elements)
+        potential = float(sum((np.sum(e.potential) for e in elements), np.sum(springs.potential)))
         sizes = push + float(np.sum(springs.size)), turn + float(np.sum(springs.moment_size)), potential
     return term_scales(model, balls, lever, rate, sizes)

@@ -1,19 +1,18 @@
-"""Rotors, springs, dampers and efforts in the rounding bound of trees: their forces, and what is rounded.
+"""Rotors, springs, dampers and efforts in the rounding bound: the sizes of what is rounded in their forces.
 
-Coordinate i of a joint acts along s (6,): a unit force at, and a unit torque about, the near point, world
-axes.  Its torque is e − k (x − x₀) − c ẋ − a ẍ, where ẍ = sᵀ(relative acceleration) + bias.  Engines that
-hold positions find x and l as differences: k multiplies their roundings, of the positions' size.
+The torque of a joint's coordinate is e − k (x − x₀) − c ẋ − a ẍ.  Engines that hold positions find x and the
+lengths of springs as differences: k multiplies their roundings, of the positions' size.  Arrays have a
+leading axis of S states.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from plumbline.model.datatypes import JOINT_ELEMENTS, Array, Model, State
 from plumbline.model.kinematics import (
-    JointFrame,
     ball_spring_rest,
     cross,
     quaternion_conjugate,
@@ -27,135 +26,82 @@ from plumbline.model.kinematics import (
 
 @dataclass(frozen=True, eq=False)
 class JointElement:
-    """The elements along one coordinate of joint k."""
+    """The elements along one coordinate of joint k, of a ball joint about one axis."""
 
     k: int
-    direction: Array  # (6,) s
     is_slide: bool
     armature: float  # kg m² or kg, a
-    torque: float  # N m or N, all but a ẍ
-    bias: float  # rad/s² or m/s², ẍ where no body accelerates
-    size: float  # N m or N, of the terms of the torque, and what their roundings amount to
-    kinetic: float  # J
-    potential: float  # J, of the terms
+    size: Array  # (S,) N m or N, of the terms of the torque, and what their roundings amount to
+    kinetic: Array  # (S,) J
+    potential: Array  # (S,) J, of the terms
 
 
 @dataclass(frozen=True, eq=False)
 class SpringTerms:
-    """Springs between points, summed by the bodies."""
+    """Springs between points: sizes of what is rounded, summed over the bodies."""
 
-    force: Array  # (N, 3) N
-    moment: Array  # (N, 3) N m about the centres, world axes
-    size: Array  # (N,) N
-    moment_size: Array  # (N,) N m
-    potential: float = field(default=0.0)  # J
+    size: Array  # (S, N) N
+    moment_size: Array  # (S, N) N m
+    potential: Array  # (S,) J
 
 
-def joint_elements(model: Model, state: State, bends: list[Array]) -> list[JointElement]:
+def joint_elements(model: Model, state: State, bends: Array) -> list[JointElement]:
     """List the elements of all joints.
 
     Args:
-        bends: per joint the relative acceleration (6,) that velocities alone cause.
+        bends: (S, N) sizes of the relative accelerations that velocities alone cause.
 
     Returns:
         Those coordinates that have any, in the order of the joints.
 
     """
     found: list[JointElement] = []
-    for k in range(model.n if model.has_joint_elements else 0):
-        far, bend = model.body[k, 0], float(np.linalg.norm(bends[k]))
-        spins, reaches, speeds = zip(*(_motion(model, state, b) for b in (k, far)), strict=True)
-        bend += float(np.linalg.norm(spins[0]) * np.linalg.norm(spins[1]))
-        for what, axis, i, x, rate, bias in _coordinates(model, state, k, bends[k], spins):
+    if not model.has_joint_elements:
+        return found
+    norm, lever = np.linalg.norm, 2 * float(np.max(np.abs(model.point)))
+    spin = norm(state.omega, axis=-1)
+    sizes = norm(state.r, axis=-1) + lever, norm(state.v, axis=-1) + lever * spin, spin
+    for k, kind in enumerate(model.kinds[: model.n]):
+        far = model.body[k, 0]
+        reach, speed, rate = (x[:, k] + (x[:, far] if far >= 0 else 0.0) for x in sizes)
+        bend = bends[:, k] + (spin[:, k] * spin[:, far] if far >= 0 else 0.0)
+        coordinates = [(what, i, state.x[:, k, i]) for i, (what, _) in enumerate(kind.motions)]
+        if kind.is_spherical:
+            unloaded = ball_spring_rest(model, k)
+            unloaded = quaternion_product(state.p[:, far], unloaded) if far >= 0 else unloaded
+            turn = rotation_vector(quaternion_product(quaternion_conjugate(unloaded), state.p[:, k]))
+            turn = rotate_vectors(rotation_matrix(unloaded), turn)
+            coordinates = [("turn", 0, angle) for angle in turn.T]
+        for what, i, x in coordinates:
             a, c, stiffness, rest, effort = (float(getattr(model, name)[k, i]) for name in JOINT_ELEMENTS)
             if not (a or c or stiffness or effort):
                 continue
             is_slide = what == "slide"
-            place = sum(reaches) if is_slide else 1.0  # what x is a difference of
-            pace = sum(speeds) if is_slide else sum(float(np.linalg.norm(spin)) for spin in spins)
-            stretch = abs(x) + abs(rest) + place
-            found.append(
-                JointElement(
-                    k=k,
-                    direction=np.concatenate([axis * is_slide, axis * (not is_slide)]),
-                    is_slide=is_slide,
-                    armature=a,
-                    torque=effort - stiffness * (x - rest) - c * rate,
-                    bias=bias,
-                    size=abs(effort) + stiffness * stretch + c * pace + a * bend,
-                    kinetic=a * pace**2 / 2,
-                    potential=stiffness * stretch**2 / 2,
-                )
-            )
+            pace = speed if is_slide else rate
+            stretch = np.abs(x) + abs(rest) + (reach if is_slide else 1.0)  # what x is a difference of
+            size = abs(effort) + stiffness * stretch + c * pace + a * bend
+            found.append(JointElement(k, is_slide, a, size, a * pace**2 / 2, stiffness * stretch**2 / 2))
     return found
 
 
-def _motion(model: Model, state: State, body: int) -> tuple[Array, float, float]:
-    """Angular velocity (3,) of a body, world axes; distance from the origin and speed of its points."""
-    if body < 0:
-        return np.zeros(3), 0.0, 0.0
-    norm, lever = np.linalg.norm, 2 * float(np.max(np.abs(model.point)))
-    spin = rotation_matrix(state.p[body]) @ state.omega[body]
-    return spin, float(norm(state.r[body])) + lever, float(norm(state.v[body]) + lever * norm(spin))
-
-
-def _coordinates(
-    model: Model, state: State, k: int, bend: Array, spins: tuple[Array, ...]
-) -> list[tuple[str, Array, int, float, float, float]]:
-    """What moves, the axis, the column of the elements, x, ẋ and the bias of every coordinate of joint k."""
-    kind, far = model.kinds[k], model.body[k, 0]
-    if kind.is_spherical:
-        rest = ball_spring_rest(model, k)
-        unloaded = quaternion_product(state.p[far], rest) if far >= 0 else rest
-        turn = rotation_vector(quaternion_product(quaternion_conjugate(unloaded), state.p[k]))
-        values = rotation_matrix(unloaded) @ turn, spins[0] - spins[1], -cross(spins[1], spins[0])
-        of_axis = zip(np.eye(3), *(value.tolist() for value in values), strict=True)
-        return [("turn", axis, 0, x, rate, bias) for axis, x, rate, bias in of_axis]
-    if kind.has_attitude:
-        return []
-    axes = JointFrame(model, k, rotation_matrix(state.p[far]) if far >= 0 else np.eye(3)).axes(state.x[k])
-    biases = [float(axis @ bend[3 * (what == "turn") :][:3]) for what, axis in axes]
-    return [
-        (what, axis, i, float(state.x[k, i]), float(state.xdot[k, i]), biases[i])
-        for i, (what, axis) in enumerate(axes)
-    ]
-
-
 def spring_terms(model: Model, state: State) -> SpringTerms:
-    """Sum the springs between points over the bodies.
-
-    Returns:
-        Their forces and the sizes of what is rounded in them.
-
-    """
-    n, body = model.n, model.spring_body
-    total = SpringTerms(np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n), np.zeros(n))
-    A, has_body = rotation_matrix(state.p), body >= 0
-    arm = np.where(has_body[..., None], rotate_vectors(A[body], model.spring_point), 0.0)
-    omega = rotate_vectors(A, state.omega)
-    velocity = np.where(has_body[..., None], state.v[body] + cross(omega[body], arm), 0.0)
-    d, d_rate = spring_vectors(model, state.r, state.p), velocity[:, 1] - velocity[:, 0]
-    length = np.linalg.norm(d, axis=1)
+    """Measure what is rounded in the forces of springs between points."""
+    norm, body, has_body = np.linalg.norm, model.spring_body, model.spring_body >= 0
+    A = rotation_matrix(state.p)
+    arm = np.where(has_body[..., None], rotate_vectors(A[:, body], model.spring_point), 0.0)
+    omega = rotate_vectors(A, state.omega)[:, body]
+    velocity = np.where(has_body[..., None], state.v[:, body] + cross(omega, arm), 0.0)
+    d, d_rate = spring_vectors(model, state.r, state.p), velocity[:, :, 1] - velocity[:, :, 0]
+    length, change = norm(d, axis=-1), norm(d_rate, axis=-1)
     k, c = model.spring_stiffness, model.spring_damping
     tension = k * (length - model.spring_length) + c * np.sum(d * d_rate, -1) / length
-    norms = np.linalg.norm(model.spring_point, axis=2) + np.where(
-        has_body, np.linalg.norm(state.r, axis=1)[body], 0.0
-    )
-    place = norms.sum(1)  # what d is a difference of
-    pace = np.where(has_body, np.linalg.norm(state.v, axis=1)[body], 0.0).sum(1)
-    pace = pace + (np.linalg.norm(omega, axis=1)[body] * np.linalg.norm(arm, axis=2)).sum(1)
-    drift = c * np.linalg.norm(d_rate, axis=1)
-    size = (k + (np.abs(tension) + drift) / length) * place + k * model.spring_length + c * pace
-    pull = d * (tension / length)[:, None]
-    for side, sign in ((0, 1.0), (1, -1.0)):
-        at = body[:, side][has_body[:, side]]
-        own, force = arm[has_body[:, side], side], sign * pull[has_body[:, side]]
-        own_size = size[has_body[:, side]]
-        np.add.at(total.force, at, force)
-        np.add.at(total.moment, at, cross(own, force))
-        np.add.at(total.size, at, own_size)
-        np.add.at(total.moment_size, at, np.linalg.norm(own, axis=1) * own_size)
-    stretch = length + model.spring_length + place
-    return SpringTerms(
-        total.force, total.moment, total.size, total.moment_size, float(np.sum(k * stretch**2) / 2)
-    )
+    # what d and its rate are differences of
+    place = np.sum(norm(model.spring_point, axis=-1) + has_body * norm(state.r, axis=-1)[:, body], -1)
+    pace = np.sum(has_body * norm(state.v, axis=-1)[:, body] + norm(omega, axis=-1) * norm(arm, axis=-1), -1)
+    size = (k + (np.abs(tension) + c * change) / length) * place + k * model.spring_length + c * pace
+    of_body = np.zeros((2, len(state.p), model.n))
+    for spring, end in np.argwhere(has_body):
+        of_body[0, :, body[spring, end]] += size[:, spring]
+        of_body[1, :, body[spring, end]] += norm(arm[:, spring, end], axis=-1) * size[:, spring]
+    potential = np.sum(k * (length + model.spring_length + place) ** 2, -1) / 2
+    return SpringTerms(of_body[0], of_body[1], potential)

@@ -22,7 +22,7 @@ from plumbline.model.sampling import derive_seed
 from plumbline.truth import TruthUnavailable
 from plumbline.truth.certified import certify_state
 from plumbline.truth.proved_motion import ProvedMotion
-from plumbline.truth.rounding_bound import RoundingBound, state_rounding_bound
+from plumbline.truth.rounding_bound import RoundingBound, rounding_bounds
 
 if TYPE_CHECKING:
     from plumbline.truth.trajectory import ClosedFormSamples
@@ -89,7 +89,7 @@ def state_truth(model: Model, states: Sequence[State]) -> StateTruth:
         CertificationFailure: the system is singular at a state, or nearly so.
 
     """
-    bounds = [state_rounding_bound(model, state) for state in states]
+    bounds = rounding_bounds(model, states)
     try:
         certified = [certify_state(model, state, mass_matrix=True) for state in states]
     except TruthUnavailable:

@@ -1,18 +1,24 @@
 """The tolerance of the state level: a first-order rounding bound per body and quantity.
 
-An engine that evaluates the Newton–Euler equations of the chain in double precision commits a few kinds of
-roundings.  Each kind is propagated through the inverse of the system, and the results are added:
+An engine that evaluates the Newton–Euler equations in double precision commits a few kinds of roundings.
+Each kind is propagated through the inverse of the system (`plumbline.equations.responses`), and the results
+are added:
 
     tolerance = 64 ε (tB + tS + tJ + d),    ε = 2⁻⁵³
 
-    tB  every term of each equation, rounded once, and the result itself
+    tB  every term of each equation of a body and of a joint, rounded once, and the result itself
     tS  elimination onto the joints: the terms of C M⁻¹ f
-    tJ  joint-space engines: the terms of M q̈ + h, as torque pairs at the joints
-    d   accumulation of accelerations and forces along the chain
+    tJ  joint-space engines: the terms of M q̈ + h, as torque pairs at turns and force pairs at slides
+    d   accumulation of accelerations and forces along the branches
 
 Arms that an engine finds as differences of positions are off by a rounding of these: terms of tB count a
 share of the position too, which is the larger one where it is above 32 arms (rods of 100 m and more).
 Without tJ joint-space engines exceed the bound by 1e7, without tS maximal coordinates by 1e4 (needles).
+
+Loops are cut open (`plumbline.model.loops`).  The dependent coordinates of a state are known only to rounding
+over the smallest singular value σ of the rows that join the two parts of a body, which changes every term of
+the equations by as much: the answer to their roundings (tB, and that of the rows that join parts) counts
+1 + 1/σ times.
 
 Every part is homogeneous in each unit, so the ratio of the bound to its quantity's scale does not change when
 lengths, masses or times are measured in other units.  World frame throughout: A ω̇′ has the norm of ω̇′.
@@ -20,22 +26,27 @@ lengths, masses or times are measured in other units.  World frame throughout: A
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import cast
 
 import numpy as np
 
-from plumbline.model.datatypes import Array, Model, State
-from plumbline.model.kinematics import cross, cross_matrix, rotate_vectors, rotation_matrix
-from plumbline.model.welding import BodyParts, part_offsets
+from plumbline.equations.responses import Responses
+from plumbline.model.datatypes import ZERO_INERTIA, Array, Model, State
+from plumbline.model.kinematics import cross, cross_matrix, joint_vectors
+from plumbline.model.loops import cut_open, regular_rank, smallest_singular_value, wrench_length
+from plumbline.model.welding import BodyParts, part_offsets, undivided_bodies
 from plumbline.processes.workers import Pickled
-from plumbline.truth.rounding_bound_tree import POSITION_SHARE, tree_tolerances
+from plumbline.truth.element_terms import joint_elements, spring_terms
 
 EPS = 2.0**-53
 ROUNDING_FACTOR = 64  # state quantities; the worst error of a sound engine is about a sixth of it (tests)
 SUM_ROUNDING_FACTOR = 256  # energies, momenta, entries of the mass matrix
 MAX_RELATIVE_BOUND = 1e-8  # a tolerance above this fraction of its scale could hide a mistake
+POSITION_SHARE = 1 / 32  # positions are rounded once or twice, where the bound counts 64 roundings of a term
+MAX_ENTRIES = 3_000_000  # of the responses of a batch of states: more do not fit the processor's cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,14 +59,14 @@ class RoundingBound:
 
     acceleration: Array  # (N,) m/s²
     angular_acceleration: Array  # (N,) rad/s²
-    joint_reaction: Array  # (N,) N
+    joint_reaction: Array  # (J,) N
+    joint_moment: Array  # (J,) N m
     kinetic_energy: float  # J
     potential_energy: float  # J
     angular_momentum: float  # kg m²/s
     mass_matrix: float  # kg m², of each entry
     scale: dict[str, Array | float]
     rod_torque: Array  # (N,) N m, of the torques at both ends of the rod that body k hangs by; 0 for a ball
-    joint_moment: Array | None = None  # (N,) N m; absent for chains of rods and balls, which have none
 
     def tolerance(self, quantity: str) -> Array | float:
         """Look up a tolerance by the name of its quantity.
@@ -123,11 +134,18 @@ def _remembered(arguments: Pickled) -> RoundingBound:
 
 
 def state_rounding_bound(model: Model, state: State, parts: BodyParts | None = None) -> RoundingBound:
-    """Compute the rounding tolerances of every state quantity.
+    """Compute the rounding tolerances of every state quantity, as `rounding_bounds` at one state."""
+    return rounding_bounds(model, [state], parts)[0]
+
+
+def rounding_bounds(
+    model: Model, states: Sequence[State], parts: BodyParts | None = None
+) -> list[RoundingBound]:
+    """Compute the rounding tolerances of every state quantity at many states.
 
     Args:
-        model: the mechanism; masses > 0, inertias positive definite.
-        state: the state at which quantities are compared.
+        model: the mechanism; where bodies can move, they have inertia.
+        states: where quantities are compared.
         parts: the rigid parts that an engine welds each body from, where it does.  The terms are those of a
             part then: for a part whose centre is c away, levers are longer by ‖c‖ and accelerations by
             ‖c‖(‖ω̇‖ + ‖ω‖W), mass and least inertia are those of the lightest part, and the weld carries the
@@ -140,272 +158,339 @@ def state_rounding_bound(model: Model, state: State, parts: BodyParts | None = N
         LinAlgError: the system is singular.
 
     """
-    if not model.is_chain:
-        return _tree_bound(model, state)
-    system = NewtonEulerSystem(model, state)
-    terms = _TermSizes(model, state, system, parts)
-    joints = _JointSpaceTerms(model, state, system, terms)
-    m, J, g = terms.m, terms.J, terms.g
-    moment = np.max(
-        [
-            J * terms.alpha,
-            terms.spin,
-            terms.sp * terms.F,
-            terms.sd * terms.F_next,
-            terms.torque,
-            terms.arm * terms.weld,
-            terms.place * terms.F,
-            terms.place * terms.F_next,
-            POSITION_SHARE * m * np.linalg.norm(state.v, axis=1) ** 2,
-        ],
-        0,
-    )
-    result = np.stack([np.maximum(terms.a, g), terms.alpha, terms.F], 1)
-    tB = system.propagate(terms.force(), moment, terms.joint()) + result
-    tS = system.propagate(0 * m, 0 * m, terms.elimination())
-    tJ = np.einsum("jnq,j->nq", system.torque_pair_responses(), joints.torque)
-    swing = joints.D.T @ joints.acceleration
-    turning = joints.is_below.T @ joints.acceleration
-    carried = np.cumsum((m * (terms.a + swing + g))[::-1])[::-1]
-    d = np.stack([swing + terms.a, turning, carried], 1)
-    total = ROUNDING_FACTOR * EPS * (tB + tS + tJ + d)
+    size = max(1, MAX_ENTRIES // (12 * len(model.kind)) ** 2)
+    found: list[RoundingBound] = []
+    for first in range(0, len(states), size):
+        some = states[first : first + size]
+        found += _of_loops(model, some) if model.has_loops else _of_tree(_Terms(model, some, parts))
+    return found
 
-    rod_torque = np.zeros(model.n)
-    rod_torque[model.rods] = joints.torque[: model.rods.sum()]
-    rod_torque += np.where(model.rods, joints.torque[model.rods.sum() :], 0.0)
 
-    rate, speed = joints.is_below.T @ joints.rate, joints.D.T @ joints.rate
-    with_place = np.maximum(speed, terms.place * rate)
-    lever = np.cumsum(terms.sp + model.length) + _from_previous(np.cumsum(terms.sd))
-    kinetic = float(0.5 * np.sum(m * speed * with_place + J * rate**2))
-    potential = float(g * np.sum(m * lever))
-    momentum = float(np.sum(m * lever * with_place + J * rate))
-    mass_entry = float(np.max(joints.mass_matrix))
+def _of_tree(terms: _Terms) -> list[RoundingBound]:
+    total, scale, sums, rods = terms.bounds()
+    return [_bound(total[s], _at(scale, s), _at(sums, s), rods[s]) for s in range(len(total))]
+
+
+def _of_loops(model: Model, states: Sequence[State]) -> list[RoundingBound]:
+    """Bounds of a mechanism with loops, cut open."""
+    cut, found = cut_open(model), list[RoundingBound]()
+    terms = _Terms(cut.model, [cut.state(state) for state in states], None, cut.ends, cut.row_scale)
+    totals, scales, sums, _ = terms.bounds()
+    of_welds, rank = terms.weld_errors(), regular_rank(model, states[0])
+    for s, state in enumerate(states):
+        spread = 1 + 1 / smallest_singular_value(model, state, rank)
+        # what one body or joint has is found together with what all others of the loop have
+        largest = {name: float(np.max(value)) for name, value in _at(scales, s).items()}
+        reaction = wrench_length(model) * largest["joint_reaction"]
+        largest["joint_moment"] = max(largest["joint_moment"], reaction)
+        sizes = list(largest.values())
+        total = totals[s] + of_welds[s] + sizes + (terms.of_rows[s] + of_welds[s] + sizes) * (spread - 1)
+        scale = {
+            name: np.full(len(model.kind) if name.startswith("joint") else model.n, value)
+            for name, value in largest.items()
+        }
+        spread_sums = {name: size * spread for name, size in _at(sums, s).items()}
+        found.append(_bound(total[cut.place], scale, spread_sums, np.zeros(model.n)))
+    return found
+
+
+def _at(values: dict[str, Array], s: int) -> dict[str, Array]:
+    return {name: value[s] for name, value in values.items()}
+
+
+def _bound(total: Array, scale: dict[str, Array], sums: dict[str, Array], rods: Array) -> RoundingBound:
+    """Tolerances by the sums of all sizes: (J, 4) of joints, of which the first hold the bodies."""
+    total, sizes = ROUNDING_FACTOR * EPS * total, {name: float(size) for name, size in sums.items()}
     return RoundingBound(
-        acceleration=total[:, 0],
-        angular_acceleration=total[:, 1],
-        joint_reaction=total[:, 2],
-        kinetic_energy=SUM_ROUNDING_FACTOR * EPS * kinetic,
-        potential_energy=SUM_ROUNDING_FACTOR * EPS * potential,
-        angular_momentum=SUM_ROUNDING_FACTOR * EPS * momentum,
-        mass_matrix=SUM_ROUNDING_FACTOR * EPS * mass_entry,
-        scale={
-            "acceleration": result[:, 0],
-            "angular_acceleration": np.max([terms.alpha, moment / J, turning], 0),
-            "joint_reaction": np.maximum(terms.F, m * g),
-            "kinetic_energy": kinetic,
-            "potential_energy": potential,
-            "angular_momentum": momentum,
-            "mass_matrix": mass_entry,
-        },
-        rod_torque=ROUNDING_FACTOR * EPS * rod_torque,
-    )
-
-
-def _tree_bound(model: Model, state: State) -> RoundingBound:
-    """The tolerances of a mechanism that is not a chain of rods and balls."""
-    total, scale, sums, rod_torque = tree_tolerances(model, state)
-    total = ROUNDING_FACTOR * EPS * total
-    return RoundingBound(
-        acceleration=total[: model.n, 0],
-        angular_acceleration=total[: model.n, 1],
+        acceleration=total[: len(rods), 0],
+        angular_acceleration=total[: len(rods), 1],
         joint_reaction=total[:, 2],
         joint_moment=total[:, 3],
-        scale=scale,
-        rod_torque=ROUNDING_FACTOR * EPS * rod_torque,
-        **{name: SUM_ROUNDING_FACTOR * EPS * size for name, size in sums.items()},
+        scale=scale | sizes,
+        rod_torque=ROUNDING_FACTOR * EPS * rods,
+        **{name: SUM_ROUNDING_FACTOR * EPS * size for name, size in sizes.items()},
     )
 
 
-class _TermSizes:
-    """Magnitudes (N,) of the terms in the equations of each body, with norms named as their vectors."""
+class _Terms:
+    """The sizes of all that is rounded in a tree at S states.
+
+    Norms (S, N) are named as their vectors: a, alpha, F, moment (of the joint), arm (centre to near point),
+    reach (centre of the far body to the near point).
+    """
 
     def __init__(
-        self, model: Model, state: State, system: NewtonEulerSystem, parts: BodyParts | None
+        self,
+        model: Model,
+        states: Sequence[State],
+        parts: BodyParts | None = None,
+        ends: Sequence[tuple[int, int]] = (),
+        row_scale: Array | None = None,
     ) -> None:
-        norm, n = np.linalg.norm, model.n
-        self.m, self.g, self.J = model.mass, float(norm(model.gravity)), norm(model.inertia, axis=(1, 2))
-        vectors = system.acceleration, system.alpha, system.omega, system.F, system.sp, system.sd
-        self.a, self.alpha, self.omega, self.F, self.sp, self.sd = (norm(x, axis=1) for x in vectors)
-        self.place = POSITION_SHARE * norm(state.r, axis=1)
-        self.load, self.torque = norm(system.load, axis=1), norm(system.torque, axis=1)
-        self.lightest, self.least_inertia = self.m, np.linalg.eigvalsh(model.inertia)[:, 0]
-        self.arm = self.weld = np.zeros(n)  # lever and force of the weld
-        rod_rate = np.where(model.rods, norm(state.udot, axis=1), 0.0)
-        # largest rate of any body or rod between the pivot and here
-        self.W = np.maximum.accumulate(np.maximum(self.omega, rod_rate))
-        self.centripetal_rod = model.length * rod_rate * self.W
-        if parts is not None:
-            self.arm = part_offsets(parts)
-            self.lightest = np.array([min(part.mass for part in pieces) for pieces in parts])
-            inertias = np.array([[part.inertia for part in pieces] for pieces in parts])
-            self.least_inertia = np.min(np.linalg.eigvalsh(inertias), axis=(1, 2))
-            self.a = self.a + self.arm * (self.alpha + self.omega * self.W)
-            self.sp, self.sd = self.sp + self.arm, self.sd + self.arm
-            self.weld = self.m * (self.a + self.g)
-        self.F_next = np.append(self.F[1:], 0.0)
-        self.spin = self.J * self.omega * self.W
+        self.responses = found = Responses(model, states, ends, row_scale)
+        norm, self.model, self.state, self.n = np.linalg.norm, model, found.state, model.n
+        state = found.state
+        self.far = model.body[:, 0]
+        self.children = self.far == np.arange(model.n)[:, None]  # [k, b]: body b is next beyond k
+        self.below = np.eye(model.n, dtype=bool)  # body b is k or beyond it
+        for k in reversed(range(model.n)):
+            if self.far[k] >= 0:
+                self.below[self.far[k]] |= self.below[k]
+        self.d = joint_vectors(model, state.r, state.p)
+        self.springs = spring_terms(model, state)
+        self.elements = joint_elements(model, state, norm(found.velocity_terms(), axis=-1))
+        self.element_size = np.zeros((len(states), model.n, 2))  # of each joint's slides and turns
+        for element in self.elements:
+            self.element_size[:, element.k, int(not element.is_slide)] += element.size
+        self.g, self.m, self.J = float(norm(model.gravity)), model.mass, norm(model.inertia, axis=(1, 2))
+        self.a, self.alpha, self.F, self.moment = np.moveaxis(norm(found.solution, axis=-1), -1, 0)
+        self.arm = norm(found.arm, axis=-1)
+        to_near = found.far_arm + np.where((model.rods & (self.far >= 0))[:, None], self.d, 0.0)
+        self.reach = norm(to_near, axis=-1) + norm(self.d, axis=-1)
+        spin = norm(state.omega, axis=-1)
+        # arms that are differences of positions far from the origin, which some engines use
+        self.place = POSITION_SHARE * norm(state.r, axis=-1)
+        own = spin + norm(state.udot, axis=-1) + norm(state.xdot, axis=-1)
+        # largest rate of any body or joint between the world and here, per body
+        self.W = np.max(np.where(self.below.T, own[:, None], 0.0), axis=-1)
+        self._measure_parts(parts, spin)
+        self.speed = norm(state.v, axis=-1)
+        self.transport, self.spin = spin * self.speed, self.J * spin * self.W
+        self.load = norm(found.load, axis=-1) + self.springs.size
+        self.torque = norm(found.torque, axis=-1) + self.springs.moment_size
+        slides = [bool(kind.slide_axes) for kind in model.kinds]
+        self.slide_rate = np.sum(np.abs(state.xdot), -1) * slides
+        self.F_children = self.F @ self.children.T
+        self.moment_children = (self.moment + self.reach * self.F) @ self.children.T
 
-    def force(self) -> Array:
-        """Largest term of each Newton equation [N]."""
-        return np.asarray(np.max([self.m * self.a, self.m * self.g, self.F, self.F_next, self.load], 0))
+    def _measure_parts(self, parts: BodyParts | None, spin: Array) -> None:
+        """Offsets of the parts, masses and least inertias that divide, and the force of welds."""
+        pieces = undivided_bodies(self.model) if parts is None else parts
+        self.offset = part_offsets(pieces)
+        self.lightest = np.array([min(part.mass for part in body) for body in pieces])
+        principal = np.linalg.eigvalsh([[part.inertia for part in body] for body in pieces])  # (N, parts, 3)
+        has_all = principal[..., 0] > ZERO_INERTIA * principal[..., 2]
+        self.least_inertia = np.min(np.where(has_all, principal[..., 0], np.inf), axis=1)
+        self.a = self.a + self.offset * (self.alpha + spin * self.W)
+        self.arm, self.reach = self.arm + self.offset, self.reach + self.of_far(self.offset)
+        self.weld = np.where(self.offset > 0, self.m * (self.a + self.g), 0.0)
 
-    def joint(self) -> Array:
-        """Largest term of each joint's acceleration equation [m/s²]."""
-        near, far = (
-            np.max([self.a, s * self.alpha, s * self.omega * self.W], 0)
-            for s in (np.maximum(self.sp, self.place), self.sd)
+    def of_far(self, x: Array) -> Array:
+        """Value (..., N) at the far body of each joint, 0 at the world."""
+        return np.where(self.far >= 0, x[..., self.far], 0.0)
+
+    def _body_errors(self) -> tuple[Array, Array, Array, Array]:
+        """Largest term of each Newton and Euler equation, and of each joint's relative accelerations."""
+        # spatial algebra in a body's axes holds ω × ṙ and ṙ × m ṙ, which a moving free body makes large
+        m, g, W, far_a, far_alpha = self.m, self.g, self.W, self.of_far(self.a), self.of_far(self.alpha)
+        weight = np.broadcast_to(m * g, self.a.shape)
+        forces = (m * self.a, weight, m * self.transport, self.F, self.F_children, self.load)
+        # a body that slides or is free may have any speed; others move as fast as their levers turn
+        drifting = [kind.holds_nothing or bool(kind.slide_axes) for kind in self.model.kinds]
+        drifts = np.any(self.below[drifting], axis=0)
+        square = np.where(drifts, 1.0, POSITION_SHARE) * m * self.speed**2
+        moments = (
+            square, self.J * self.alpha, self.spin, self.arm * self.F, self.torque, self.moment,
+            self.moment_children, self.offset * self.weld, self.place * self.F, self.place * self.F_children,
+        )  # fmt: skip
+        linear = (
+            self.a, self.arm * self.alpha, self.arm * W**2, far_a, self.reach * far_alpha, self.reach * W**2,
+            W * self.slide_rate, self.place * self.alpha, self.place * W**2,
+        )  # fmt: skip
+        sizes = (np.max(terms, 0) for terms in (forces, moments, linear, (self.alpha, far_alpha, W**2)))
+        force, moment, push, turn = sizes
+        return force, moment, push, turn
+
+    def _elimination_errors(self) -> tuple[Array, Array]:
+        """Terms of C M⁻¹ f in the linear and angular rows of each joint; of a body with an M⁻¹."""
+        free = (self.F + self.F_children + self.m * self.g + self.load + self.weld) / self.lightest
+        turn = self.arm * self.F + self.moment + self.moment_children + self.spin + self.torque
+        turn = turn / self.least_inertia
+        far_free, far_turn = self.of_far(free), self.of_far(turn)
+        return free + self.arm * turn + far_free + self.reach * far_turn, turn + far_turn
+
+    def weld_errors(self) -> Array:
+        """First-order change (S, N, 4) of r̈, α, F, M by errors in the rows that join parts of a body."""
+        found, sizes = self.responses, list[Array]()
+        for pair in found.ends:
+            around = np.any([self.below[:, k] for k in pair], axis=0)
+            reach = np.sum((self.reach + self.arm)[:, around], -1)
+            turning = np.max((self.W**2 + self.alpha)[:, around], -1)
+            sizes += [np.max(self.a[:, around], -1) + reach * turning, turning]
+        response = found.to_gaps()  # (S, N, 4, 3, 6 L)
+        norms = np.sqrt(np.sum(response.reshape(*response.shape[:4], -1, 3) ** 2, axis=(3, 5)))
+        return np.asarray((norms @ np.stack(sizes, 1)[:, None, :, None])[..., 0])
+
+    def _norms_of_joints(self) -> Array:
+        """Frobenius norms (S, N, 4, N, 2) of the responses to linear and angular accelerations of joints."""
+        held, first = self.responses.held, 0
+        squares = np.sum(self.responses.to_joints() ** 2, axis=3)
+        found = np.zeros((*squares.shape[:-1], self.n, 2))
+        for k, directions in enumerate(held):
+            last = first + directions.shape[-1]
+            linear = first + int(np.sum(np.any(directions[0, :3], axis=0)))
+            found[..., k, 0] = np.sum(squares[..., first:linear], -1)
+            found[..., k, 1] = np.sum(squares[..., linear:last], -1)
+            first = last
+        return np.asarray(np.sqrt(found))
+
+    def bounds(self) -> tuple[Array, dict[str, Array], dict[str, Array], Array]:
+        """Sum the sizes of all roundings.
+
+        Returns:
+            tB + tS + tJ + d (S, N, 4) of r̈ [m/s²], α [rad/s²], F [N] and M [N m]; the scales of vectors; the
+            sums (S,) behind the energies [J], the angular momentum and the mass matrix; torques of rods
+            (S, N) [N m].
+
+        """
+        t, model, state, joints = self, self.model, self.state, _JointSpace(self)
+        force, moment, *rows = self._body_errors()
+        to_wrenches = self.responses.to_wrenches()
+        of_bodies = _errors(_norms(to_wrenches), np.stack([force, moment], -1))
+        of_joints = self._norms_of_joints()
+        self.of_rows = of_bodies + _errors(of_joints, np.stack(rows, -1))
+        total = self.of_rows + _errors(of_joints, np.stack(self._elimination_errors(), -1))
+        total += np.einsum("sjnq,sj->snq", joints.responses(to_wrenches), joints.load)
+        swing, turning = (
+            (x.mT @ joints.acceleration[..., None])[..., 0] for x in (joints.lever, joints.turns)
         )
-        return np.asarray(np.max([near, _from_previous(far), self.centripetal_rod], 0))
+        tip = state.r + self.responses.arm
+        carried = t.m * (t.a + swing + t.g + t.transport) + t.load
+        lever = np.linalg.norm(state.r[:, None] - tip[:, :, None], axis=-1) * t.below
+        carried_moment = (t.J * (t.alpha + turning) + t.spin + t.torque) @ t.below.T
+        carried_moment += (lever @ carried[..., None])[..., 0]
+        result = np.stack([np.maximum(t.a, t.g), t.alpha, t.F, t.moment], -1)
+        total += result
+        free = model.free  # its wrench is what rounding leaves
+        total[:, free, 2:] += np.stack([force @ t.below.T, moment @ t.below.T], -1)[:, free]
+        total[..., 2:] += np.sum(t.element_size, -1, keepdims=True) * (t.element_size > 0)
+        total += np.stack([swing + t.a + t.transport, turning, carried @ t.below.T, carried_moment], -1)
 
-    def elimination(self) -> Array:
-        """Terms of C M⁻¹ f in each joint's equation [m/s²]."""
-        free = (self.F + self.F_next + self.m * self.g + self.weld) / self.lightest
-        turn = (self.sp * self.F + self.sd * self.F_next + self.spin + self.torque) / self.least_inertia
-        return np.asarray(free + self.sp * turn + _from_previous(free + self.sd * turn))
+        rate, speed = ((x.mT @ joints.rate[..., None])[..., 0] for x in (joints.turns, joints.lever))
+        with_place = np.maximum(speed, t.place * rate)
+        steps = np.sum(np.linalg.norm(model.point, axis=2), 1) + np.linalg.norm(t.d, axis=-1)
+        steps += t.offset + t.of_far(t.offset) + np.linalg.norm(state.r, axis=-1) * free
+        height = steps @ t.below
+        kinetic, potential = (
+            sum((getattr(element, name) for element in t.elements), np.zeros(len(total)))
+            for name in ("kinetic", "potential")
+        )
+        sums = {
+            "kinetic_energy": np.sum(t.m * speed * with_place + t.J * rate**2, -1) / 2 + kinetic,
+            "potential_energy": t.g * np.sum(t.m * height, -1) + potential + t.springs.potential,
+            "angular_momentum": np.sum(t.m * height * with_place + t.J * rate, -1),
+            "mass_matrix": np.max(joints.mass_matrix, axis=(1, 2), initial=0.0),
+        }
+        inertia = np.where(t.J > 0, t.J, np.inf)
+        weight = np.broadcast_to(t.m * t.g, t.F.shape)
+        scale = {
+            "acceleration": result[..., 0],
+            "angular_acceleration": np.max([t.alpha, moment / inertia, turning], 0),
+            "joint_reaction": np.max([t.F, weight, t.m * t.a], 0),
+            "joint_moment": np.max(
+                [t.moment, t.arm * t.F, t.J * t.alpha, np.sum(t.element_size, -1), (lever @ (t.m * t.g))], 0
+            ),
+        }
+        rods = np.zeros(t.a.shape)
+        for at, (what, k) in enumerate(joints.pairs):
+            rods[:, k] += joints.load[:, at] * (what in ("upper", "lower"))
+        return total, scale, sums, rods
 
 
-class _JointSpaceTerms:
-    """Terms of M q̈ + h with one joint per ball and two per rod (its upper end, and its tip).
+def _norms(responses: Array) -> Array:
+    """Frobenius norms (S, N, 4, N, 2) of 3×3 blocks (S, N, 4, 3, N, 2, 3)."""
+    return np.asarray(np.sqrt(np.einsum("snqikcj,snqikcj->snqkc", responses, responses)))
 
-    Joints are ordered as in `NewtonEulerSystem.torque_pair_responses`.
+
+def _errors(norms: Array, sizes: Array) -> Array:
+    """First-order change (S, N, 4) for errors (S, N, 2) in the equations of bodies or joints."""
+    flat = norms.reshape(*norms.shape[:3], -1)
+    return np.asarray((flat @ sizes.reshape(len(sizes), 1, -1, 1))[..., 0])
+
+
+class _JointSpace:
+    """Joint coordinates of a tree: turns at near points (a rod's also at its far point), and slides.
+
+    Per coordinate and body: ``lever`` (S, C, N) [m or 1] the size of the velocity of the centre per unit
+    rate, ``turns`` (C, N) 1 where the body turns with it.
     """
 
-    def __init__(self, model: Model, state: State, system: NewtonEulerSystem, terms: _TermSizes) -> None:
-        norm, rods, body = np.linalg.norm, model.rods, np.arange(model.n)
-        tip = state.r + system.sp
-        position = np.concatenate([(tip - model.length[:, None] * state.u)[rods], tip])
-        self.is_below = np.concatenate([body[rods], body])[:, None] <= body  # (joints, N)
-        distance = norm(position[:, None] - state.r, axis=2) + terms.arm
-        self.D = np.where(self.is_below, distance, 0.0)  # (joints, N) m, joint to centre
+    def __init__(self, terms: _Terms) -> None:
+        self.terms, model, state, found = terms, terms.model, terms.state, terms.responses
+        solution, norm = found.solution, np.linalg.norm
+        self.pairs: list[tuple[str, int]] = []
+        lever, turns, rates, accelerations = (list[Array]() for _ in range(4))
+        relative = self._relative_accelerations()
+        none = np.zeros((len(state.p), 3))
 
-        def relative(of_body: Array, of_rod: Array) -> Array:
-            """Norms (joints,): rods against the body above, bodies against their rod or the body above."""
-            above = _from_previous(of_body)
-            turns = [(of_rod - above)[rods], of_body - np.where(rods[:, None], of_rod, above)]
-            return np.asarray(norm(np.concatenate(turns), axis=1))
+        def add(what: str, k: int, reach: Array, turn: bool, rate: Array, acceleration: Array) -> None:
+            self.pairs.append((what, k))
+            lever.append(terms.below[k] * reach)
+            turns.append(terms.below[k] * float(turn))
+            rates.append(norm(rate, axis=-1))
+            accelerations.append(norm(acceleration, axis=-1))
 
-        self.rate = relative(system.omega, cross(state.u, state.udot))
-        self.acceleration = relative(system.alpha, system.rod_angular_acceleration())
-        m, J = terms.m, terms.J
-        self.mass_matrix = (self.D * m) @ self.D.T + (self.is_below * J) @ self.is_below.T
-        h = self.is_below @ (J * terms.W**2 + terms.torque) + self.D @ (m * (terms.g + terms.a) + terms.load)
-        self.torque = self.mass_matrix @ self.acceleration + h
-
-
-class NewtonEulerSystem:
-    """The Newton–Euler system of the chain at one state, its inverse and its solution; world axes.
-
-    With x = (r̈, α) per body and F = E λ per joint, E = u for a rod (padded to 3×3) and I for a ball,
-
-        M x − Cᵀ λ = f,    C x = γ,    K = C M⁻¹ Cᵀ
-
-    ``inverse_columns`` (N, 3, 3, 9N): r̈, α, F of each body per unit of each row (6N of f, then 3N of γ).
-    """
-
-    def __init__(self, model: Model, state: State) -> None:
-        """Assemble, invert and solve the system.
-
-        Args:
-            state: a state on the constraint manifold.
-
-        """
-        n, body, rods = model.n, np.arange(model.n), model.rods
-        A = rotation_matrix(state.p)
-        inertia = A @ model.inertia @ A.mT
-        self.n, self.rods, self.u, self.length = n, rods, state.u, model.length
-        self.sp, self.sd = rotate_vectors(A, model.proximal), rotate_vectors(A, model.distal)
-        self.sd[-1] = 0.0  # nothing is attached there
-        self.omega = omega = rotate_vectors(A, state.omega)
-        self.load = model.force - model.drag_force[:, None] * state.v
-        self.torque = rotate_vectors(A, model.moment) - model.drag_moment[:, None] * omega
-
-        E = np.where(rods[:, None, None], state.u[:, :, None] * np.array([1.0, 0.0, 0.0]), np.eye(3))
-        C = np.zeros((n, 3, n, 6))
-        C[body, :, body, :3], C[body, :, body, 3:] = E.mT, -E.mT @ cross_matrix(self.sp)
-        up, down = body[1:], body[:-1]
-        C[up, :, down, :3], C[up, :, down, 3:] = -E[1:].mT, E[1:].mT @ cross_matrix(self.sd[:-1])
-        M_inverse = np.zeros((n, 6, n, 6))
-        M_inverse[body, :3, body, :3] = np.eye(3) / model.mass[:, None, None]
-        M_inverse[body, 3:, body, 3:] = np.linalg.inv(inertia)
-        C_flat, M_flat = C.reshape(3 * n, 6 * n), M_inverse.reshape(6 * n, 6 * n)
-        CM = C_flat @ M_flat
-        held = np.repeat(~rods, 3).reshape(n, 3) | (np.arange(3) == 0)  # a rod uses one of its three rows
-        K = CM @ C_flat.T + np.diag(~held.ravel())
-        d = 1 / np.sqrt(np.diag(K))  # equilibrated: pivots must not depend on the units
-        K_inverse = np.linalg.inv(K * d * d[:, None]) * d * d[:, None] * np.outer(held, held)
-        X = CM.T @ K_inverse
-        x_rows = np.concatenate([M_flat - X @ CM, X], 1).reshape(n, 2, 3, 9 * n)
-        F_rows = E @ np.concatenate([-X.T, K_inverse], 1).reshape(n, 3, 9 * n)
-        self.inverse_columns = np.concatenate([x_rows, F_rows[:, None]], 1)
-
-        self.centripetal_p, self.centripetal_d = (cross(omega, cross(omega, s)) for s in (self.sp, self.sd))
-        gamma = (E.mT @ (_from_previous(self.centripetal_d) - self.centripetal_p)[..., None])[..., 0]
-        gamma[:, 0] -= np.where(rods, model.length * np.sum(state.udot**2, -1), 0.0)
-        force = model.mass[:, None] * model.gravity + self.load
-        moment = self.torque - cross(omega, rotate_vectors(inertia, omega))
-        rows = np.concatenate([np.concatenate([force, moment], -1).ravel(), gamma.ravel()])
-        self.acceleration, self.alpha, self.F = np.moveaxis(self.inverse_columns @ rows, 1, 0)  # (N, 3) each
-
-    def propagate(self, force: Array, moment: Array, joint: Array) -> Array:
-        """Compute the first-order change for errors in the rows: Frobenius norms of the inverse's 3×3 blocks.
-
-        Args:
-            force: sizes (N,) of the errors in the force rows [N].
-            moment: sizes (N,) in the moment rows [N m].
-            joint: sizes (N,) in the joint rows [m/s²].
-
-        Returns:
-            (N, 3) of r̈ [m/s²], α [rad/s²] and F [N].
-
-        """
-        n, norm = self.n, np.linalg.norm
-        of_body = norm(self.inverse_columns[..., : 6 * n].reshape(n, 3, 3, n, 2, 3), axis=(2, 5))
-        of_joint = norm(self.inverse_columns[..., 6 * n :].reshape(n, 3, 3, n, 1, 3), axis=(2, 5))
-        B = np.concatenate([of_body, of_joint], -1)
-        return np.asarray(np.einsum("nqkc,kc->nq", B, np.stack([force, moment, joint], 1)))
-
-    def rod_angular_acceleration(self) -> Array:
-        """Compute the angular acceleration of each rod without axial spin, u × d̈/ℓ.
-
-        Returns:
-            (N, 3) [rad/s²], world frame; 0 for a ball.
-
-        """
-        near = self.acceleration + cross(self.alpha, self.sp) + self.centripetal_p
-        far = self.acceleration + cross(self.alpha, self.sd) + self.centripetal_d
-        ell = np.where(self.rods, self.length, np.inf)[:, None]
-        return cross(self.u, near - _from_previous(far)) / ell
-
-    def torque_pair_responses(self) -> Array:
-        """Compute the norms of the response to a unit torque pair at each joint.
-
-        A torque τ on a massless rod is balanced by forces ∓(τ × u)/ℓ at its ends.
-
-        Returns:
-            (joints, N, 3) of r̈, α and F, the rods' upper joints first.
-
-        """
-        wrench = self.inverse_columns[..., : 6 * self.n].reshape(self.n, 3, 3, self.n, 2, 3)
-        force, moment = np.moveaxis(wrench[..., 0, :], 3, 0), np.moveaxis(wrench[..., 1, :], 3, 0)
-
-        def push(k: int, s: Array) -> Array:
-            """Response (N, 3, 3, 3) to a force at a point of body k."""
-            return np.asarray(force[k] + moment[k] @ cross_matrix(s))
-
-        upper, lower = [], []
-        for k in range(self.n):
-            above = moment[k - 1] if k else np.zeros_like(moment[0])
-            if not self.rods[k]:
-                lower.append(moment[k] - above)
+        for k, kind in enumerate(model.kinds):
+            far = terms.far[k]
+            w, alpha, tip = found.omega[:, k], solution[:, k, 1], state.r[:, k] + found.arm[:, k]
+            far_w, far_alpha = (found.omega[:, far], solution[:, far, 1]) if far >= 0 else (none, none)
+            reach = norm(state.r - tip[:, None], axis=-1) + terms.offset
+            if kind.holds_distance:
+                u = state.u[:, k]
+                spin, swing = cross(u, state.udot[:, k]), cross(u, relative[:, k]) / model.length[k]
+                upper = norm(state.r - (tip - terms.d[:, k])[:, None], axis=-1) + terms.offset
+                add("upper", k, upper, True, spin - far_w, swing - far_alpha)
+                add("lower", k, reach, True, w - spin, alpha - swing)
                 continue
-            ends = push(k, self.sp[k]) - (push(k - 1, self.sd[k - 1]) if k else 0.0)
-            through = -ends @ cross_matrix(self.u[k]) / self.length[k]  # (τ × u)/ℓ = −ũ τ/ℓ
-            upper.append(through - above)
-            lower.append(moment[k] - through)
-        return np.asarray(np.linalg.norm(np.array(upper + lower), axis=(3, 4)))
+            if kind.has_attitude or kind.turn_axes:
+                add("turn", k, reach, True, w - far_w, alpha - far_alpha)
+            if kind.holds_nothing:
+                add("slide", k, np.ones_like(reach), False, state.v[:, k], relative[:, k])
+            elif kind.slide_axes:
+                rate = terms.slide_rate[:, k, None]
+                add("slide", k, np.ones_like(reach), False, rate, relative[:, k])
+        shape = len(state.p), len(lever), terms.n
+        self.lever = np.reshape(np.swapaxes(lever, 0, 1) if lever else [], shape)
+        self.turns = np.reshape(turns, shape[1:])
+        self.rate, self.acceleration = (np.reshape(x, shape[1::-1]).T for x in (rates, accelerations))
+        m, J = terms.m, terms.J
+        self.mass_matrix = (self.lever * m) @ self.lever.mT + (self.turns * J) @ self.turns.T
+        h = (J * terms.W**2 + terms.torque) @ self.turns.T
+        h += (self.lever @ (m * (terms.g + terms.a) + terms.load)[..., None])[..., 0]
+        for element in terms.elements:
+            row = self.pairs.index(("slide" if element.is_slide else "turn", element.k))
+            self.mass_matrix[:, row, row] += element.armature
+            h[:, row] += element.size
+        self.load = (self.mass_matrix @ self.acceleration[..., None])[..., 0] + h  # N m or N
 
+    def _relative_accelerations(self) -> Array:
+        """(S, N, 3) accelerations of near points against the points that far bodies carry."""
+        t, found = self.terms, self.terms.responses
+        a, alpha = np.moveaxis(found.solution[:, :, :2], 2, 0)
+        w, far = found.omega, t.far
+        near = a + cross(alpha, found.arm) + cross(w, cross(w, found.arm))
+        arm, turn, spin = found.far_arm, alpha[:, far], w[:, far]
+        carried = a[:, far] + cross(turn, arm) + cross(spin, cross(spin, arm))
+        return np.asarray(near - np.where((far >= 0)[:, None], carried, 0.0))
 
-def _from_previous(v: Array) -> Array:
-    """Value (N,) or (N, 3) at the body above each body, 0 at the pivot."""
-    return np.concatenate([np.zeros_like(v[:1]), v[:-1]])
+    def responses(self, to_wrenches: Array) -> Array:
+        """Norms (S, coordinates, N, 4) of the response to a unit torque or force pair at each coordinate."""
+        t, found = self.terms, self.terms.responses
+        force, moment = to_wrenches[..., 0, :], to_wrenches[..., 1, :]  # (S, N, 4, 3, N, 3)
+        arm, far_arm = (cross_matrix(x)[:, None, None] for x in (found.arm, found.far_arm))
+        pairs = list[Array]()
+        for what, k in self.pairs:
+            far = t.far[k]
+            above = moment[..., far, :] if far >= 0 else 0.0
+            if what == "turn":
+                pair = moment[..., k, :] - above
+            else:
+                pair = force[..., k, :] + moment[..., k, :] @ arm[..., k, :, :]
+                if far >= 0:
+                    pair = pair - force[..., far, :] - moment[..., far, :] @ far_arm[..., k, :, :]
+            if what in ("upper", "lower"):  # a torque on a massless rod is balanced by forces ∓(τ × u)/ℓ
+                u = cross_matrix(t.state.u[:, k])[:, None, None]
+                through = -pair @ u / t.model.length[k]
+                pair = through - above if what == "upper" else moment[..., k, :] - through
+            pairs.append(np.sqrt(np.einsum("snqij,snqij->snq", pair, pair)))
+        return np.reshape(np.swapaxes(pairs, 0, 1) if pairs else [], (len(t.a), len(pairs), t.n, 4))

