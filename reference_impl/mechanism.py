@@ -77,11 +77,12 @@ class Mechanism:
     def __post_init__(self) -> None:
         """Give joints without passive elements zeros, and all elements a column per coordinate."""
         given = [getattr(self, name) for name in JOINT_ELEMENTS]
-        columns = max(2, *(len(kind.motions) for kind in self.kinds), *(x.shape[1] for x in given))
+        columns = max(2, *(len(kind.motions) for kind in self.kinds), *(x.shape[-1] for x in given))
         for name, values in zip(JOINT_ELEMENTS, given, strict=True):
-            if values.shape != (len(self.kind), columns):
-                full = np.zeros((len(self.kind), columns))
-                full[: len(values), : values.shape[1]] = values
+            if values.shape[-2:] != (len(self.kind), columns):
+                # Leading axes are a batch: the steps of implicit methods add to the rotors' inertias.
+                full = np.zeros((*values.shape[:-2], len(self.kind), columns), values.dtype)
+                full[..., : values.shape[-2], : values.shape[-1]] = values
                 object.__setattr__(self, name, full)
 
     @classmethod
