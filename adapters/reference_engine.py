@@ -27,10 +27,10 @@ from plumbline.model.datatypes import (
 )
 from plumbline.model.kinematics import joint_coordinates
 from reference_impl.direct import DirectSystem, Solution
-from reference_impl.errors import SingularSystem
 from reference_impl.fast.collocation import integrate_collocation
 from reference_impl.fast.tree_elimination import eliminated_acceleration, eliminated_system
 from reference_impl.integrate import integrate_dop853
+from reference_impl.singular_system import SingularSystem
 
 
 class Reference(MetamorphicHooks):

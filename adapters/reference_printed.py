@@ -31,9 +31,9 @@ from plumbline.model.datatypes import (
     Unsupported,
 )
 from plumbline.model.kinematics import joint_vectors
-from reference_impl.errors import SingularSystem
 from reference_impl.integrate import integrate_dop853, notes_acceleration
 from reference_impl.notes import assemble_system, solve_system
+from reference_impl.singular_system import SingularSystem
 
 
 class ReferencePrinted(MetamorphicHooks):

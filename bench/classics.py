@@ -25,7 +25,7 @@ from bench.classics_values import (
     true_rod_end,
     true_slider_height,
 )
-from plumbline.engines.calls import RefinementRun, describe_engine, evaluate_states, run_refinement
+from plumbline.engines.engine_calls import RefinementRun, describe_engine, evaluate_states, run_refinement
 from plumbline.engines.registry import ENGINES, load_adapter
 from plumbline.measurements.order_and_limit import romberg, tightest_tolerance_limit
 from plumbline.model.datatypes import Array, Model, Trajectory

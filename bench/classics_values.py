@@ -16,7 +16,7 @@ from bench.classic_motions import (
 from plumbline.model.datatypes import Array
 from plumbline.model.kinematics import rotation_matrix
 from plumbline.scenario.loader import Scenario, find_scenario_file, load_scenario
-from plumbline.truth.certified import certify_state
+from plumbline.truth.certified_state import certify_state
 from plumbline.truth.closed_form import exact_samples
 from plumbline.truth.taylor import simulate_taylor
 

@@ -10,10 +10,10 @@ import sys
 import time
 
 from plumbline.scenario.loader import Scenario, catalogue, find_scenario_file, load_scenario
+from plumbline.truth.certificate_file import parse_certificate
+from plumbline.truth.certificate_proof import load_checker, prove_motion, reason_not_provable
 from plumbline.truth.closed_form import exact_samples
-from plumbline.truth.enclosure import load_checker, prove_motion, reason_not_provable
-from plumbline.truth.enclosure_file import parse_certificate
-from plumbline.truth.trajectory import judge_claim
+from plumbline.truth.trajectory_truth import judge_claim
 
 MAX_BODIES = 5
 TITLE = "| scenario | radius, m | `prove`, CPU s | `verify`, CPU s | steps | bits | kB | error over claim |"

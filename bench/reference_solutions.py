@@ -16,7 +16,12 @@ import numpy as np
 
 from plumbline.scenario.loader import find_scenario_file, load_scenario
 from plumbline.storage.results_store import write_atomically
-from plumbline.truth.enclosure import CertificatePrecision, checked_numbers, checked_topology, prove_motion
+from plumbline.truth.certificate_proof import (
+    CertificatePrecision,
+    checked_numbers,
+    checked_topology,
+    prove_motion,
+)
 
 STORED = Path(__file__).resolve().parents[1] / "docs" / "reference-solutions.json"
 TIMES = (1.0, 2.0, 5.0, 10.0)

@@ -17,10 +17,10 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from reference_impl.elements import ElementForces, Elements
-from reference_impl.errors import SingularSystem
 from reference_impl.euler_parameters import A, L, angular_velocity, dot
 from reference_impl.joints import ConstraintRows, constraint_rows, joint_of_rows, of_far_body
 from reference_impl.mechanism import Array, Mechanism
+from reference_impl.singular_system import SingularSystem
 
 EPS = float(np.finfo(float).eps)
 RANK_TOLERANCE = 1e-11  # of scaled rows: below it a row of a loop depends on the others

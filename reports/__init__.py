@@ -21,7 +21,7 @@ def write(folder: Path, history: Path | None = None) -> Path:
 
     """
     from reports import html_report, junit, step_summary
-    from reports.results import Results
+    from reports.stored_results import Results
 
     results = Results.load(folder)
     page = html_report.write(results, history)  # first: it reads every table, so nothing is half written

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from reports.results import Record, Results
+from reports.stored_results import Record, Results
 
 
 def coverage_tables(folder: Path) -> Record | None:

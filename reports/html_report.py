@@ -19,8 +19,8 @@ from markupsafe import Markup
 from plumbline.judging.rows import SHOWN_STYLES, is_declared
 from plumbline.storage.results_store import write_atomically
 from reports import coverage_table, reference_tables, report_data
-from reports.history import History
-from reports.results import Record, Results
+from reports.earlier_runs import History
+from reports.stored_results import Record, Results
 from reports.verdicts import (
     count_all_verdicts,
     css_class,

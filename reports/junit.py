@@ -8,7 +8,7 @@ from pathlib import Path
 
 from plumbline.judging.rows import is_declared
 from plumbline.storage.results_store import write_atomically
-from reports.results import Record, Results
+from reports.stored_results import Record, Results
 from reports.verdicts import format_number, needs_attention, shown_verdict
 
 OWN = "an own scenario"

@@ -15,7 +15,7 @@ from markupsafe import Markup
 
 from plumbline.storage.results_store import write_atomically
 from reports import html_report, junit, robot_drawing
-from reports.results import Record, replace_unprintable
+from reports.stored_results import Record, replace_unprintable
 from reports.verdicts import count_verdicts, needs_attention, rank
 
 MADE = {"Plumbline": "version", "commit": "commit", "date": "started", "command": "command"}

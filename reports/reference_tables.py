@@ -10,7 +10,7 @@ import json
 from pathlib import Path
 
 from plumbline.storage.results_schema import DamagedResults
-from reports.results import Record, Results, replace_unprintable
+from reports.stored_results import Record, Results, replace_unprintable
 
 STORED_RESULTS = Path(__file__).parent.parent / "bench" / "results"
 DRIFT_COLUMNS = {  # column: title, unit

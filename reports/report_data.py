@@ -17,8 +17,8 @@ from plumbline.model.kinematics import quaternion_conjugate, quaternion_product,
 from plumbline.model.loops import cut_open, determinate_projectors, singular_values
 from plumbline.storage.results_schema import DamagedResults
 from reports.chunks import ChunkBuilder, decimate, decimate_times, log_scale_codes
-from reports.history import History
-from reports.results import Columns, Record, Results, group_rows
+from reports.earlier_runs import History
+from reports.stored_results import Columns, Record, Results, group_rows
 from reports.verdicts import css_class, error_ratio, severity, shown_verdict
 
 CURVE_COLUMNS = (

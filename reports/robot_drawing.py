@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from reports.results import Record
+from reports.stored_results import Record
 
 _SIZE = 312  # px, the larger of width and height of a robot of many bodies
 _STEP = 80  # px, the same per body of a small one

@@ -9,7 +9,7 @@ from typing import Any
 
 from plumbline.judging.rows import SHOWN_STYLES
 from plumbline.storage.results_store import write_atomically
-from reports.results import Record, Results
+from reports.stored_results import Record, Results
 from reports.verdicts import count_all_verdicts, error_ratio, format_number, shown_verdict, unexpected_rows
 
 MAX_SUMMARY_BYTES = 1_000_000  # bytes; GitHub drops a step's summary above 1 MiB = 1,048,576 bytes

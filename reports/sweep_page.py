@@ -17,7 +17,7 @@ from markupsafe import Markup
 
 from plumbline.storage.results_store import write_atomically
 from reports import html_report
-from reports.results import Record, replace_unprintable
+from reports.stored_results import Record, replace_unprintable
 from reports.verdicts import count_verdicts, severity
 
 MAX_AXIS_VALUES = 24  # values of an axis that are shown one by one; more are gathered into intervals

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from plumbline.judging import rows
-from reports.results import Record, Results
+from reports.stored_results import Record, Results
 
 
 def severity(row: Record) -> int:

@@ -23,13 +23,14 @@ ALLOWED_SKIPS = {  # pattern of the skip's reason: why continuous integration ca
 }
 
 LONGEST_FIRST = (  # begun last, one of these would keep one process busy while the others have no work;
-    # isolation, dask_cluster and workers mostly wait, so one begins when another ends
+    # isolation, dask_cluster and worker_pool mostly wait, so one begins when another ends
     "isolation", "planted_defects", "report_browser", "adapter_contract", "exit_codes", "dask_cluster",
-    "step", "tree_motions", "scripts", "workers", "loops", "command_line", "trees", "relations", "nightly",
-    "coverage", "planted_branches", "tree_motion", "sweep", "enclosure", "joint_causes", "integrator_search",
-    "importer_cause", "trajectory_truth", "tree_relations", "selftest", "environments", "model_command",
-    "reference_pages", "resume", "diagnose", "collocation", "docs", "rounding_bound", "long_runs", "report",
-    "sensitivity", "storage_faults",
+    "step_level", "tree_motions", "scripts", "worker_pool", "engines_on_loops", "command_line",
+    "engines_on_trees", "relations", "nightly", "smallest_detectable_mistake", "planted_branches",
+    "tree_motion", "sweep", "certificate_proof", "joint_causes", "integrator_search", "importer_cause",
+    "trajectory_truth", "tree_relations", "selftest", "environments", "model_command", "reference_pages",
+    "resume", "diagnose", "collocation", "docs", "rounding_bound", "long_runs", "report",
+    "predictability_horizon", "storage_faults",
 )  # fmt: skip
 LAST = ("matrix",)  # scenario by scenario it fills what is left
 

@@ -2,5 +2,5 @@
 
 `main` is the command group; `run_commands`, `study_commands`, `result_commands` and `scenario_commands` hold
 the commands by what they are about, `options` the options they share and the checks of what was typed,
-`console` what they print, `nightly` the steps of a night.
+`terminal_output` what they print, `nightly` the steps of a night.
 """

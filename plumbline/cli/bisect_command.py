@@ -17,9 +17,9 @@ from plumbline.engines.registry import IMPORTERS
 from plumbline.execution.exit_codes import ExitCode
 from plumbline.execution.plan import Plan
 from plumbline.model_files.model_run import ModelPlan
-from plumbline.processes.workers import Limits
-from plumbline.scenario.errors import did_you_mean, shorten
+from plumbline.processes.worker_pool import Limits
 from plumbline.scenario.generator import RANDOM_FAMILY, RandomScenarios, random_seed
+from plumbline.scenario.line_and_column_errors import did_you_mean, shorten
 from plumbline.scenario.loader import Scenario
 from plumbline.storage.results_store import read_model_results, read_results
 from plumbline.storage.version_changes import add_version_change

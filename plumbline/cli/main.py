@@ -20,7 +20,7 @@ import click
 from plumbline import __version__
 from plumbline.cli.help_texts import EXIT_CODES
 from plumbline.execution.exit_codes import ExitCode
-from plumbline.scenario.errors import Problem, did_you_mean, shorten
+from plumbline.scenario.line_and_column_errors import Problem, did_you_mean, shorten
 
 SECONDS_TO_NEXT_TRY = 0.05  # of an interruption that came during an import
 FILE_COMMANDS = ("run", "nightly", "check", "sweep", "prove", "coverage")  # whose arguments are YAML files

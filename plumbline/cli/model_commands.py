@@ -16,8 +16,8 @@ from rich.table import Table
 
 from plumbline import __version__
 from plumbline.cli import options
-from plumbline.cli.console import ProgressDisplay, command_line, count_noun, make_console
 from plumbline.cli.help_texts import EXIT_CODES, examples
+from plumbline.cli.terminal_output import ProgressDisplay, command_line, count_noun, make_console
 from plumbline.cli.verdict_matrix import coloured_glyph, engine_heading
 from plumbline.engines.environments import is_optional_importer, split_version, version_problem
 from plumbline.engines.registry import IMPORTERS
@@ -27,8 +27,8 @@ from plumbline.judging.rows import Row, Verdict
 from plumbline.model_files.importer_cause import Explanation
 from plumbline.model_files.model_rows import REFUSED, FileResult
 from plumbline.model_files.model_run import ModelPlan, ModelRunResult, run_model_files
-from plumbline.processes.workers import Limits
-from plumbline.scenario.errors import MAX_LISTED_PROBLEMS, did_you_mean, shorten
+from plumbline.processes.worker_pool import Limits
+from plumbline.scenario.line_and_column_errors import MAX_LISTED_PROBLEMS, did_you_mean, shorten
 from plumbline.storage.results_store import row_record, to_json_value
 
 COLUMN_HEADINGS = {

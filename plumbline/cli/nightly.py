@@ -31,16 +31,16 @@ from plumbline.execution.runner import RunResult, run_plan, save
 from plumbline.execution.selftest import SelfTestResult
 from plumbline.judging.known_issues import KnownIssue, project_known_issues
 from plumbline.model.features import Feature, features
-from plumbline.processes.workers import Limits, WorkerPool
+from plumbline.processes.worker_pool import Limits, WorkerPool
 from plumbline.reproduce.write import write_scripts
 from plumbline.scenario.generator import MECHANISM_PREFIX, RANDOM_FAMILY, RandomScenarios, random_seed
 from plumbline.scenario.loader import Scenario
-from plumbline.storage.history import next_night_number, stored_runs
+from plumbline.storage.history_of_nights import next_night_number, stored_runs
 from plumbline.storage.results_store import write_atomically
-from plumbline.studies.coverage import FILE as COVERAGE_FILE
-from plumbline.studies.coverage import CoverageFailure, coverage_table, measure_coverage
+from plumbline.studies.coverage_study import FILE as COVERAGE_FILE
+from plumbline.studies.coverage_study import CoverageFailure, coverage_table, measure_coverage
 from plumbline.studies.feature_pairs import count_triples
-from plumbline.studies.tables import write_table
+from plumbline.studies.parquet_files import write_table
 
 FEATURES_FILE = "features.json"  # features of each random mechanism of a night
 WEEK = 7  # nights
@@ -232,7 +232,7 @@ def night_coverage(result: RunResult, plan: Plan, progress: ProgressCallback) ->
         progress: called after every scenario.
 
     Returns:
-        The table of `plumbline.studies.coverage`; None where it could not be computed.
+        The table of `plumbline.studies.coverage_study`; None where it could not be computed.
 
     """
     moving = [s for s in plan.scenarios if s.level == "all"]  # of the others pairs of features are computed

@@ -19,11 +19,11 @@ from plumbline.engines import environments
 from plumbline.engines.registry import ENGINES
 from plumbline.execution.exit_codes import ExitCode
 from plumbline.judging.known_issues import KNOWN_ISSUES_FILE, KnownIssue, load_known_issues
-from plumbline.processes.errors import PlumblineError
+from plumbline.processes.exceptions import PlumblineError
 from plumbline.processes.isolation import FileLock, LockHeld
-from plumbline.processes.workers import ExecutorLost, ExecutorUnavailable
+from plumbline.processes.worker_pool import ExecutorLost, ExecutorUnavailable
 from plumbline.scenario import loader as scenarios
-from plumbline.scenario.errors import Problem, ScenarioError, did_you_mean, shorten
+from plumbline.scenario.line_and_column_errors import Problem, ScenarioError, did_you_mean, shorten
 from plumbline.scenario.yaml_reader import is_file, read_yaml
 from plumbline.truth.closed_form import ClosedFormMismatch, closed_form_motion
 

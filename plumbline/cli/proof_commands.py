@@ -13,11 +13,11 @@ import click
 import numpy as np
 
 from plumbline.cli import options
-from plumbline.cli.console import ProgressDisplay, count_noun, print_table
 from plumbline.cli.help_texts import EXIT_CODES, examples
+from plumbline.cli.terminal_output import ProgressDisplay, count_noun, print_table
 from plumbline.execution.exit_codes import ExitCode
 from plumbline.model.datatypes import EngineFailure
-from plumbline.processes.workers import Limits
+from plumbline.processes.worker_pool import Limits
 from plumbline.scenario.loader import Scenario
 from plumbline.truth import TruthUnavailable
 
@@ -101,10 +101,10 @@ def verify(
 
     The proof is of the numbers in the certificate: it says which scenario of the catalogue has exactly
     these numbers, whatever the certificate's own field `scenario` claims. The checker is one file, which
-    states its theorem at its head: plumbline/truth/enclosure_checker.py.
+    states its theorem at its head: plumbline/truth/certificate_checker.py.
     """
     from plumbline.execution.proofs import verify_certificates
-    from plumbline.truth.enclosure import load_checker
+    from plumbline.truth.certificate_proof import load_checker
 
     try:
         load_checker()
@@ -119,7 +119,7 @@ def verify(
 
 
 def _require_provable(chosen: Sequence[Scenario], option: str) -> None:
-    from plumbline.truth.enclosure import reason_not_provable
+    from plumbline.truth.certificate_proof import reason_not_provable
 
     for s in chosen:
         if reason := reason_not_provable(s.model):
@@ -138,7 +138,7 @@ def _prove(
 ) -> tuple[dict[str, Any], bytes | None]:
     """Prove one scenario; keep the proof for runs; return its record and certificate."""
     from plumbline.execution.proofs import proved_radii
-    from plumbline.truth.enclosure import load_checker, prove_motion
+    from plumbline.truth.certificate_proof import load_checker, prove_motion
     from plumbline.truth.proved_motion import round_enclosure, store_proof
 
     began, pair = time.process_time(), (scenario.model, scenario.state)

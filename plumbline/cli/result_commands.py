@@ -11,8 +11,8 @@ import click
 
 import reports
 from plumbline.cli import options
-from plumbline.cli.console import count_noun, make_console, print_table
 from plumbline.cli.help_texts import examples
+from plumbline.cli.terminal_output import count_noun, make_console, print_table
 from plumbline.storage.results_store import read_results
 
 MAKES_ONE = "`python -m plumbline nightly` makes one in the folder `nightly`"
@@ -26,7 +26,7 @@ MAKES_ONE = "`python -m plumbline nightly` makes one in the folder `nightly`"
 @options.json_option
 def history(folder: Path, pattern: str | None, as_json: bool) -> None:
     """Print verdict counts, first bad nights and changes since the last green one of the nights in FOLDER."""
-    from plumbline.storage.history import History
+    from plumbline.storage.history_of_nights import History
 
     _check_history_folder(folder)
     document = History(folder).to_document(pattern)
@@ -59,7 +59,7 @@ def _check_history_folder(folder: Path) -> None:
     if not folder.is_dir():
         what = f"{folder} is a file and no folder of nights" if folder.exists() else f"no folder {folder}"
         raise click.UsageError(f"{what}: no nights yet; {MAKES_ONE}")
-    from plumbline.storage.history import night_folders
+    from plumbline.storage.history_of_nights import night_folders
 
     if not night_folders(folder):
         raise click.UsageError(f"no complete night in {folder}; {MAKES_ONE}")

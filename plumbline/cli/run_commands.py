@@ -11,15 +11,15 @@ import click
 
 import reports
 from plumbline.cli import options
-from plumbline.cli.console import command_line, print_matrix, print_result
 from plumbline.cli.help_texts import EXIT_CODES, examples
 from plumbline.cli.run_display import RunDisplay
+from plumbline.cli.terminal_output import command_line, print_matrix, print_result
 from plumbline.engines.registry import ENGINES
-from plumbline.execution import scenario_run
+from plumbline.execution import scenario_verdicts
 from plumbline.execution.plan import Plan
 from plumbline.execution.result_cache import DiskResultCache, user_cells_folder
 from plumbline.execution.runner import RunResult, run_plan, save
-from plumbline.processes.workers import Limits, start_warm_process
+from plumbline.processes.worker_pool import Limits, start_warm_process
 from plumbline.storage.results_store import row_record, to_json_value
 
 MAX_PROOF_CPU_SECONDS = 1e6
@@ -66,7 +66,7 @@ def run(
 ) -> None:  # fmt: skip
     """Compare scenarios (names of the catalogue, or paths of YAML files; default: all) on all engines."""
     if scheduler is None and options.are_scenarios_found(names):
-        start_warm_process([scenario_run.__name__])
+        start_warm_process([scenario_verdicts.__name__])
     chosen = options.choose_scenarios(names, families)
     known_issues = options.read_known_issues(known_files, chosen)
     folder = options.claim_folder(out)

@@ -9,7 +9,7 @@ from typing import Any
 from rich.console import Group
 from rich.live import Live
 
-from plumbline.cli.console import ProgressDisplay, make_console
+from plumbline.cli.terminal_output import ProgressDisplay, make_console
 from plumbline.cli.verdict_matrix import VerdictMatrix
 from plumbline.engines.adapter import EngineInfo
 from plumbline.execution.plan import RunObserver

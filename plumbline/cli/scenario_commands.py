@@ -9,13 +9,13 @@ from typing import Any
 import click
 
 from plumbline.cli import options
-from plumbline.cli.console import count_noun, print_table
+from plumbline.cli.terminal_output import count_noun, print_table
 from plumbline.engines.registry import ENGINES
 from plumbline.execution.runner import describe_engines
-from plumbline.execution.scenario_run import NO_REGULAR_POSE
+from plumbline.execution.scenario_verdicts import NO_REGULAR_POSE
 from plumbline.model.loops import immovable_joints, is_singular, smallest_singular_value
 from plumbline.model.sampling import compared_states
-from plumbline.processes.workers import WorkerPool
+from plumbline.processes.worker_pool import WorkerPool
 from plumbline.scenario import loader as scenarios
 
 SINGULAR_TRIES = 10  # states that are looked for where the initial pose is singular

@@ -14,16 +14,16 @@ import pyarrow as pa
 
 import reports
 from plumbline.cli import options
-from plumbline.cli.console import ProgressDisplay, count_noun, print_table
 from plumbline.cli.help_texts import EXIT_CODES, examples
+from plumbline.cli.terminal_output import ProgressDisplay, count_noun, print_table
 from plumbline.engines.registry import ENGINES
 from plumbline.execution.exit_codes import ExitCode
 from plumbline.execution.plan import RANDOM_STATES, Plan
 from plumbline.execution.runner import run_plan
-from plumbline.judging.coverage import COVERED_LEVELS, CoverageEntry
 from plumbline.judging.rows import Level, Verdict
-from plumbline.processes.workers import Limits, WorkerPool
-from plumbline.scenario.errors import ScenarioError
+from plumbline.judging.smallest_detectable_mistake import COVERED_LEVELS, CoverageEntry
+from plumbline.processes.worker_pool import Limits, WorkerPool
+from plumbline.scenario.line_and_column_errors import ScenarioError
 from plumbline.scenario.loader import Scenario
 
 MAX_LISTED_CELLS = 10
@@ -42,7 +42,7 @@ def sweep(file: Path, jobs: int, out: Path, timeout: float) -> None:
     from plumbline.execution.runner import describe_engines
     from plumbline.studies import sweep as sweeps
     from plumbline.studies import sweep_file
-    from plumbline.studies.tables import write_table
+    from plumbline.studies.parquet_files import write_table
     from reports import sweep_page
 
     try:
@@ -110,7 +110,7 @@ def drift(names: tuple[str, ...], rtols: tuple[float, ...], max_cpu_seconds: flo
     Writes drift.parquet, and report.html again where OUT holds results: the report shows the table.
     """
     from plumbline.studies import drift as drifts
-    from plumbline.studies.tables import write_table
+    from plumbline.studies.parquet_files import write_table
 
     chosen = options.require_chains(options.read_scenarios(names or ("tumbling-ball", "tumbling-rod")))
     folder = options.claim_folder(out)
@@ -186,8 +186,8 @@ def coverage(
     again where OUT holds results: the report shows the table. With --pairs it writes nothing and ends with 1
     where a legal pair is not covered.
     """
-    from plumbline.studies import coverage as study
-    from plumbline.studies.tables import write_table
+    from plumbline.studies import coverage_study as study
+    from plumbline.studies.parquet_files import write_table
 
     chosen = options.choose_scenarios(names, ())
     if has_pairs:
@@ -241,7 +241,7 @@ def _print_pairs(chosen: list[Scenario], jobs: int, limits: Limits, as_json: boo
 
 def _print_coverage_json(found: list[CoverageEntry]) -> None:
     """Print every entry, the summary and what no scenario sees."""
-    from plumbline.studies import coverage as study
+    from plumbline.studies import coverage_study as study
 
     document = {
         "summary": [asdict(one) for one in study.summarize_coverage(found)],

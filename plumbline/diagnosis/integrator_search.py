@@ -23,7 +23,7 @@ from plumbline.diagnosis.digit_loss import (
 )
 from plumbline.diagnosis.hypotheses import format_significant
 from plumbline.diagnosis.result import Diagnosis
-from plumbline.engines.calls import StepEvaluation
+from plumbline.engines.engine_calls import StepEvaluation
 from plumbline.engines.registry import load_adapter
 from plumbline.model.datatypes import Array, Model, State, StepRun
 from plumbline.model.kinematics import angular_velocity, quaternion_rate, rotation_matrix

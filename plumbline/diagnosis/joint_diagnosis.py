@@ -29,7 +29,7 @@ from plumbline.model.kinematics import (
 )
 from plumbline.truth.ground_truth import StateTruth
 from plumbline.truth.parameter_effects import evaluate_models, evaluate_to_first_order, stack_states
-from reference_impl.errors import SingularSystem
+from reference_impl.singular_system import SingularSystem
 
 MAX_STATES = 2  # at which causes are fitted: those of the largest difference
 STEP = 1e-4  # of a cause's scale, in differences

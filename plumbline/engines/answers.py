@@ -13,7 +13,7 @@ from pydantic import ConfigDict, PydanticUserError, TypeAdapter, ValidationError
 
 from plumbline.model.datatypes import EngineFailure, Model, StateQuantities, StepRun, Trajectory
 from plumbline.model.kinematics import rate_count
-from plumbline.processes.errors import MAX_TEXT, one_line
+from plumbline.processes.exceptions import MAX_TEXT, one_line
 
 MAX_NAME = 200  # characters of names, titles and versions
 COUNT = "count"  # a whole number

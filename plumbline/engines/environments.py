@@ -26,7 +26,7 @@ from packaging.utils import InvalidWheelFilename, canonicalize_name, parse_wheel
 from packaging.version import Version
 
 from plumbline.engines.registry import ENGINES, IMPORTERS
-from plumbline.processes.errors import PlumblineError
+from plumbline.processes.exceptions import PlumblineError
 from plumbline.processes.isolation import ScratchFolder
 from plumbline.processes.user_cache import (
     UntrustedFolder,

@@ -11,12 +11,12 @@ from contextlib import redirect_stdout
 
 from plumbline.engines.adapter import EngineInfo
 from plumbline.engines.answers import check_numbers, check_version, describe_value
-from plumbline.engines.calls import describe_missing
+from plumbline.engines.engine_calls import describe_missing
 from plumbline.engines.registry import load_importer
 from plumbline.importers.importer import ModelFile, Reading
 from plumbline.importers.neutral_model import CanonicalState, ModelQuantities
 from plumbline.model.datatypes import EngineFailure
-from plumbline.processes.errors import describe_exception
+from plumbline.processes.exceptions import describe_exception
 
 _FIELDS = {  # shapes, as of `plumbline.engines.answers.FIELDS`; V velocities
     "mass_matrix": "V V",

@@ -10,7 +10,7 @@ from typing import Literal
 from plumbline.engines.adapter import EngineInfo
 from plumbline.judging.known_issues import KnownIssue, project_known_issues
 from plumbline.judging.rows import Row
-from plumbline.processes.workers import Limits, ResultCache
+from plumbline.processes.worker_pool import Limits, ResultCache
 from plumbline.scenario.loader import Scenario
 
 RANDOM_STATES = 50  # random states per scenario, besides the initial one

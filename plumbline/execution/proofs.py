@@ -12,15 +12,20 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from plumbline.processes.workers import Limits, Task, WorkerPool
-from plumbline.scenario.errors import shorten
+from plumbline.processes.worker_pool import Limits, Task, WorkerPool
+from plumbline.scenario.line_and_column_errors import shorten
 from plumbline.scenario.loader import Scenario, catalogue, load_scenarios
+from plumbline.truth.certificate_file import Certificate, parse_certificate
+from plumbline.truth.certificate_proof import (
+    certificate_digest,
+    load_checker,
+    numbers_digest,
+    reason_not_provable,
+)
 from plumbline.truth.closed_form import exact_samples
 from plumbline.truth.compressed_json import MAX_BYTES, MalformedCertificate
-from plumbline.truth.enclosure import certificate_digest, load_checker, numbers_digest, reason_not_provable
-from plumbline.truth.enclosure_file import Certificate, parse_certificate
 from plumbline.truth.proved_motion import find_proof, store_proof
-from plumbline.truth.trajectory import prove_and_judge_claim
+from plumbline.truth.trajectory_truth import prove_and_judge_claim
 
 TRUTH_TOOLS = ("flint", "heyoka", "mpmath")
 MAX_PROVED_BODIES = 10  # the cost of a step grows with the cube of the number of coordinates

@@ -32,7 +32,7 @@ from plumbline.processes.user_cache import (
     describe_failure,
     user_cache_folder,
 )
-from plumbline.processes.workers import Outcome, Pickled, ResultCache, Task
+from plumbline.processes.worker_pool import Outcome, Pickled, ResultCache, Task
 
 MAX_BYTES = 2 * 2**30  # of the cells that runs share
 MAX_UNFINISHED_NIGHTS = 4  # that keep their cells

@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from plumbline.engines import calls, environments
+from plumbline.engines import engine_calls, environments
 from plumbline.engines.adapter import EngineInfo
 from plumbline.engines.importer_calls import describe_importer
 from plumbline.execution.exit_codes import ExitCode
@@ -28,13 +28,13 @@ from plumbline.execution.plan import (
     task_keys,
 )
 from plumbline.execution.random_batch import RandomBatch
-from plumbline.execution.scenario_run import ScenarioRun, uncompared_kinds
+from plumbline.execution.scenario_verdicts import ScenarioRun, uncompared_kinds
 from plumbline.judging import known_issues
 from plumbline.judging.identity import RUN_SCENARIO, IdentityCheck
 from plumbline.judging.rows import RUN_FAMILY, Row, Verdict, is_declared
 from plumbline.processes.cpu_time import CpuTimes
 from plumbline.processes.processor import processor_name
-from plumbline.processes.workers import (
+from plumbline.processes.worker_pool import (
     Executor,
     ExecutorUnavailable,
     Outcome,
@@ -100,7 +100,7 @@ def describe_engines(
     """
     found: dict[str, EngineInfo] = {}
     tasks = []
-    describe = describe_importer if are_importers else calls.describe_engine
+    describe = describe_importer if are_importers else engine_calls.describe_engine
     for name in engines:
         base, version = environments.split_version(name)
         try:

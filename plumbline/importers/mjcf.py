@@ -11,7 +11,7 @@ from pathlib import Path
 
 from plumbline.importers.neutral_model import ElementaryJoint, Feature, NeutralBody, NeutralModel, Source
 from plumbline.importers.xml_tree import Element, ModelFileError, read_xml
-from plumbline.scenario.errors import shorten
+from plumbline.scenario.line_and_column_errors import shorten
 from plumbline.scenario.yaml_reader import is_file
 
 MAX_INCLUDES = 200

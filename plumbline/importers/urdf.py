@@ -27,7 +27,7 @@ from plumbline.importers.neutral_model import (
 from plumbline.importers.xml_tree import Element, ModelFileError, parse_numbers
 from plumbline.model.datatypes import Array
 from plumbline.model.kinematics import quaternion_product, rotation_matrix
-from plumbline.scenario.errors import Problem, did_you_mean, shorten
+from plumbline.scenario.line_and_column_errors import Problem, did_you_mean, shorten
 
 GRAVITY = (0.0, 0.0, -9.81)  # m/s²; a URDF does not say it
 _TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")

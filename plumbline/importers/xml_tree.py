@@ -13,7 +13,7 @@ from xml.parsers import expat
 from xml.sax.saxutils import escape, quoteattr
 
 from plumbline.importers.neutral_model import MAX_MAGNITUDE, Source
-from plumbline.scenario.errors import Problem, ScenarioError, shorten
+from plumbline.scenario.line_and_column_errors import Problem, ScenarioError, shorten
 
 MAX_BYTES = 64 * 2**20  # the largest robot of the known collections has 2 MB
 MAX_DEPTH = 500  # nested elements; MuJoCo's own limit is 500 bodies deep

@@ -39,13 +39,13 @@ from plumbline.engines.declared_names import declared_integrators, declared_text
 from plumbline.engines.registry import ENGINES, IMPORTERS
 from plumbline.importers.neutral_model import MODEL_UNITS
 from plumbline.judging.rows import DECLARED_PREFIX, Level, Row, Verdict
-from plumbline.judging.state import SINGULAR_POSE, STATE_UNITS
+from plumbline.judging.state_level import SINGULAR_POSE, STATE_UNITS
 from plumbline.measurements.relation_result import REPEATABILITY, UNEXPLAINED
 from plumbline.measurements.run_relations import REVERSED_IN_TIME
 from plumbline.measurements.state_relations import REDESCRIPTIONS, STATE_RELATIONS, WELDED_HALVES
 from plumbline.model.invariants import INVARIANT_UNITS, MOTION_UNITS
-from plumbline.scenario.errors import Problem, ScenarioError, did_you_mean, shorten
 from plumbline.scenario.generator import MECHANISM_PREFIX, MOTION_PREFIX, RANDOM_FAMILY
+from plumbline.scenario.line_and_column_errors import Problem, ScenarioError, did_you_mean, shorten
 from plumbline.scenario.loader import catalogue
 from plumbline.scenario.schema import invalid_value_error
 from plumbline.scenario.validation_messages import problems_from_validation

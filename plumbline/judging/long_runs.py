@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from plumbline.judging.rows import JudgingResult, Row, RowContext, Verdict, first_decided
-from plumbline.judging.trajectory import singular_motion_row
+from plumbline.judging.trajectory_level import singular_motion_row
 from plumbline.measurements.long_run_study import (
     BLOCK_COUNT,
     MAX_RELATIVE_DRIFT,

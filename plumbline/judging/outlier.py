@@ -11,8 +11,8 @@ from dataclasses import replace
 from itertools import combinations
 
 from plumbline.judging.rows import Deviation, Level, Row, Verdict
-from plumbline.judging.state import STATE_UNITS
-from plumbline.judging.trajectory import LIMIT_QUANTITIES
+from plumbline.judging.state_level import STATE_UNITS
+from plumbline.judging.trajectory_level import LIMIT_QUANTITIES
 
 # What is compared with the truth; steps are with each method's formula, relations with the engine itself.
 COMPARED_WITH_TRUTH: Mapping[Level, frozenset[str]] = {

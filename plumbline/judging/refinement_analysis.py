@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from plumbline.engines.calls import RefinementRun
+from plumbline.engines.engine_calls import RefinementRun
 from plumbline.judging.rows import RowContext
 from plumbline.measurements.order_and_limit import (
     ORDER_MARGIN,

@@ -18,7 +18,7 @@ from plumbline.model.invariants import (
     kinetic_energy,
 )
 from plumbline.model.kinematics import angular_velocity
-from plumbline.processes.errors import describe_exception
+from plumbline.processes.exceptions import describe_exception
 from plumbline.truth.ground_truth import singular_note, stretched_length
 
 # By order: coarsest and finest step, as -log2 of the `step_unit`.

@@ -20,8 +20,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from plumbline.engines import calls
-from plumbline.engines.calls import RefinementRun, RefinementStudy
+from plumbline.engines import engine_calls
+from plumbline.engines.engine_calls import RefinementRun, RefinementStudy
 from plumbline.measurements.order_and_limit import ORDER_MARGIN, max_norm, observed_order, romberg
 from plumbline.model.datatypes import Array, Integrator, Model, State
 from plumbline.model.invariants import INVARIANT_UNITS, compute_invariants, invariant_scales
@@ -48,7 +48,7 @@ def run_refinement_study(
         MemoryError: the worker reached its memory limit, which the pool reports.
 
     """
-    return calls.run_refinement(engine, integrator, model, state, times, steps, is_resolved)
+    return engine_calls.run_refinement(engine, integrator, model, state, times, steps, is_resolved)
 
 
 def is_resolved(model: Model, integrator: Integrator, runs: Sequence[RefinementRun]) -> bool:

@@ -19,7 +19,7 @@ from plumbline.measurements.relation_result import OPTION_PREFIX, Refusal, Relat
 from plumbline.model.datatypes import EngineFailure, Integrator, Model, State, Trajectory, Unsupported
 from plumbline.model.invariants import attitude_error, position_error
 from plumbline.model.kinematics import angular_velocity
-from plumbline.processes.errors import describe_exception
+from plumbline.processes.exceptions import describe_exception
 from plumbline.truth.ground_truth import RUN_ROUNDING, stretched_length
 from plumbline.truth.rounding_bound import state_rounding_bound
 
@@ -190,7 +190,9 @@ def run_tolerance(integrator: Integrator, model: Model, state: State, end: float
     driven = _loop_acceleration(model, state) * end
     bound, (_, spin, speed) = state_rounding_bound(model, state), characteristic_scales(model, state, driven)
     pushed = end * max(np.max(bound.acceleration) / speed, np.max(bound.angular_acceleration) / spin)
-    from plumbline.truth.sensitivity import perturbation_growth  # with SciPy: not in a run's own process
+    from plumbline.truth.predictability_horizon import (
+        perturbation_growth,  # with SciPy: not in a run's own process
+    )
 
     growth = perturbation_growth(model, state, np.array([0.0, end / 2, end]))
     return float((RUN_ROUNDING + of_step * np.sqrt(steps) + pushed) * np.max(growth))

@@ -7,11 +7,11 @@ from functools import lru_cache
 
 import numpy as np
 
-from plumbline.engines.calls import StepEvaluation, run_steps
+from plumbline.engines.engine_calls import StepEvaluation, run_steps
 from plumbline.model.datatypes import ZERO_INERTIA, Integrator, Model, State
 from plumbline.model.loops import STABILISATION
 from plumbline.model.step_methods import ConstrainedMethod
-from plumbline.processes.workers import Pickled
+from plumbline.processes.worker_pool import Pickled
 from plumbline.truth.rounding_bound import remembered_rounding_bound
 from plumbline.truth.step_comparison import step_counts
 from plumbline.truth.step_formulas import fastest_rates, first_coordinate_acceleration

@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 
 from plumbline.model.step_methods import StepMethod
-from plumbline.processes.errors import PlumblineError
+from plumbline.processes.exceptions import PlumblineError
 from reference_impl.joint_kinds import BALL as BALL
 from reference_impl.joint_kinds import CYLINDRICAL as CYLINDRICAL
 from reference_impl.joint_kinds import FREE as FREE

@@ -29,7 +29,7 @@ from plumbline.importers.neutral_model import CanonicalState, ElementaryJoint, M
 from plumbline.model.datatypes import Array
 from plumbline.model.kinematics import quaternion_conjugate, quaternion_product
 from plumbline.truth import import_truth_tool
-from plumbline.truth.balls import entries, flatten, midpoints
+from plumbline.truth.ball_geometry import entries, flatten, midpoints
 from plumbline.truth.joint_tree import JointTree
 
 ROUNDING_FACTOR = 16.0

@@ -43,7 +43,7 @@ from plumbline.model_files.model_comparison import (
     model_states,
     permuted,
 )
-from plumbline.scenario.errors import shorten
+from plumbline.scenario.line_and_column_errors import shorten
 
 MODEL_FAMILY = "model file"  # of the rows, in place of a scenario's family
 REFUSED = "refused: "  # before an importer's words

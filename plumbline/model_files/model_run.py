@@ -33,8 +33,8 @@ from plumbline.model_files.model_rows import (
 )
 from plumbline.model_files.prepared_file import BaseChoice, PreparedFile, prepare_file
 from plumbline.processes.isolation import ScratchFolder
-from plumbline.processes.workers import Executor, Limits, Outcome, Packed, Scheduler, Task, WorkerPool
-from plumbline.scenario.errors import Problem, did_you_mean, shorten
+from plumbline.processes.worker_pool import Executor, Limits, Outcome, Packed, Scheduler, Task, WorkerPool
+from plumbline.scenario.line_and_column_errors import Problem, did_you_mean, shorten
 
 MJCF_READER = "mujoco"  # whose compiled model is the neutral reading of MJCF
 ProgressCallback = Callable[[int, int, str], None]

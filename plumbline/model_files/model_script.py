@@ -33,9 +33,9 @@ from plumbline.model_files.model_rows import FileResult
 from plumbline.model_files.model_run import FileRun, ModelPlan, describe_importers, run_files
 from plumbline.model_files.prepared_file import BaseChoice
 from plumbline.model_files.xml_shrink import shrink_tree
-from plumbline.processes.errors import PlumblineError
+from plumbline.processes.exceptions import PlumblineError
 from plumbline.processes.isolation import ScratchFolder
-from plumbline.processes.workers import Limits, Task, WorkerPool
+from plumbline.processes.worker_pool import Limits, Task, WorkerPool
 
 FORMS = ("mujoco", "pinocchio", "exudyn", "drake", "dart")
 SHRINKING_SECONDS = 60.0

@@ -16,7 +16,7 @@ from plumbline.importers.mjcf_rewriting import rewritings
 from plumbline.importers.neutral_model import NeutralModel, Source, extreme_numbers, zero_directions
 from plumbline.importers.urdf import read_urdf
 from plumbline.importers.xml_tree import Element, ModelFileError, read_xml, write_xml, write_xml_in_place
-from plumbline.scenario.errors import Problem, shorten
+from plumbline.scenario.line_and_column_errors import Problem, shorten
 from plumbline.scenario.yaml_reader import is_file
 
 BaseChoice = Literal["fixed", "free", "auto"]

@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from plumbline.processes.workers import Outcome, ResultCache, Task
+from plumbline.processes.worker_pool import Outcome, ResultCache, Task
 
 CPU_TIME_KINDS = ("engines", "reference", "truth", "diagnosis", "process", "judging", "storage", "report")
 MIN_ENGINE_TIME = 5.0  # s

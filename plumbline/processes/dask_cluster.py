@@ -16,7 +16,7 @@ from typing import Any
 
 import distributed
 
-from plumbline.processes.workers import (
+from plumbline.processes.worker_pool import (
     Executor,
     ExecutorLost,
     ExecutorUnavailable,

@@ -20,7 +20,7 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import IO, Self
 
-from plumbline.processes.errors import PlumblineError
+from plumbline.processes.exceptions import PlumblineError
 
 try:
     import fcntl

@@ -22,7 +22,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import IO, Any
 
-from plumbline.processes.errors import PlumblineError, describe_exception
+from plumbline.processes.exceptions import PlumblineError, describe_exception
 
 ROOT = Path(__file__).resolve().parents[2]
 _FRAME_LENGTH = struct.Struct("<Q")

@@ -26,13 +26,13 @@ from multiprocessing import connection, forkserver, resource_tracker
 from multiprocessing.context import BaseContext
 from typing import Any
 
-from plumbline.processes.errors import PlumblineError, describe_exception
+from plumbline.processes.exceptions import PlumblineError, describe_exception
 from plumbline.processes.isolation import ScratchFolder, die_with_parent, kill_orphans, kill_tree
 from plumbline.processes.record_encoding import EncodedRecord
 from plumbline.processes.remote_python import RemoteCrash, call_remote, call_timed, describe_exit
 from plumbline.processes.worker_environment import SINGLE_THREAD, TEMPORARY_FOLDER
 
-_WARM_MODULE = "plumbline.processes.warm"
+_WARM_MODULE = "plumbline.processes.preloaded_libraries"
 _MAX_FRAME = 2**29  # bytes of an answer; four printable characters that an engine writes are a larger number
 _MAX_DESCRIPTOR = 2**16  # above those that a new process has open
 _process_table = threading.Lock()  # held while processes start, are joined and are listed

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from io import StringIO
 from typing import Any
 
-from plumbline.engines import calls
+from plumbline.engines import engine_calls
 from plumbline.engines.metamorphic_hooks import metamorphic_hooks
 from plumbline.engines.registry import load_adapter
 from plumbline.measurements.relation_result import OPTION_PREFIX
@@ -58,7 +58,7 @@ class EngineClient:
             The integrator as this version's adapter declares it.
 
         """
-        every = self.call(calls.describe_engine).integrators
+        every = self.call(engine_calls.describe_engine).integrators
         found: Integrator = next(i for i in every if i.name == name)
         return found
 

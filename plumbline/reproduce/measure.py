@@ -14,13 +14,13 @@ from typing import Any, cast
 
 import numpy as np
 
-from plumbline.engines import calls
-from plumbline.engines.calls import RefinementRun
+from plumbline.engines import engine_calls
+from plumbline.engines.engine_calls import RefinementRun
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.invariant_drift import invariant_rows
 from plumbline.judging.refinement_analysis import RefinementAnalysis
 from plumbline.judging.rows import Row, RowContext, Verdict
-from plumbline.judging.trajectory import FINEST_RUN_SHOWN, LIMIT_QUANTITIES, trajectory_rows
+from plumbline.judging.trajectory_level import FINEST_RUN_SHOWN, LIMIT_QUANTITIES, trajectory_rows
 from plumbline.measurements.relation_result import OTHER_FORMULATION_PREFIX
 from plumbline.measurements.state_relations import (
     STATE_RELATIONS,
@@ -36,7 +36,7 @@ from plumbline.model.welding import split_bodies
 from plumbline.reproduce.engine_client import EngineClient
 from plumbline.reproduce.shrink import ReproductionCase, smallest_case
 from plumbline.truth import TruthUnavailable
-from plumbline.truth.certified import certify_state
+from plumbline.truth.certified_state import certify_state
 from plumbline.truth.ground_truth import MotionTruth, motion_truth
 from plumbline.truth.rounding_bound import state_rounding_bound
 from plumbline.truth.step_comparison import FormulaSteps
@@ -286,7 +286,7 @@ class StepMeasure:
             return None
         try:
             integrator = self.engine.integrator(self.method)
-            answer = self.engine.call(calls.run_steps, self.method, model, [state], [[h]], [count])
+            answer = self.engine.call(engine_calls.run_steps, self.method, model, [state], [[h]], [count])
             method, run = integrator.method, answer.attempts[0].run
             if not isinstance(method, JointSpaceMethod) or run is None:
                 return None
@@ -358,7 +358,7 @@ class ConvergenceMeasure:
         missing = [h for h in case.steps if h not in runs]
         if missing:
             study = self.engine.call(
-                calls.run_refinement, self.method, case.model, case.state, times, missing
+                engine_calls.run_refinement, self.method, case.model, case.state, times, missing
             )
             runs.update({run.resolution: run for run in study.runs})
         return truth, [runs[h] for h in case.steps]

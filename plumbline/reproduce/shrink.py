@@ -16,7 +16,7 @@ import numpy as np
 
 from plumbline.model.datatypes import Array, Model, State
 from plumbline.model.kinematics import state_from_minimal
-from plumbline.processes.errors import PlumblineError
+from plumbline.processes.exceptions import PlumblineError
 
 CLEAR_RATIO = 10.0  # a shrunk case exceeds its tolerance this many times, or half as often as the original
 MIN_RUNS = 3  # of a refinement study: an extrapolation and its uncertainty need three

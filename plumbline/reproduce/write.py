@@ -20,8 +20,8 @@ from plumbline.measurements.order_and_limit import STEP_EXPONENTS
 from plumbline.model.datatypes import BadInput, Model, State
 from plumbline.model.kinematics import state_from_minimal
 from plumbline.model.sampling import compared_states
-from plumbline.processes.errors import PlumblineError
-from plumbline.processes.workers import Limits, Outcome, ResultCache, Task, WorkerPool
+from plumbline.processes.exceptions import PlumblineError
+from plumbline.processes.worker_pool import Limits, Outcome, ResultCache, Task, WorkerPool
 from plumbline.reproduce.engine_client import EngineClient
 from plumbline.reproduce.measure import Disagreement
 from plumbline.reproduce.render import LONG_RUN_SUFFIXES, no_script_reason, render_script

@@ -25,7 +25,13 @@ from plumbline.model.kinematics import (
     turn_of_z,
 )
 from plumbline.model.loops import assembled, loop_gaps, motion_without_inertia, without_still_rates
-from plumbline.scenario.errors import Problem, ScenarioError, closest_match, did_you_mean, shorten
+from plumbline.scenario.line_and_column_errors import (
+    Problem,
+    ScenarioError,
+    closest_match,
+    did_you_mean,
+    shorten,
+)
 from plumbline.scenario.schema import (
     INPUT_ROUNDING,
     MAX_BODIES,

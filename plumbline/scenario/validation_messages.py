@@ -14,7 +14,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 from plumbline.model.datatypes import KINDS as JOINT_KINDS
-from plumbline.scenario.errors import Problem, closest_match, did_you_mean, shorten
+from plumbline.scenario.line_and_column_errors import Problem, closest_match, did_you_mean, shorten
 from plumbline.scenario.schema import SCHEMA_VERSION, Body, BodySequence, Document
 from plumbline.scenario.yaml_source import PathKey, YamlSource, dotted_path
 

@@ -16,7 +16,7 @@ from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from ruamel.yaml.reader import ReaderError
 from ruamel.yaml.scanner import Scanner
 
-from plumbline.scenario.errors import shorten
+from plumbline.scenario.line_and_column_errors import shorten
 from plumbline.scenario.yaml_source import PathKey, Position, YamlSource
 
 MAX_NODES = 50_000  # about 1,000 bodies in full, 6 s of reading; longer chains repeat

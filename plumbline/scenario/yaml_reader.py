@@ -7,7 +7,7 @@ from functools import cache
 from pathlib import Path
 
 from plumbline.processes.user_cache import content_key, recall, remember
-from plumbline.scenario.errors import ScenarioError
+from plumbline.scenario.line_and_column_errors import ScenarioError
 from plumbline.scenario.yaml_source import YamlSource
 
 MAX_BYTES = 1_000_000

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from plumbline.scenario.errors import Problem, ScenarioError, shorten
+from plumbline.scenario.line_and_column_errors import Problem, ScenarioError, shorten
 
 PathKey = str | int
 Position = tuple[int, int]

@@ -14,8 +14,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from plumbline.judging.rows import Level
 from plumbline.model.datatypes import CHAIN_FIELDS, JOINT_ELEMENTS, JOINT_FIELDS, KINDS, SPRING_FIELDS, Model
-from plumbline.processes.errors import PlumblineError
-from plumbline.scenario.errors import shorten
+from plumbline.processes.exceptions import PlumblineError
+from plumbline.scenario.line_and_column_errors import shorten
 from plumbline.scenario.schema import MAX_BODIES, invalid_value_error
 from plumbline.scenario.validation_messages import problems_from_validation
 from plumbline.scenario.yaml_source import YamlSource

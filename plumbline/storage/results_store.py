@@ -22,9 +22,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from plumbline.judging.rows import Columns, Row
-from plumbline.scenario.errors import shorten
+from plumbline.scenario.line_and_column_errors import shorten
 from plumbline.storage.results_schema import DamagedResults, check_results
-from plumbline.storage.upgrade import upgrade_document, upgrade_summary
+from plumbline.storage.schema_upgrade import upgrade_document, upgrade_summary
 
 Record = dict[str, Any]
 SCHEMA_VERSION = 2

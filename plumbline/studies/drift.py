@@ -22,7 +22,7 @@ from plumbline.model.invariants import compute_invariants
 from plumbline.model.kinematics import quaternion_rate
 from plumbline.scenario.loader import Scenario
 from plumbline.storage.results_store import DRIFT_TABLE
-from plumbline.studies.tables import make_table
+from plumbline.studies.parquet_files import make_table
 from reference_impl.fast.collocation import BatchIntegrationResult, integrate_collocation
 
 BAUMGARTE_RATE = 10.0  # 1/s

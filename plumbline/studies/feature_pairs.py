@@ -18,11 +18,11 @@ from plumbline.model.kinematics import complete_state
 from plumbline.model.random_mechanisms import mechanism_with_places
 from plumbline.model.sampling import compared_states
 from plumbline.processes.cpu_time import CpuTimes
-from plumbline.processes.workers import Executor, Task
-from plumbline.scenario.errors import ScenarioError
+from plumbline.processes.worker_pool import Executor, Task
+from plumbline.scenario.line_and_column_errors import ScenarioError
 from plumbline.scenario.loader import Scenario, scenario_from_dict
 from plumbline.scenario.mechanism_document import mechanism_document
-from plumbline.studies.coverage import CoverageFailure
+from plumbline.studies.coverage_study import CoverageFailure
 from plumbline.truth.parameter_effects import evaluate_models, evaluate_to_first_order, stack_states
 from plumbline.truth.rounding_bound import state_rounding_bound
 

@@ -1,7 +1,7 @@
 """Parameter sweeps: the reference runs cells in batches, engines run them cell by cell, all in workers.
 
 An engine's cell is judged as a run judges it: the same refinement study, compared with the same truth up to
-the same horizon (`plumbline.judging.trajectory`).
+the same horizon (`plumbline.judging.trajectory_level`).
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ import numpy as np
 import pyarrow as pa
 
 from plumbline.engines.adapter import EngineInfo
-from plumbline.engines.calls import RefinementStudy, run_refinement
+from plumbline.engines.engine_calls import RefinementStudy, run_refinement
 from plumbline.judging.rows import Row, RowContext, Verdict
-from plumbline.judging.trajectory import judge_trajectory
+from plumbline.judging.trajectory_level import judge_trajectory
 from plumbline.measurements.order_and_limit import refinement_resolutions
 from plumbline.model.datatypes import Integrator, Trajectory
 from plumbline.model.invariants import compute_invariants, position_error
 from plumbline.model.kinematics import quaternion_rate
-from plumbline.processes.workers import Outcome, Task, WorkerPool
+from plumbline.processes.worker_pool import Outcome, Task, WorkerPool
 from plumbline.scenario.loader import Scenario
+from plumbline.studies.parquet_files import make_table
 from plumbline.studies.sweep_file import REFINEMENT_LEVELS, Sweep, SweepCell
-from plumbline.studies.tables import make_table
 from plumbline.truth.ground_truth import MotionTruth, motion_truth
 from reference_impl.fast import collocation
 

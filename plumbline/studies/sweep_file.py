@@ -36,7 +36,7 @@ from plumbline.engines.adapter import EngineInfo
 from plumbline.engines.registry import ENGINES
 from plumbline.model.sampling import derive_seed
 from plumbline.scenario import loader as scenarios
-from plumbline.scenario.errors import Problem, ScenarioError, shorten
+from plumbline.scenario.line_and_column_errors import Problem, ScenarioError, shorten
 from plumbline.scenario.loader import Scenario
 from plumbline.scenario.schema import SchemaModel
 from plumbline.scenario.validation_messages import problems_from_validation

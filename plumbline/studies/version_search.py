@@ -24,7 +24,7 @@ from plumbline.execution.runner import run_plan
 from plumbline.judging.rows import Row, Verdict
 from plumbline.model_files.model_rows import FileResult
 from plumbline.model_files.model_run import ModelPlan, run_model_files
-from plumbline.processes.errors import PlumblineError
+from plumbline.processes.exceptions import PlumblineError
 
 
 class VersionUnusable(PlumblineError):

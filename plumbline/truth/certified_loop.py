@@ -28,7 +28,7 @@ from plumbline.equations.balls import balls as ball_arithmetic
 from plumbline.equations.tree import Tree
 from plumbline.model.datatypes import KINDS, ZERO_INERTIA, Array, Model, State
 from plumbline.model.loops import CutMechanism, cut_open, independent_rows
-from plumbline.truth.balls import entries, midpoints, quantity_scales, tree_quantities
+from plumbline.truth.ball_geometry import entries, midpoints, quantity_scales, tree_quantities
 
 UNIQUENESS_RADIUS = 1e-10  # of dependent coordinates [rad, m], in which the pose is the only one
 NEWTON_STEPS = 40
@@ -172,8 +172,8 @@ def enclose_loop(flint: Any, model: Model, state: State) -> dict[str, Any]:
         state: near an assembled state.
 
     Returns:
-        As `plumbline.truth.certified.enclose_quantities`; "scale" has besides the largest gap of the rows
-        that were not kept.
+        As `plumbline.truth.certified_state.enclose_quantities`; "scale" has besides the largest gap of the
+        rows that were not kept.
 
     Raises:
         ZeroDivisionError: no pose was proved to exist and to be unique, or a matrix has no inverse.

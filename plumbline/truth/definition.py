@@ -27,7 +27,7 @@ import numpy as np
 
 from plumbline.model.datatypes import KINDS, Array, Model, State
 from plumbline.model.kinematics import joint_coordinates, minimal_rates
-from plumbline.processes.errors import PlumblineError
+from plumbline.processes.exceptions import PlumblineError
 
 MAX_DIFFERENCE = 1e-18  # of the two sides, relative to the size of the terms
 MAX_LOOP_DEVIATION = 1e-8  # of a loop's pose and rates from the state's doubles, relative to their size
@@ -52,7 +52,7 @@ def definition_holds(flint: Any, model: Model, state: State, balls: dict[str, An
 
     Args:
         state: the state, of which the minimal coordinates are used.
-        balls: the solution, as `plumbline.truth.certified.enclose_quantities` returns it.
+        balls: the solution, as `plumbline.truth.certified_state.enclose_quantities` returns it.
 
     Returns:
         Whether every statement was checked to `MAX_DIFFERENCE`; False where a ball is too wide for that.

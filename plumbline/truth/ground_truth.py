@@ -1,8 +1,8 @@
 """The truth of a scenario, its uncertainty, and the smallest error that must be detectable.
 
-Runs inside a worker.  State level: rigorous enclosures in ball arithmetic (`certified`).  Trajectories: the
-closed form where the scenario has one, else Taylor's method in minimal coordinates; the uncertainty is the
-difference from a method of another kind (`trajectory`).
+Runs inside a worker.  State level: rigorous enclosures in ball arithmetic (`certified_state`).  Trajectories:
+the closed form where the scenario has one, else Taylor's method in minimal coordinates; the uncertainty is
+the difference from a method of another kind (`trajectory_truth`).
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from plumbline.model.kinematics import complete_state
 from plumbline.model.loops import MIN_MOTION_SINGULAR_VALUE, assembled
 from plumbline.model.sampling import derive_seed
 from plumbline.truth import TruthUnavailable
-from plumbline.truth.certified import certify_state
+from plumbline.truth.certified_state import certify_state
 from plumbline.truth.proved_motion import ProvedMotion
 from plumbline.truth.rounding_bound import RoundingBound, rounding_bounds
 
 if TYPE_CHECKING:
-    from plumbline.truth.trajectory import ClosedFormSamples
+    from plumbline.truth.trajectory_truth import ClosedFormSamples
 
 RUN_ROUNDING = 1e3 * 2.0**-52  # error of a whole run over its growth G; the largest measured is 115 ε
 TRUTHS_DIFFER = "the two truth methods differ by more than rounding explains: one is wrong, or at its limits"
@@ -62,7 +62,7 @@ class MotionTruth:
     @property
     def horizon(self) -> float:
         """Predictability horizon T_h [s], from the rounding of a run and the truth's uncertainty."""
-        from plumbline.truth.sensitivity import predictability_horizon
+        from plumbline.truth.predictability_horizon import predictability_horizon
 
         rounding = self.length * RUN_ROUNDING
         return predictability_horizon(self.trajectory.t, self.growth, rounding, self.uncertainty["position"])
@@ -70,7 +70,7 @@ class MotionTruth:
     @property
     def wanted_time(self) -> float:
         """How long a run should be compared [s]: the duration, up to the horizon of rounding alone."""
-        from plumbline.truth.sensitivity import predictability_horizon
+        from plumbline.truth.predictability_horizon import predictability_horizon
 
         return predictability_horizon(self.trajectory.t, self.growth, self.length * RUN_ROUNDING)
 
@@ -115,7 +115,7 @@ def motion_truth(
         times: (T,) [s] of the samples, times[0] = 0.
         closed_form: samples of a closed form at ``times``, if the scenario has one.
         max_compiled_bodies: longest chain for Taylor's method, None for `MAX_COMPILED_BODIES` of
-            `plumbline.truth.trajectory`; 0 after it has crashed a worker.
+            `plumbline.truth.trajectory_truth`; 0 after it has crashed a worker.
         proof: the motion as a certificate proves it; it takes the place of the two methods.
 
     Returns:
@@ -127,7 +127,7 @@ def motion_truth(
 
     """
     # with SciPy: not in a run's own process, which needs the classes of this module
-    from plumbline.truth import sensitivity, trajectory
+    from plumbline.truth import predictability_horizon, trajectory_truth
 
     singular = ""
     if model.has_loops:
@@ -138,9 +138,9 @@ def motion_truth(
             closed_form[2],
         )
     if max_compiled_bodies is None:
-        max_compiled_bodies = trajectory.MAX_COMPILED_BODIES
-    truth = trajectory.trajectory_truth(model, state, times, closed_form, max_compiled_bodies, proof)
-    growth, runs = sensitivity.perturbation_growth_and_runs(
+        max_compiled_bodies = trajectory_truth.MAX_COMPILED_BODIES
+    truth = trajectory_truth.trajectory_truth(model, state, times, closed_form, max_compiled_bodies, proof)
+    growth, runs = predictability_horizon.perturbation_growth_and_runs(
         model, state, times, perturbed_models(model, state)
     )
     growth, length = np.maximum.accumulate(growth), float(np.sum(stretched_length(model)))

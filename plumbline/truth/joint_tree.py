@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from plumbline.truth.balls import BallVectors, entries
+from plumbline.truth.ball_geometry import BallVectors, entries
 
 
 class JointTree(BallVectors):

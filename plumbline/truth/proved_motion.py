@@ -22,10 +22,10 @@ from plumbline.processes.user_cache import (
     user_cache_folder,
 )
 from plumbline.truth import import_truth_tool
-from plumbline.truth.enclosure import checked_numbers, checked_topology
+from plumbline.truth.certificate_proof import checked_numbers, checked_topology
 
 if TYPE_CHECKING:
-    from plumbline.truth.enclosure_checker import Enclosure
+    from plumbline.truth.certificate_checker import Enclosure
 
 MAX_BYTES = 50 * 2**20  # of all stored motions; one of 10 bodies and 41 samples takes 50 kB
 
@@ -125,6 +125,11 @@ def _name(model: Model, state: State, times: Array) -> str:
     arrays = [np.ascontiguousarray(x, dtype=float).tobytes() for x in numbers.values()]
     code = [
         Path(__file__).with_name(name).read_bytes()
-        for name in ("enclosure_checker.py", "enclosure_file.py", "compressed_json.py", Path(__file__).name)
+        for name in (
+            "certificate_checker.py",
+            "certificate_file.py",
+            "compressed_json.py",
+            Path(__file__).name,
+        )
     ]
     return f"{content_key(*code, repr(checked_topology(model)), *arrays)}.proof"

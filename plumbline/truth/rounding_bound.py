@@ -38,7 +38,7 @@ from plumbline.model.datatypes import ZERO_INERTIA, Array, Model, State
 from plumbline.model.kinematics import cross, cross_matrix, joint_vectors
 from plumbline.model.loops import cut_open, regular_rank, smallest_singular_value, wrench_length
 from plumbline.model.welding import BodyParts, part_offsets, undivided_bodies
-from plumbline.processes.workers import Pickled
+from plumbline.processes.worker_pool import Pickled
 from plumbline.truth.element_terms import joint_elements, spring_terms
 
 EPS = 2.0**-53

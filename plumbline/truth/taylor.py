@@ -1,7 +1,7 @@
 """Motion by heyoka's adaptive Taylor method in minimal coordinates, in double, extended or quad precision.
 
 Coordinates per body: the quaternion p, ω′, and for a rod u, u̇ (world frame).  The joint forces come from the
-block elimination described in `certified`, written as expressions in the coordinates; no constraint is
+block elimination described in `certified_state`, written as expressions in the coordinates; no constraint is
 integrated, so nothing drifts.  Mechanisms with other joints have the equations of `taylor_tree`; loops are
 held by accelerations there, and drift by rounding.  One compiled integrator serves every model with the same
 sequence of joints: the numbers of the model enter as parameters, which also keeps double-precision constants

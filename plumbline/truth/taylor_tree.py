@@ -8,7 +8,7 @@ Rotors, springs and dampers act on the relative rates ν of their joints, which 
 Ω along the world's axes, whose rotor adds a (Ω̇ + Ω × ω) in the turning near body's axes.
 A spring of a ball joint adds 6 k γ n with n = sin θ times the axis of its turn θ, γ = θ/(6 sin θ).  θ² and γ
 are integrated beside the motion, because θ/sin θ has no Taylor series by recurrence where θ = 0; (8) of
-`enclosure_checker` has their rates, whose series in θ² is f₀.
+`certificate_checker` has their rates, whose series in θ² is f₀.
 Loops are cut open (`plumbline.model.loops`): the ends b and c of each get forces λ on rows J of their
 relative acceleration in the axes of b, with X = M⁻¹ Jᵀ and ν̇₀ of the tree alone
 

@@ -25,10 +25,10 @@ import numpy as np
 from scipy.linalg import lapack
 
 from reference_impl.direct import EPS, Solution, check_state_solvable
-from reference_impl.errors import SingularSystem
 from reference_impl.euler_parameters import G, L, tilde
 from reference_impl.joints import joint_of_rows
 from reference_impl.mechanism import Array, Mechanism
+from reference_impl.singular_system import SingularSystem
 
 # Constants that turn flattened outer products of p with another vector into what is needed of them.
 _L, _G = L(np.eye(4)), G(np.eye(4))  # (4, 3, 4) each: L(p) = Σ pᵢ Lᵢ

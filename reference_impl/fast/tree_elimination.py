@@ -39,12 +39,12 @@ from reference_impl.direct import (
     power_of_two_scale,
 )
 from reference_impl.elements import Elements
-from reference_impl.errors import SingularSystem
 from reference_impl.euler_parameters import L, angular_velocity, cross, dot
 from reference_impl.fast.chain_elimination import StructuredSystem, component_first
 from reference_impl.integrate import Acceleration
 from reference_impl.joints import constraint_rows, joint_of_rows
 from reference_impl.mechanism import Array, Mechanism
+from reference_impl.singular_system import SingularSystem
 
 
 @dataclass(frozen=True, eq=False)

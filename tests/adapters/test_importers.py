@@ -11,7 +11,7 @@ from plumbline.engines.importer_calls import describe_importer, evaluate_model_f
 from plumbline.engines.registry import IMPORTERS
 from plumbline.importers.importer import ModelFile
 from plumbline.importers.neutral_model import CanonicalState
-from plumbline.processes.workers import Limits, Task, WorkerPool
+from plumbline.processes.worker_pool import Limits, Task, WorkerPool
 
 FILES = Path(__file__).parent / "model_files"
 GRAVITY = 9.81

@@ -60,7 +60,8 @@ def test_judging_runs_no_engine(name):
     taken = {(n.module, alias.name) for n in nodes if isinstance(n, ast.ImportFrom) for alias in n.names}
     assert ("plumbline.engines.registry", "load_adapter") not in taken
     for module, member in taken:
-        is_call = module in ("plumbline.engines.calls", "plumbline.processes.workers") and member.islower()
+        calling = ("plumbline.engines.engine_calls", "plumbline.processes.worker_pool")
+        is_call = module in calling and member.islower()
         assert not is_call and module != "plumbline.engines.metamorphic_hooks", f"{module}.{member}"
 
 
@@ -103,4 +104,4 @@ def test_the_main_job_needs_no_optional_package():
     users = {name: found for name, found in users.items() if found and name not in optional}
     assert not users, "load them where they are used, with a sentence where they are missing"
     assert "plumbline.processes.dask_cluster" in optional
-    assert not optional.keys() & {"plumbline.storage.history", "reports.history"}
+    assert not optional.keys() & {"plumbline.storage.history_of_nights", "reports.earlier_runs"}

@@ -17,8 +17,8 @@ import pytest
 from click.testing import CliRunner
 
 import plumbline as package
-from plumbline.cli.console import count_noun
 from plumbline.cli.main import COMMANDS, main
+from plumbline.cli.terminal_output import count_noun
 from plumbline.cli.verdict_matrix import engine_heading
 from plumbline.execution.runner import exit_code, summarize_verdicts
 from plumbline.judging.rows import RowContext, Verdict

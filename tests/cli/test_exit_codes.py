@@ -20,7 +20,7 @@ from plumbline.execution.plan import Plan
 from plumbline.execution.runner import run_plan
 from plumbline.judging.known_issues import load_known_issues
 from plumbline.processes import worker_process
-from plumbline.processes.workers import ExecutorLost, Limits
+from plumbline.processes.worker_pool import ExecutorLost, Limits
 from plumbline.scenario import loader
 from plumbline.truth.ground_truth import TRUTHS_DIFFER
 from tests.helpers import wrong_truths

@@ -41,7 +41,7 @@ WORK = (  # where the work of a command begins
     "plumbline.cli.run_commands.run_plan", "plumbline.cli.nightly.run_plan", "plumbline.studies.sweep.run",
     "plumbline.execution.runner.describe_engines", "plumbline.cli.scenario_commands.describe_engines",
     "plumbline.studies.drift.measure_drift", "plumbline.cli.study_commands.run_plan",
-    "plumbline.reproduce.write.make_script", "plumbline.truth.enclosure.prove_motion",
+    "plumbline.reproduce.write.make_script", "plumbline.truth.certificate_proof.prove_motion",
     "plumbline.cli.nightly.prove_changed_motions", "plumbline.cli.model_commands.run_model_files",
     "plumbline.cli.bisect_command.search_versions",
 )  # fmt: skip

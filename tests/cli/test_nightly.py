@@ -20,7 +20,7 @@ from plumbline.model.features import joint_roles
 from plumbline.model.loops import loop_gaps
 from plumbline.model.random_mechanisms import ELEMENTS, random_loop_mechanism
 from plumbline.processes.cpu_time import CpuTimes
-from plumbline.processes.workers import Limits
+from plumbline.processes.worker_pool import Limits
 from plumbline.scenario import loader
 from plumbline.scenario.generator import (
     MAX_RANDOM_BODIES,
@@ -32,9 +32,9 @@ from plumbline.scenario.generator import (
     random_scenario,
 )
 from plumbline.scenario.mechanism_document import mechanism_document
-from plumbline.storage.history import History
+from plumbline.storage.history_of_nights import History
 from plumbline.storage.results_store import ResultTables, read_table
-from plumbline.studies.coverage import CoverageFailure
+from plumbline.studies.coverage_study import CoverageFailure
 from tests.reports.test_report import decoded_chunks
 
 

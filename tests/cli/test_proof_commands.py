@@ -11,10 +11,10 @@ from click.testing import CliRunner
 
 from plumbline.cli.main import main
 from plumbline.execution.plan import Plan, TaskKey, TaskKind
-from plumbline.execution.scenario_run import ScenarioRun
+from plumbline.execution.scenario_verdicts import ScenarioRun
 from plumbline.scenario.loader import find_scenario_file, load_scenario
-from plumbline.truth import enclosure, proved_motion
-from plumbline.truth.trajectory import trajectory_truth
+from plumbline.truth import certificate_proof, proved_motion
+from plumbline.truth.trajectory_truth import trajectory_truth
 
 pytestmark = pytest.mark.skipif(
     not all(find_spec(module) for module in ("heyoka", "mpmath", "flint")),
@@ -206,7 +206,7 @@ def test_a_run_uses_the_proof_of_its_own_numbers_only():
     times = scenario.times
     found = proved_motion.find_proof(scenario.model, scenario.state, times)
     assert found is None
-    _, balls = enclosure.prove_motion(scenario.model, scenario.state, times)
+    _, balls = certificate_proof.prove_motion(scenario.model, scenario.state, times)
     proof = proved_motion.round_enclosure(balls)
     proved_motion.store_proof(scenario.model, scenario.state, times, proof)
 
@@ -231,7 +231,7 @@ def test_the_rounded_motion_is_within_its_radius():
     """Against the balls, at every sample."""
     scenario = load_scenario(find_scenario_file("lagrange-top"))
     times = np.arange(5) * 0.02
-    _, balls = enclosure.prove_motion(scenario.model, scenario.state, times)
+    _, balls = certificate_proof.prove_motion(scenario.model, scenario.state, times)
     proof = proved_motion.round_enclosure(balls)
     for k in range(len(times)):
         for exact, rounded in zip(balls.r[k], proof.trajectory.r[k], strict=True):

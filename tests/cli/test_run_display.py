@@ -6,9 +6,9 @@ from unittest.mock import patch
 import pytest
 from click.testing import CliRunner
 
-from plumbline.cli.console import make_console, print_matrix
 from plumbline.cli.main import main
 from plumbline.cli.run_display import RunDisplay
+from plumbline.cli.terminal_output import make_console, print_matrix
 from plumbline.cli.verdict_matrix import VerdictMatrix
 from plumbline.engines.adapter import EngineInfo
 from plumbline.execution.exit_codes import ExitCode

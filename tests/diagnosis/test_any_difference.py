@@ -10,13 +10,13 @@ from plumbline.diagnosis.diagnose import explain_disagreement
 from plumbline.diagnosis.integrator_search import explain_disagreeing_steps
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.rows import Verdict
-from plumbline.judging.state import STATE_UNITS
-from plumbline.judging.step import judge_steps
+from plumbline.judging.state_level import STATE_UNITS
+from plumbline.judging.step_level import judge_steps
 from plumbline.model.sampling import compared_states
 from plumbline.truth import step_formulas
 from plumbline.truth.ground_truth import state_truth
 from tests.helpers.catalogue import catalogue_scenarios
-from tests.judging.test_step import CONTEXT, methods, stepped
+from tests.judging.test_step_level import CONTEXT, methods, stepped
 
 STATES = 3  # besides the initial one
 MAX_BODIES = 10  # longer chains take minutes

@@ -5,7 +5,7 @@ import pytest
 
 from plumbline.diagnosis.defect_model import MAX_DENSE_UNKNOWNS, evaluate_case, make_defect_case
 from plumbline.model.sampling import random_states
-from plumbline.truth.certified import certify_state
+from plumbline.truth.certified_state import certify_state
 from plumbline.truth.rounding_bound import state_rounding_bound
 from tests.helpers import pendulums
 

@@ -13,7 +13,7 @@ from plumbline.engines.registry import load_adapter
 from plumbline.model.equivalent import WORLD_VECTORS, first_bodies, rotate_world, unrotate
 from plumbline.model.sampling import random_states
 from plumbline.scenario import loader
-from plumbline.truth.certified import certify_state
+from plumbline.truth.certified_state import certify_state
 from plumbline.truth.ground_truth import state_truth
 from tests.helpers import pendulums
 

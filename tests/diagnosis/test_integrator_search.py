@@ -14,7 +14,7 @@ from plumbline.truth import step_formulas
 from tests.helpers.nightly_tests import some_fast
 from tests.helpers.planted_steps import STEP_DEFECTS, planted_step, words_for
 from tests.helpers.shared_answers import sharing
-from tests.judging.test_step import loop_subject, methods, stepped, subject
+from tests.judging.test_step_level import loop_subject, methods, stepped, subject
 
 for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
     pytest.importorskip(engine)

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from plumbline.diagnosis.joint_diagnosis import diagnose_joints
-from plumbline.engines.calls import Evaluation
+from plumbline.engines.engine_calls import Evaluation
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.rows import RowContext
-from plumbline.judging.state import judge_states
+from plumbline.judging.state_level import judge_states
 from plumbline.model.kinematics import complete_state, rotation_matrix
 from plumbline.model.sampling import random_states
 from plumbline.scenario.loader import catalogue, load_scenario

@@ -1,4 +1,4 @@
-"""docs/notes/reference-performance.md cites stored runs: every figure of its tables is in bench/results."""
+"""docs/measurements/reference-performance.md cites stored runs: its tables' figures are in bench/results."""
 
 import json
 from pathlib import Path

@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from plumbline.engines import calls
+from plumbline.engines import engine_calls
 from plumbline.engines.registry import ENGINES, load_adapter
 from plumbline.judging import known_issues
 from plumbline.judging.rows import RowContext
-from plumbline.judging.state import judge_states
+from plumbline.judging.state_level import judge_states
 from plumbline.model.datatypes import EngineFailure, Unsupported
 from plumbline.model.sampling import random_states
 from plumbline.scenario.loader import catalogue, load_scenario
@@ -22,11 +22,11 @@ CONTEXT = RowContext("s", "f", "reference", "Reference", "1")
 
 def rows_of(adapter, monkeypatch, joints="bb"):
     """State-level rows of an adapter, as a run gets them."""
-    monkeypatch.setattr(calls, "load_adapter", lambda _: adapter)
+    monkeypatch.setattr(engine_calls, "load_adapter", lambda _: adapter)
     model = pendulums.make_model(joints)
     states = random_states(model, 2, seed=1)
     return judge_states(
-        CONTEXT, state_truth(model, states), calls.evaluate_states("reference", model, states)
+        CONTEXT, state_truth(model, states), engine_calls.evaluate_states("reference", model, states)
     ).rows
 
 
@@ -116,7 +116,7 @@ def test_every_refusal_in_the_catalogue_is_declared(engine):
         "furuta",
     ):
         s = load_scenario(catalogue()[name])
-        found = calls.evaluate_states(engine, s.model, [s.state])
+        found = engine_calls.evaluate_states(engine, s.model, [s.state])
         assert found.failure is None
         if found.unsupported is not None:
             assert found.gap, f"{engine}, {name}: {found.unsupported}"

@@ -16,16 +16,16 @@ import psutil
 import pytest
 from packaging.version import Version
 
-from plumbline.engines import calls, environments
+from plumbline.engines import engine_calls, environments
 from plumbline.engines.registry import ENGINES
 from plumbline.execution.plan import Plan
 from plumbline.execution.runner import run_plan
 from plumbline.judging import known_issues
 from plumbline.judging.rows import RowContext
 from plumbline.processes.remote_python import call_remote
-from plumbline.processes.workers import Limits, Task, WorkerPool
+from plumbline.processes.worker_pool import Limits, Task, WorkerPool
 from plumbline.scenario import loader
-from plumbline.truth.certified import certify_state
+from plumbline.truth.certified_state import certify_state
 from tests.helpers.exudyn_initial_accelerations import initial_accelerations
 
 PYTHON = (
@@ -67,14 +67,16 @@ def test_what_an_adapter_declares_is_read_without_importing_it(engine):
     assert environments.declared_attribute(engine, "package") == found.package
     for name in ("extra_requirements", "other_formulation", "reproduction_template"):
         assert environments.declared_attribute(engine, name) == getattr(found, name)
-    assert calls.describe_engine(engine).missing is None, "the installed version is in the declared range"
+    assert engine_calls.describe_engine(engine).missing is None, (
+        "the installed version is in the declared range"
+    )
 
 
 def test_a_version_out_of_range_is_reported(monkeypatch):
     from adapters.mujoco_engine import Mujoco
 
     monkeypatch.setattr(Mujoco, "supported_versions", "<1")
-    assert "supports versions <1 of mujoco, this is" in calls.describe_engine("mujoco").missing
+    assert "supports versions <1 of mujoco, this is" in engine_calls.describe_engine("mujoco").missing
 
 
 def test_known_entries_hold_for_an_engine_in_any_version_of_their_range():
@@ -126,7 +128,7 @@ def test_an_engine_gives_the_same_answer_in_another_environment():
             o.value.quantities[0]
             for python in ("", PYTHON)
             for o in workers.run(
-                [Task("k", calls.evaluate_states, ("mujoco", s.model, [s.state]), python=python)]
+                [Task("k", engine_calls.evaluate_states, ("mujoco", s.model, [s.state]), python=python)]
             )
         )
     assert np.array_equal(here.acceleration, away.acceleration)

@@ -7,7 +7,7 @@ from plumbline.equations.responses import Responses
 from plumbline.model.kinematics import rotation_matrix
 from plumbline.model.loops import cut_open
 from plumbline.model.sampling import compared_states
-from plumbline.truth.certified import certify_state
+from plumbline.truth.certified_state import certify_state
 from plumbline.truth.rounding_bound import state_rounding_bound
 from tests.helpers.catalogue import catalogue_scenarios
 

@@ -14,7 +14,7 @@ from plumbline.model.loops import motion_without_inertia
 from plumbline.model.random_mechanisms import ELEMENTS, random_tree
 from plumbline.model.sampling import compared_states, random_states
 from plumbline.scenario.generator import random_mechanism, random_scenario
-from plumbline.truth.certified import MAX_RELATIVE_RADIUS, certify_state, enclose_quantities
+from plumbline.truth.certified_state import MAX_RELATIVE_RADIUS, certify_state, enclose_quantities
 from plumbline.truth.rounding_bound import state_rounding_bound
 from tests.helpers.catalogue import catalogue_scenarios
 from tests.helpers.former_equations.chain import enclose_chain

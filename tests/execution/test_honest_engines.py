@@ -10,7 +10,7 @@ import pytest
 from plumbline.engines.registry import ENGINES
 from plumbline.execution.plan import Plan
 from plumbline.execution.runner import run_plan
-from plumbline.processes.workers import Limits
+from plumbline.processes.worker_pool import Limits
 from plumbline.scenario.generator import RandomScenarios
 
 for engine in ("mujoco", "pinocchio", "exudyn", "flint"):

@@ -12,10 +12,10 @@ import pytest
 from plumbline.engines.registry import ENGINES
 from plumbline.execution.plan import Plan, TaskKind
 from plumbline.execution.runner import describe_engines
-from plumbline.execution.scenario_run import ScenarioRun
+from plumbline.execution.scenario_verdicts import ScenarioRun
 from plumbline.judging import known_issues
 from plumbline.model.invariants import inertia_ratio
-from plumbline.processes.workers import Limits, WorkerPool
+from plumbline.processes.worker_pool import Limits, WorkerPool
 from tests.helpers.catalogue import catalogue_scenarios
 from tests.helpers.fast_matrix import features, is_fast, levels
 

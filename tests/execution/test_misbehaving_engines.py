@@ -10,7 +10,7 @@ from plumbline.engines import registry
 from plumbline.execution.plan import Plan
 from plumbline.execution.runner import exit_code, run_plan
 from plumbline.processes import worker_process
-from plumbline.processes.workers import Limits
+from plumbline.processes.worker_pool import Limits
 from plumbline.scenario import loader
 from tests.helpers import misbehaving_engines as engines
 

@@ -9,11 +9,11 @@ from functools import cache
 import numpy as np
 import pytest
 
-from plumbline.engines.calls import Evaluation
+from plumbline.engines.engine_calls import Evaluation
 from plumbline.engines.registry import load_adapter
 from plumbline.execution.plan import RANDOM_STATES, STATES_PER_RANDOM_SCENARIO
 from plumbline.judging.rows import RowContext
-from plumbline.judging.state import judge_states
+from plumbline.judging.state_level import judge_states
 from plumbline.measurements.single_steps import STEP_STATES
 from plumbline.model.datatypes import Unsupported
 from plumbline.model.sampling import compared_states
@@ -24,7 +24,7 @@ from tests.helpers.catalogue import catalogue_scenarios
 from tests.helpers.planted_branches import BRANCH_DEFECTS, BRANCH_STEPS
 from tests.helpers.planted_defects import plant
 from tests.helpers.planted_steps import planted_step
-from tests.judging.test_step import judged
+from tests.judging.test_step_level import judged
 
 for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
     pytest.importorskip(engine)

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from plumbline.diagnosis.diagnose import diagnose
-from plumbline.engines.calls import Evaluation
+from plumbline.engines.engine_calls import Evaluation
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.rows import RowContext
-from plumbline.judging.state import judge_states
-from plumbline.judging.trajectory import judge_trajectory
+from plumbline.judging.state_level import judge_states
+from plumbline.judging.trajectory_level import judge_trajectory
 from plumbline.measurements.order_and_limit import refinement_resolutions
 from plumbline.measurements.refinement_study import run_refinement_study
 from plumbline.model.sampling import random_states
@@ -120,7 +120,10 @@ def state_report(defect):
 def motion_report(defect):
     """Rows about motion that do not agree; an unresolved cell that no file excuses fails a run, too."""
     model, state, truth = motion(defect.loaded)
-    with planted(defect, model) as engine, patch("plumbline.engines.calls.load_adapter", lambda _: engine):
+    with (
+        planted(defect, model) as engine,
+        patch("plumbline.engines.engine_calls.load_adapter", lambda _: engine),
+    ):
         integrator = engine.integrator(defect.integrator)
         steps = refinement_resolutions(integrator, model.n, float(TIMES[-1]))
         runs = run_refinement_study(defect.engine, integrator.name, model, state, TIMES, steps)

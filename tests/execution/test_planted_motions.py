@@ -11,7 +11,7 @@ import pytest
 from adapters.pinocchio_engine import PinocchioChain
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.rows import RowContext
-from plumbline.judging.trajectory import judge_trajectory
+from plumbline.judging.trajectory_level import judge_trajectory
 from plumbline.measurements.order_and_limit import refinement_resolutions
 from plumbline.measurements.refinement_study import run_refinement_study
 from plumbline.truth.ground_truth import motion_truth
@@ -31,7 +31,7 @@ def rows(engine, integrator):
     model, state, truth = subject()
     method = engine.integrator(integrator)
     steps = refinement_resolutions(method, model.n, float(TIMES[-1]))
-    with patch("plumbline.engines.calls.load_adapter", lambda _: engine):
+    with patch("plumbline.engines.engine_calls.load_adapter", lambda _: engine):
         runs = run_refinement_study(engine.name, integrator, model, state, TIMES, steps)
     return judge_trajectory(RowContext("planted", "planted", *[engine.name] * 3), model, truth, method, runs)
 

@@ -8,9 +8,9 @@ import pytest
 
 from plumbline.execution import proofs
 from plumbline.execution.proofs import ProofSummary, prove_changed_motions
-from plumbline.processes.workers import Limits
+from plumbline.processes.worker_pool import Limits
 from plumbline.scenario.loader import find_scenario_file, load_scenario
-from plumbline.truth import trajectory
+from plumbline.truth import trajectory_truth
 from plumbline.truth.closed_form import exact_samples
 from plumbline.truth.proved_motion import find_proof
 
@@ -51,20 +51,20 @@ def test_a_proof_that_fails_is_reported():
 @pytest.mark.parametrize("name", ["tumbling-ball", "lagrange-top", "rest", "drag-rod", "free-top"])
 def test_the_usual_truth_is_within_its_claim(name):
     s = short(name)
-    _, ratio = trajectory.prove_and_judge_claim(s.model, s.state, s.times, exact_samples(s, s.times))
+    _, ratio = trajectory_truth.prove_and_judge_claim(s.model, s.state, s.times, exact_samples(s, s.times))
     assert 0 <= ratio <= 1
 
 
 def test_a_truth_that_claims_too_much_is_noticed(monkeypatch):
     s = short("tumbling-ball")
-    usual = trajectory.trajectory_truth
+    usual = trajectory_truth.trajectory_truth
 
     def wrong(*arguments):
         found = usual(*arguments)
         return replace(found, trajectory=replace(found.trajectory, r=found.trajectory.r + 1e-13))
 
-    monkeypatch.setattr(trajectory, "trajectory_truth", wrong)
-    _, ratio = trajectory.prove_and_judge_claim(s.model, s.state, s.times)
+    monkeypatch.setattr(trajectory_truth, "trajectory_truth", wrong)
+    _, ratio = trajectory_truth.prove_and_judge_claim(s.model, s.state, s.times)
     assert 1 < ratio < 1e4
     summary = ProofSummary(exceeded={s.name: ratio})
     assert "tumbling-ball: the usual truth is off by" in summary.sentence

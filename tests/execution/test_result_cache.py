@@ -22,7 +22,7 @@ from plumbline.judging.rows import JudgingResult, RowContext
 from plumbline.processes.record_encoding import encode_record
 from plumbline.processes.user_cache import CheckedFiles, recall, remember
 from plumbline.processes.worker_environment import hashed_environment
-from plumbline.processes.workers import Task, WorkerPool
+from plumbline.processes.worker_pool import Task, WorkerPool
 from plumbline.scenario import loader
 from tests.helpers.in_process import InProcessWorkers
 

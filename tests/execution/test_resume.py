@@ -18,12 +18,12 @@ import pytest
 from click.testing import CliRunner
 
 from plumbline.cli.main import main
-from plumbline.engines import calls
+from plumbline.engines import engine_calls
 from plumbline.execution import environment_fingerprint
 from plumbline.execution.plan import Plan
 from plumbline.execution.result_cache import DiskResultCache, task_hash
 from plumbline.execution.runner import run_plan
-from plumbline.processes.workers import Outcome, Pickled, Task
+from plumbline.processes.worker_pool import Outcome, Pickled, Task
 from plumbline.scenario import loader
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -209,13 +209,16 @@ def test_the_key_is_the_content():
     turned = replace(s.state, omega=-s.state.omega)
     other = replace(s.model, mass=np.nextafter(s.model.mass, 9.0))
     base = Task(
-        "a", calls.run_refinement, ("mujoco", "RK4", s.model, s.state, s.times, [0.5, 0.25]), version="4.0.0"
+        "a",
+        engine_calls.run_refinement,
+        ("mujoco", "RK4", s.model, s.state, s.times, [0.5, 0.25]),
+        version="4.0.0",
     )
     key = task_hash(base)
     assert key == task_hash(replace(base, key="b")), "the key is not the label's"
     changed = [
         replace(base, version="3.3.0"),
-        replace(base, function=calls.evaluate_states),
+        replace(base, function=engine_calls.evaluate_states),
         *(
             replace(base, arguments=(*base.arguments[:i], value, *base.arguments[i + 1 :]))
             for i, value in enumerate(

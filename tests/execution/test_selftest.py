@@ -8,7 +8,7 @@ import pytest
 from plumbline.cli import nightly
 from plumbline.execution import selftest
 from plumbline.execution.selftest import SelfTestResult
-from plumbline.processes.workers import Limits
+from plumbline.processes.worker_pool import Limits
 from plumbline.scenario import loader
 
 PASSING_TEST = """

@@ -8,9 +8,9 @@ from plumbline.engines.adapter import EngineInfo
 from plumbline.engines.registry import load_adapter
 from plumbline.execution.plan import Plan, TaskKind
 from plumbline.execution.runner import run_plan
-from plumbline.execution.scenario_run import ScenarioRun, uncompared_kinds
+from plumbline.execution.scenario_verdicts import ScenarioRun, uncompared_kinds
 from plumbline.judging.rows import Verdict
-from plumbline.judging.state import SINGULAR_POSE
+from plumbline.judging.state_level import SINGULAR_POSE
 from tests.helpers.catalogue import catalogue_scenarios
 
 

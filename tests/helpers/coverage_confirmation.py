@@ -13,13 +13,13 @@ from unittest.mock import patch
 import numpy as np
 
 from plumbline.engines.adapter import Adapter
-from plumbline.engines.calls import Evaluation
+from plumbline.engines.engine_calls import Evaluation
 from plumbline.engines.registry import load_adapter
-from plumbline.judging.coverage import CoverageEntry, scenario_coverage
 from plumbline.judging.rows import Level, Row, RowContext
-from plumbline.judging.state import judge_states
-from plumbline.judging.step import judge_steps
-from plumbline.judging.trajectory import judge_trajectory
+from plumbline.judging.smallest_detectable_mistake import CoverageEntry, scenario_coverage
+from plumbline.judging.state_level import judge_states
+from plumbline.judging.step_level import judge_steps
+from plumbline.judging.trajectory_level import judge_trajectory
 from plumbline.measurements.order_and_limit import refinement_resolutions
 from plumbline.measurements.refinement_study import run_refinement_study
 from plumbline.measurements.single_steps import STEP_STATES, run_step_study
@@ -93,7 +93,7 @@ def judged_rows(name: str, level: Level, change: Change) -> list[Row]:
         answers = with_change(STATE_ENGINE, change).evaluate(s.model, states(name))
         return judge_states(context, true_states(name), Evaluation(answers, None, None, 0.0)).rows
     adapter = with_change(STEP_ENGINE if level == "step" else MOTION_ENGINE, change)
-    with patch("plumbline.engines.calls.load_adapter", lambda _: adapter):
+    with patch("plumbline.engines.engine_calls.load_adapter", lambda _: adapter):
         if level == "step":
             integrator, some = adapter.integrator(STEP_INTEGRATOR), states(name)[:STEP_STATES]
             answer = run_step_study(STEP_ENGINE, integrator, s.model, some)

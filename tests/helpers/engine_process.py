@@ -9,7 +9,7 @@ from typing import Any
 
 from plumbline.engines.adapter import Adapter
 from plumbline.engines.registry import load_adapter
-from plumbline.processes.workers import Limits, Task, WorkerPool
+from plumbline.processes.worker_pool import Limits, Task, WorkerPool
 
 TIMEOUT = 60.0  # s
 

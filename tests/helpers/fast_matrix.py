@@ -6,7 +6,7 @@ import numpy as np
 
 from plumbline.engines.registry import load_adapter
 from plumbline.execution.plan import TaskKind
-from plumbline.execution.scenario_run import uncompared_kinds
+from plumbline.execution.scenario_verdicts import uncompared_kinds
 from plumbline.scenario.loader import Scenario
 
 MAX_BODIES = 10  # at state level; of mechanisms with loops

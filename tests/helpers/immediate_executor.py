@@ -1,6 +1,6 @@
 """Tasks that run in this process."""
 
-from plumbline.processes.workers import Executor, Limits, Outcome, Task
+from plumbline.processes.worker_pool import Executor, Limits, Outcome, Task
 
 
 class Immediate(Executor):

@@ -1,7 +1,7 @@
 """Calls of tasks in this process."""
 
-from plumbline.processes import workers
-from plumbline.processes.workers import Executor, Limits
+from plumbline.processes import worker_pool
+from plumbline.processes.worker_pool import Executor, Limits
 
 
 class InProcessWorkers(Executor):
@@ -16,4 +16,4 @@ class InProcessWorkers(Executor):
         self.task = task
 
     def collect(self):
-        return [(self.task, workers.run_task(self.task))]
+        return [(self.task, worker_pool.run_task(self.task))]

@@ -1,6 +1,6 @@
 """A second formulation of the truth: the notes' full system S x = b (N5) solved with mpmath at 50 digits.
 
-Euler parameters, p̈ and the normalisation multipliers, dense LU: nothing shared with `certified` but the
+Euler parameters, p̈ and the normalisation multipliers, dense LU: nothing shared with `certified_state` but the
 minimal state.  Costs (9N … 12N)³, so it is a check on small chains.
 """
 

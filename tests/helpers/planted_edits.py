@@ -14,9 +14,9 @@ from ruamel.yaml import YAML
 
 from plumbline.engines.registry import ENGINES, load_adapter
 from plumbline.execution.plan import Plan
-from plumbline.execution.scenario_run import ScenarioRun
+from plumbline.execution.scenario_verdicts import ScenarioRun
 from plumbline.judging.rows import Row
-from plumbline.processes.workers import run_task
+from plumbline.processes.worker_pool import run_task
 from plumbline.scenario.generator import RandomScenarios
 from plumbline.scenario.loader import load_scenarios
 

@@ -20,8 +20,8 @@ from plumbline.model.datatypes import Model, State
 from plumbline.model.random_mechanisms import ELEMENTS, random_tree
 from plumbline.model.sampling import random_states
 from plumbline.scenario.loader import find_scenario_file, load_scenario
-from plumbline.truth import enclosure
-from plumbline.truth.enclosure_file import JOINTS, SHAPES, parse_certificate
+from plumbline.truth import certificate_proof
+from plumbline.truth.certificate_file import JOINTS, SHAPES, parse_certificate
 from tests.helpers.random_chains import random_chain
 
 FOLDER = Path(__file__).parents[1] / "truth" / "certificates"
@@ -90,10 +90,10 @@ def write_certificates() -> None:
     found: dict[str, Any] = {}
     for name in NAMES:
         mechanism = stored_mechanism(name)
-        with mock.patch.dict(enclosure.BITS, quad=BITS):
-            raw, wide = enclosure.prove_motion(*mechanism, TIMES)
+        with mock.patch.dict(certificate_proof.BITS, quad=BITS):
+            raw, wide = certificate_proof.prove_motion(*mechanism, TIMES)
         (FOLDER / f"{name}.json.gz").write_bytes(raw)
-        _, narrow = enclosure.prove_motion(*mechanism, TIMES, precision="octuple")
+        _, narrow = certificate_proof.prove_motion(*mechanism, TIMES, precision="octuple")
         digits = np.frompyfunc(lambda ball: ball.mid().str(35, radius=False), 1, 1)
         radius = np.frompyfunc(lambda ball: float(f"{float(ball.rad()):.8e}"), 1, 1)
         found[name] = {

@@ -7,7 +7,7 @@ from typing import Any
 
 from plumbline.model.datatypes import Model
 from plumbline.processes import worker_process
-from plumbline.truth import certified, ground_truth, trajectory
+from plumbline.truth import certified_state, ground_truth, trajectory_truth
 
 GRAVITY_ERROR = 1e-7  # relative
 
@@ -15,23 +15,23 @@ GRAVITY_ERROR = 1e-7  # relative
 def prepare(*arguments: Any) -> None:
     """Initialise a worker, and give Taylor's method a gravity that is wrong by 1e-7."""
     initialize_worker(*arguments)
-    right = trajectory.simulate_taylor
+    right = trajectory_truth.simulate_taylor
 
     def wrong(model: Model, *rest: Any) -> Any:
         return right(model.changed(gravity=model.gravity * (1 + GRAVITY_ERROR)), *rest)
 
-    trajectory.simulate_taylor = wrong  # type: ignore[assignment]
+    trajectory_truth.simulate_taylor = wrong  # type: ignore[assignment]
 
 
 def prepare_states(*arguments: Any) -> None:
     """Initialise a worker, and certify states with a gravity that is wrong by 1e-7."""
     initialize_worker(*arguments)
-    right = certified.enclose_quantities
+    right = certified_state.enclose_quantities
 
     def wrong(model: Model, *rest: Any) -> Any:
         return right(model.changed(gravity=model.gravity * (1 + GRAVITY_ERROR)), *rest)
 
-    certified.enclose_quantities = wrong  # type: ignore[assignment]
+    certified_state.enclose_quantities = wrong  # type: ignore[assignment]
 
 
 def prepare_accepted(*arguments: Any) -> None:

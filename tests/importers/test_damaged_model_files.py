@@ -10,7 +10,7 @@ import pytest
 from plumbline.execution.exit_codes import ExitCode
 from plumbline.judging.rows import Verdict
 from plumbline.model_files.model_run import ModelPlan, run_model_files
-from plumbline.processes.workers import Limits
+from plumbline.processes.worker_pool import Limits
 from tests.helpers.model_mutations import damaged_model, extreme_model, robots
 
 # All files of a test are compared by one command, which also tests that a bad file hides no other.

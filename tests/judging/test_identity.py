@@ -20,7 +20,7 @@ from plumbline.judging.identity import (
     state_fingerprints,
 )
 from plumbline.model.datatypes import Integrator
-from plumbline.processes.workers import Limits
+from plumbline.processes.worker_pool import Limits
 from plumbline.scenario import loader
 from tests.helpers import pendulums
 

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from plumbline.cli.console import print_result
+from plumbline.cli.terminal_output import print_result
 from plumbline.engines.declared_names import declared_integrators
 from plumbline.engines.registry import ENGINES, load_adapter
 from plumbline.execution.random_batch import RandomBatch
@@ -17,7 +17,7 @@ from plumbline.execution.runner import RunResult
 from plumbline.judging import known_issues
 from plumbline.judging.rows import RowContext
 from plumbline.processes.cpu_time import CpuTimes
-from plumbline.scenario.errors import ScenarioError
+from plumbline.scenario.line_and_column_errors import ScenarioError
 from plumbline.storage.results_store import ResultTables
 
 ROOT = Path(__file__).resolve().parents[2]

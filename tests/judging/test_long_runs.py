@@ -23,7 +23,7 @@ from plumbline.measurements.long_run_study import (
     run_long_run_study,
 )
 from plumbline.model.datatypes import Integrator, Trajectory
-from plumbline.processes.workers import Limits
+from plumbline.processes.worker_pool import Limits
 from plumbline.scenario import loader
 from tests.helpers import engine_process as worker
 from tests.helpers.nightly_tests import slow

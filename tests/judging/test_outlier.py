@@ -5,11 +5,11 @@ from functools import cache
 
 import pytest
 
-from plumbline.engines.calls import Evaluation
+from plumbline.engines.engine_calls import Evaluation
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.outlier import annotate_outliers, describe_outliers, doubt_truth
 from plumbline.judging.rows import RowContext
-from plumbline.judging.state import judge_states
+from plumbline.judging.state_level import judge_states
 from plumbline.model.sampling import random_states
 from plumbline.truth.ground_truth import state_truth
 from tests.helpers import pendulums

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from plumbline.engines.calls import RefinementRun, RefinementStudy
+from plumbline.engines.engine_calls import RefinementRun, RefinementStudy
 from plumbline.judging.refinement_analysis import RefinementAnalysis
 from plumbline.judging.rows import RowContext
-from plumbline.judging.trajectory import judge_trajectory, pose_columns
+from plumbline.judging.trajectory_level import judge_trajectory, pose_columns
 from plumbline.measurements.order_and_limit import romberg
 from plumbline.measurements.refinement_study import ROUNDING_PER_STEP
 from plumbline.model.datatypes import Integrator, Trajectory

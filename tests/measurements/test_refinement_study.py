@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from plumbline.engines.calls import RefinementStudy, run_refinement
+from plumbline.engines.engine_calls import RefinementStudy, run_refinement
 from plumbline.engines.registry import load_adapter
-from plumbline.judging.trajectory import judge_trajectory
+from plumbline.judging.trajectory_level import judge_trajectory
 from plumbline.measurements import refinement_study
 from plumbline.measurements.order_and_limit import refinement_resolutions
 from plumbline.measurements.refinement_study import MIN_RUNS, STOP_MARGIN, is_resolved, run_refinement_study

@@ -32,8 +32,8 @@ from plumbline.model.datatypes import EngineFailure, Integrator, StateQuantities
 from plumbline.model.kinematics import angular_velocity, quaternion_product, quaternion_rate
 from plumbline.scenario.loader import find_scenario_file, load_scenario
 from plumbline.truth.ground_truth import RUN_ROUNDING, stretched_length
+from plumbline.truth.predictability_horizon import perturbation_growth
 from plumbline.truth.rounding_bound import state_rounding_bound
-from plumbline.truth.sensitivity import perturbation_growth
 from tests.helpers import pendulums
 
 MODEL = pendulums.make_model("br")

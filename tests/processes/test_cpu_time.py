@@ -7,7 +7,7 @@ import pytest
 from plumbline.execution.plan import Plan, TaskKey, TaskKind
 from plumbline.execution.runner import run_plan
 from plumbline.processes.cpu_time import CpuTimes
-from plumbline.processes.workers import Outcome, ResultCache, Task, WorkerPool
+from plumbline.processes.worker_pool import Outcome, ResultCache, Task, WorkerPool
 from plumbline.scenario import loader
 
 

@@ -16,7 +16,7 @@ pytest.importorskip("distributed")
 
 from plumbline.execution.plan import Plan
 from plumbline.execution.runner import run_plan
-from plumbline.processes.workers import Limits, Task
+from plumbline.processes.worker_pool import Limits, Task
 from plumbline.scenario import loader
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -157,7 +157,7 @@ class LostFuture:
 
 def test_a_lost_cluster_ends_the_run():
     from plumbline.processes import dask_cluster
-    from plumbline.processes.workers import ExecutorLost
+    from plumbline.processes.worker_pool import ExecutorLost
 
     made = object.__new__(dask_cluster.DaskCluster)
     made._client, made._tasks = LostClient(), {"a": (Task("a", len), dask_cluster._MAX_RETRIES + 1)}

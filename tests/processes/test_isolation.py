@@ -10,9 +10,9 @@ import psutil
 from plumbline.cli import nightly
 from plumbline.engines import registry
 from plumbline.processes import worker_process
-from plumbline.processes.workers import Limits
+from plumbline.processes.worker_pool import Limits
 from plumbline.scenario import loader
-from plumbline.storage.history import History
+from plumbline.storage.history_of_nights import History
 from tests.helpers import faulty_engines as faulty
 
 LIMITS = Limits(seconds=30, gigabytes=4)  # a sound cell beside two other test processes takes up to 10 s

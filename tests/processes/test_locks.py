@@ -84,7 +84,7 @@ def test_sockets_of_a_killed_run_are_removed_by_the_next(tmp_path, request, is_s
     script = tmp_path / "killed.py"
     script.write_text(
         f"import sys, time\nsys.path.insert(0, {str(ROOT)!r})\n"
-        "from plumbline.processes.workers import Task, WorkerPool\n"
+        "from plumbline.processes.worker_pool import Task, WorkerPool\n"
         "if __name__ == '__main__':\n"
         "    with WorkerPool(1) as workers:\n"
         "        list(workers.run([Task(0, abs, (-1,))]))\n"

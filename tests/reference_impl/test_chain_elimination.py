@@ -6,10 +6,10 @@ import pytest
 from plumbline.model.kinematics import quaternion_rate, state_from_minimal
 from plumbline.truth.rounding_bound import state_rounding_bound
 from reference_impl.direct import EPS, DirectSystem, Solution
-from reference_impl.errors import SingularSystem
 from reference_impl.euler_parameters import L
 from reference_impl.fast.chain_elimination import StructuredSystem, component_first
 from reference_impl.joints import constraint_rows
+from reference_impl.singular_system import SingularSystem
 from tests.helpers.random_chains import in_other_units, norms_per_body, random_chain
 
 JOINT_MIXES = {

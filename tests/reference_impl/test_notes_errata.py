@@ -5,11 +5,11 @@ import pytest
 
 from reference_impl import notes
 from reference_impl.direct import DirectSystem, check_state_solvable, solve_dense
-from reference_impl.errors import SingularSystem
 from reference_impl.euler_parameters import I3, A, A_rate, L, dAs_dp, dot
 from reference_impl.integrate import integrate_dop853
 from reference_impl.joints import constraint_rows
 from reference_impl.mechanism import Mechanism
+from reference_impl.singular_system import SingularSystem
 from tests.helpers.notes_test_data import Symbols, state_off_manifold, state_on_manifold
 from tests.helpers.random_chains import random_model
 

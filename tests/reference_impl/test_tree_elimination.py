@@ -12,13 +12,13 @@ from plumbline.model.sampling import random_states
 from plumbline.scenario.loader import find_scenario_file, load_scenario
 from plumbline.truth.rounding_bound import state_rounding_bound
 from reference_impl.direct import DirectSystem
-from reference_impl.errors import SingularSystem
 from reference_impl.euler_parameters import L, dot
 from reference_impl.fast.chain_elimination import StructuredSystem, component_first
 from reference_impl.fast.collocation import integrate_collocation
 from reference_impl.fast.tree_elimination import DenseSystem, TreeSystem, eliminated_system
 from reference_impl.integrate import integrate_dop853
 from reference_impl.joints import constraint_rows
+from reference_impl.singular_system import SingularSystem
 from tests.helpers.random_chains import random_model
 
 

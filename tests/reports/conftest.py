@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from reports import html_report, screenshot
-from reports.results import Results
+from reports.stored_results import Results
 from tests.helpers import example_results
 
 AXE = Path(html_report.__file__).parent / "node_modules" / "axe-core" / "axe.min.js"

@@ -9,9 +9,9 @@ import pytest
 from plumbline.model.invariants import DEPARTURE
 from plumbline.truth.proved_motion import ProvedMotion
 from reports import html_report
-from reports.history import History
+from reports.earlier_runs import History
 from reports.report_data import PROVED
-from reports.results import Results
+from reports.stored_results import Results
 from tests.reports.test_report import decoded_chunks
 
 RADIUS = 2e-4  # m, so large that it matters

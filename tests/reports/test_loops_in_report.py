@@ -6,7 +6,7 @@ import pytest
 import reports
 from plumbline.execution.plan import Plan
 from plumbline.execution.runner import run_plan, save
-from reports.results import Results
+from reports.stored_results import Results
 from tests.helpers.catalogue import catalogue_scenarios
 from tests.reports.test_report import decoded_chunks
 

@@ -15,14 +15,14 @@ import pytest
 from click.testing import CliRunner
 
 from plumbline.cli.main import main
-from plumbline.judging.coverage import CoverageEntry
+from plumbline.judging.smallest_detectable_mistake import CoverageEntry
 from plumbline.storage.results_store import DRIFT_TABLE
 from plumbline.studies import sweep
-from plumbline.studies.coverage import coverage_table
-from plumbline.studies.tables import write_table
+from plumbline.studies.coverage_study import coverage_table
+from plumbline.studies.parquet_files import write_table
 from reports import coverage_table as coverage_page
 from reports import html_report, reference_tables, sweep_page
-from reports.results import Results, replace_unprintable
+from reports.stored_results import Results, replace_unprintable
 from tests.helpers.example_results import HOSTILE, NASTY
 
 MEASURED: dict[str, Any] = {

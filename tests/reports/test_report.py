@@ -27,8 +27,8 @@ from plumbline.cli import verdict_matrix
 from plumbline.judging.rows import VERDICT_STYLES, Row, Verdict
 from plumbline.model.kinematics import quaternion_product
 from reports import chunks, html_report, junit, report_data, step_summary
-from reports.history import History
-from reports.results import Results, replace_unprintable
+from reports.earlier_runs import History
+from reports.stored_results import Results, replace_unprintable
 from reports.verdicts import css_class, error_ratio, format_number, needs_attention, rank
 from tests.helpers import example_results as fixture
 

@@ -17,7 +17,7 @@ import pytest
 
 from plumbline.storage.script_index import write_script_index
 from reports import html_report as report
-from reports.results import Results
+from reports.stored_results import Results
 from tests.helpers import example_results as fixture
 
 pytestmark = pytest.mark.browser

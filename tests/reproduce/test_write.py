@@ -11,7 +11,7 @@ from plumbline.cli.main import main
 from plumbline.engines.registry import load_adapter
 from plumbline.execution.result_cache import DiskResultCache
 from plumbline.judging.rows import RowContext
-from plumbline.processes.workers import Outcome
+from plumbline.processes.worker_pool import Outcome
 from plumbline.reproduce import write
 from plumbline.reproduce.write import NotReproducible, write_scripts
 from plumbline.scenario.loader import find_scenario_file, load_scenario

@@ -15,7 +15,7 @@ import pytest
 from pydantic_core.core_schema import ErrorType
 from ruamel.yaml import YAML
 
-from plumbline.scenario.errors import Problem, ScenarioError, did_you_mean
+from plumbline.scenario.line_and_column_errors import Problem, ScenarioError, did_you_mean
 from plumbline.scenario.loader import (
     find_scenario_file,
     json_schema,

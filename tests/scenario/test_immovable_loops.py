@@ -8,14 +8,14 @@ import pytest
 from click.testing import CliRunner
 
 from plumbline.cli.main import main
-from plumbline.engines.calls import evaluate_states
+from plumbline.engines.engine_calls import evaluate_states
 from plumbline.execution.exit_codes import ExitCode
 from plumbline.judging.rows import RowContext
-from plumbline.judging.state import judge_states
+from plumbline.judging.state_level import judge_states
 from plumbline.model.loops import immovable_joints
 from plumbline.model.sampling import compared_states
 from plumbline.scenario.loader import catalogue, find_scenario_file, load_scenario, load_scenario_text
-from plumbline.truth.certified import certify_state
+from plumbline.truth.certified_state import certify_state
 from plumbline.truth.ground_truth import state_truth
 
 TRUSS = """\

@@ -15,9 +15,9 @@ import pytest
 from plumbline.cli import nightly
 from plumbline.execution import runner
 from plumbline.execution.plan import Plan
-from plumbline.processes.workers import Limits
+from plumbline.processes.worker_pool import Limits
 from plumbline.scenario import loader
-from plumbline.storage.history import History
+from plumbline.storage.history_of_nights import History
 from tests.helpers.in_process import InProcessWorkers
 
 ROOT = Path(__file__).resolve().parents[2]

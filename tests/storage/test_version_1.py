@@ -9,7 +9,7 @@ from click.testing import CliRunner
 
 from plumbline.cli.main import main
 from plumbline.judging.rows import Row
-from plumbline.storage.history import History
+from plumbline.storage.history_of_nights import History
 from plumbline.storage.results_store import read_results, read_table
 
 STORED = Path(__file__).with_name("version_1") / "20261122T112600Z"  # `run rest --level state`, two engines

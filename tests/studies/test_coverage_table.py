@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from plumbline.judging.rows import RowContext, Verdict
-from plumbline.studies import coverage
+from plumbline.studies import coverage_study
 from tests.helpers.catalogue import catalogue_scenarios
 from tests.helpers.immediate_executor import Immediate
 
@@ -17,11 +17,11 @@ def test_parameters_in_several_tasks_give_the_table_of_one(monkeypatch):
         figures = {"value": 1e-12, "tolerance": 1e-10, "compared_until": s.duration / 16}
         for level, quantity in (("trajectory", "position_limit"), ("invariants", "energy_drift")):
             rows.append(context.make_row(level, "RK4", quantity, Verdict.AGREES, "", **figures))
-    whole = coverage.measure_coverage(Immediate(), scenarios, rows, 1)
-    assert {entry.level for entry in whole} == set(coverage.COVERED_LEVELS)
-    monkeypatch.setattr(coverage, "PARAMETERS_PER_TASK", 20)
+    whole = coverage_study.measure_coverage(Immediate(), scenarios, rows, 1)
+    assert {entry.level for entry in whole} == set(coverage_study.COVERED_LEVELS)
+    monkeypatch.setattr(coverage_study, "PARAMETERS_PER_TASK", 20)
     executor, seen = Immediate(), []
-    parts = coverage.measure_coverage(
+    parts = coverage_study.measure_coverage(
         executor, scenarios, rows, 1, progress=lambda *counts: seen.append(counts)
     )
     assert len(executor.started) == len(seen) == seen[-1][1] == 2 * len(scenarios)

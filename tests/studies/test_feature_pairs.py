@@ -6,10 +6,10 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from plumbline.engines.calls import Evaluation
+from plumbline.engines.engine_calls import Evaluation
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.rows import RowContext, Verdict
-from plumbline.judging.state import judge_states
+from plumbline.judging.state_level import judge_states
 from plumbline.model.datatypes import JOINT_ELEMENTS, KINDS
 from plumbline.model.features import ROLES, Feature, Place, features, joint_roles, without_feature
 from plumbline.model.kinematics import complete_state

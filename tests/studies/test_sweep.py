@@ -11,17 +11,17 @@ import pyarrow.parquet as pq
 import pytest
 
 from plumbline.engines.adapter import EngineInfo
-from plumbline.engines.calls import run_refinement
+from plumbline.engines.engine_calls import run_refinement
 from plumbline.engines.registry import load_adapter
 from plumbline.execution.runner import describe_engines
 from plumbline.judging.rows import RowContext
-from plumbline.judging.trajectory import judge_trajectory
+from plumbline.judging.trajectory_level import judge_trajectory
 from plumbline.measurements.order_and_limit import refinement_resolutions
-from plumbline.processes.workers import Limits, WorkerPool
+from plumbline.processes.worker_pool import Limits, WorkerPool
 from plumbline.scenario import loader as scenarios
-from plumbline.scenario.errors import ScenarioError
+from plumbline.scenario.line_and_column_errors import ScenarioError
 from plumbline.studies import sweep, sweep_file
-from plumbline.studies.tables import write_table
+from plumbline.studies.parquet_files import write_table
 from plumbline.truth.ground_truth import motion_truth
 from tests.helpers import pendulums
 from tests.helpers.mutations import limited_time
@@ -120,7 +120,7 @@ def judged_by_run_and_sweep(defect):
 
     def study(steps):
         inside = defect.engine_patch() if defect.engine_patch else nullcontext()
-        with inside, patch("plumbline.engines.calls.load_adapter", lambda _: engine):
+        with inside, patch("plumbline.engines.engine_calls.load_adapter", lambda _: engine):
             return run_refinement("mujoco", method.name, s.model, s.state, s.times, steps)
 
     run_steps = refinement_resolutions(method, s.model.n, s.duration)

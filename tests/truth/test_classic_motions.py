@@ -29,7 +29,7 @@ def scenario(name):
 
 def certified_rates(s, x, xdot):
     """ω̇′ of all bodies at joint coordinates and rates of a loop that close it, certified."""
-    from plumbline.truth.certified import certify_state
+    from plumbline.truth.certified_state import certify_state
 
     coordinates, rates = np.zeros((2, s.model.n, 2))
     coordinates[:, 0], rates[:, 0] = x, xdot

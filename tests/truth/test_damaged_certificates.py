@@ -8,13 +8,13 @@ from functools import cache
 
 import pytest
 
+from plumbline.truth.certificate_file import parse_certificate
+from plumbline.truth.certificate_proof import certificate_digest
 from plumbline.truth.compressed_json import MalformedCertificate
-from plumbline.truth.enclosure import certificate_digest
-from plumbline.truth.enclosure_file import parse_certificate
 from tests.helpers.mutations import damaged_bytes, damaged_document, limited_time
 from tests.helpers.stored_certificates import FOLDER, NAMES, QUANTITIES, stored_document
 
-checker = pytest.importorskip("plumbline.truth.enclosure_checker", reason="needs python-flint")
+checker = pytest.importorskip("plumbline.truth.certificate_checker", reason="needs python-flint")
 PROOF_SECONDS = 60.0  # s of CPU time; the slowest of the originals takes 2
 
 

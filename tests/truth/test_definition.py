@@ -8,7 +8,7 @@ import pytest
 
 from plumbline.model.sampling import compared_states
 from plumbline.scenario.generator import random_mechanism, random_scenario
-from plumbline.truth.certified import certify_state, enclose_quantities
+from plumbline.truth.certified_state import certify_state, enclose_quantities
 from plumbline.truth.definition import DefinitionViolated, definition_holds
 from tests.helpers.catalogue import catalogue_scenarios
 from tests.helpers.nightly_tests import slow

@@ -22,9 +22,9 @@ from plumbline.truth.ground_truth import (
     perturbed_models,
     stretched_length,
 )
+from plumbline.truth.predictability_horizon import perturbation_growth
 from plumbline.truth.rounding_bound import state_rounding_bound
-from plumbline.truth.sensitivity import perturbation_growth
-from plumbline.truth.trajectory import TrajectoryTruth, trajectory_truth
+from plumbline.truth.trajectory_truth import TrajectoryTruth, trajectory_truth
 from tests.helpers import pendulums
 
 TIMES = np.linspace(0, 1, 9)
@@ -181,7 +181,7 @@ def test_two_methods_that_differ_by_more_than_rounding_are_reported(wrong):
         for name, scale in zip(MOTION_UNITS, scales, strict=True)
     }
     made = TrajectoryTruth(sound.trajectory, differences, "made")
-    with patch("plumbline.truth.trajectory.trajectory_truth", lambda *_: made):
+    with patch("plumbline.truth.trajectory_truth.trajectory_truth", lambda *_: made):
         found = motion_truth(model, at, TIMES, None)
     assert found.method == "made" and bool(found.conflict) is bool(wrong)
     assert not wrong or (found.conflict.startswith(TRUTHS_DIFFER) and "1.1 times what" in found.conflict)
@@ -193,7 +193,7 @@ def test_a_truth_that_is_not_a_number_is_in_doubt(name: str) -> None:
     at = pendulums.state_from_seed(model, seed=2, rate=0.5)
     sound = motion_truth(model, at, TIMES, None)
     made = TrajectoryTruth(sound.trajectory, sound.uncertainty | {name: np.full(9, np.nan)}, "made")
-    with patch("plumbline.truth.trajectory.trajectory_truth", lambda *_: made):
+    with patch("plumbline.truth.trajectory_truth.trajectory_truth", lambda *_: made):
         assert motion_truth(model, at, TIMES, None).conflict
 
 

@@ -12,10 +12,10 @@ from plumbline.model.loops import assembled, loop_gaps, smallest_singular_value
 from plumbline.model.random_mechanisms import random_loop_mechanism
 from plumbline.truth.ground_truth import motion_truth, perturbed_models
 from plumbline.truth.notes_motion import simulate_notes_form
+from plumbline.truth.predictability_horizon import perturbed_states
 from plumbline.truth.regular_motion import RTOL, first_doubt, regular_motion
-from plumbline.truth.sensitivity import perturbed_states
 from plumbline.truth.taylor import simulate_taylor
-from plumbline.truth.trajectory import trajectory_truth
+from plumbline.truth.trajectory_truth import trajectory_truth
 from tests.helpers.catalogue import catalogue_scenarios
 
 pytestmark = pytest.mark.skipif(

@@ -91,7 +91,7 @@ def test_no_sound_engine_exceeds_the_bound_in_two_thousand_chains(name):
 def check_errors_within_bound(name, count):
     """Check that the worst error of an engine stays below half of the tolerance, which leaves a margin."""
     pytest.importorskip("flint")
-    from plumbline.truth.certified import certify_state
+    from plumbline.truth.certified_state import certify_state
 
     try:
         engine = load_adapter(name)
@@ -136,7 +136,7 @@ FAR = {  # the joint of the first body, its other fields, and the joint of the s
 def test_positions_far_from_the_origin_lose_digits_of_arms_within_the_bound(case, engine):
     """An arm that an engine finds as a difference of positions is off by a rounding of these."""
     pytest.importorskip("flint")
-    from plumbline.truth.certified import certify_state
+    from plumbline.truth.certified_state import certify_state
 
     inertia = {"six": [0.021, 0.034, 0.042, 0.004, -0.003, 0.005]}
     joint, more, second, its = FAR[case]
@@ -163,7 +163,7 @@ def test_a_real_loss_of_digits_exceeds_the_bound():
     """The articulated-body recursion on a chain of 50 balls is off by far more than roundings explain."""
     pytest.importorskip("flint")
     pytest.importorskip("pinocchio")
-    from plumbline.truth.certified import certify_state
+    from plumbline.truth.certified_state import certify_state
 
     scenario = load_scenario(find_scenario_file("chain-50-balls"))
     (state,) = random_states(scenario.model, 1, seed=3)
@@ -209,7 +209,7 @@ def test_a_small_parameter_error_exceeds_the_bound(what, rods, sharp):
 
 
 def smallest_detected_error(what, rods):
-    from plumbline.truth.certified import certify_state
+    from plumbline.truth.certified_state import certify_state
 
     rng, worst = np.random.default_rng(5), 0.0
     for _ in range(10):
@@ -289,7 +289,7 @@ def test_bounds_of_many_states_are_those_of_each(name):
 def test_a_small_body_on_a_rod_at_its_centre_of_mass_keeps_within_the_bound(name):
     """Spatial algebra holds ṙ × m ṙ, whose rounding turns a body of small inertia."""
     pytest.importorskip("flint")
-    from plumbline.truth.certified import certify_state
+    from plumbline.truth.certified_state import certify_state
 
     model = catalogue_scenarios()["spherical"].model
     model = model.changed(inertia=1e-4 * model.inertia)

@@ -9,14 +9,15 @@ import pytest
 
 from plumbline.model.datatypes import EngineFailure
 from plumbline.model.invariants import attitude_error, motion_errors, motion_scales, position_error
-from plumbline.processes.workers import Limits, Task, WorkerPool
+from plumbline.processes.worker_pool import Limits, Task, WorkerPool
 from plumbline.scenario.loader import find_scenario_file, load_scenario
-from plumbline.truth import ground_truth, trajectory
-from plumbline.truth.certified import certify_state
+from plumbline.truth import ground_truth
+from plumbline.truth import trajectory_truth as trajectory
+from plumbline.truth.certified_state import certify_state
 from plumbline.truth.closed_form import closed_form_motion
 from plumbline.truth.notes_motion import simulate_notes_form
 from plumbline.truth.taylor import load_heyoka, simulate_taylor
-from plumbline.truth.trajectory import MAX_EXTENDED_PRECISION_BODIES, NOTES_RTOL, trajectory_truth
+from plumbline.truth.trajectory_truth import MAX_EXTENDED_PRECISION_BODIES, NOTES_RTOL, trajectory_truth
 from tests.helpers.catalogue import catalogue_scenarios
 from tests.helpers.random_chains import random_chain
 

@@ -7,7 +7,7 @@
 The mistakes are mutmut's.  Each is made in the memory of a forked child, so no file is ever changed and a
 mutant costs the tests it meets and little more.  The tests run in a copy of the checkout, first once in full
 to learn which test reaches which line; a mutant meets those that reach its line, the likeliest to notice
-first, until one fails or `PATIENCE` ends.  docs/notes/mutation.md says what is left out, and why.
+first, until one fails or `PATIENCE` ends.  docs/measurements/mutation.md says what is left out, and why.
 
 Ends with 1 where fewer than 95 % are noticed, where one survives that `survivors.yaml` does not list with a
 reason, or where one is noticed that it lists.
@@ -93,16 +93,17 @@ TARGETS = {
         "plumbline/model/invariants.py",
     ],
     "checker": [
-        f"plumbline/truth/{name}.py" for name in ("enclosure_checker", "enclosure_file", "compressed_json")
+        f"plumbline/truth/{name}.py"
+        for name in ("certificate_checker", "certificate_file", "compressed_json")
     ],
-    "prover": ["plumbline/truth/enclosure.py"],
+    "prover": ["plumbline/truth/certificate_proof.py"],
     "equations": ["plumbline/equations/*.py", "plumbline/truth/definition.py"],
 }
 TEST_FILES = {  # by target or top folder, the tests that must notice its mutants
     "reference_impl": [
         "tests/reference_impl/test_*.py",
         "tests/adapters/test_reference_engine.py",
-        "tests/scenario/test_loops.py",
+        "tests/scenario/test_loop_files.py",
         *(f"tests/truth/test_{name}.py" for name in ("certified_tree", "loop_motion", "tree_motion")),
     ],
     "plumbline": [
@@ -128,8 +129,8 @@ TEST_FILES = {  # by target or top folder, the tests that must notice its mutant
         "tests/model/test_invariants.py",
         "tests/execution/test_planted_defects.py",
     ],
-    "checker": ["tests/truth/test_enclosure_checker.py", "tests/truth/test_enclosure_file.py"],
-    "prover": ["tests/truth/test_enclosure.py"],
+    "checker": ["tests/truth/test_certificate_checker.py", "tests/truth/test_certificate_file.py"],
+    "prover": ["tests/truth/test_certificate_proof.py"],
     "equations": ["tests/equations/test_*.py", "tests/truth/test_definition.py"],
 }
 TOKEN = re.compile(r"\"[^\"]*\"|'[^']*'|\w+\.?\w*|[^\w\s]+")

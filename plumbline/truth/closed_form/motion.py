@@ -13,7 +13,7 @@ import numpy as np
 
 from plumbline.model.datatypes import Array, Model, State
 from plumbline.model.kinematics import rotation_matrix
-from plumbline.processes.errors import PlumblineError
+from plumbline.processes.exceptions import PlumblineError
 
 CONDITION_RTOL = 1e-12  # relative: by how much rounded inputs may violate a condition
 

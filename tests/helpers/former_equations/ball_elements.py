@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from plumbline.truth.balls import entries
+from plumbline.truth.ball_geometry import entries
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from plumbline.model.datatypes import Model, State
-from plumbline.truth.balls import entries, midpoints, term_scales
+from plumbline.truth.ball_geometry import entries, midpoints, term_scales
 from tests.helpers.former_equations.tree import BallArithmetic
 
 

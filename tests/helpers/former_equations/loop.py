@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from plumbline.model.datatypes import KINDS, Array, Model, State
 from plumbline.model.loops import CutMechanism, cut_open, independent_rows
-from plumbline.truth.balls import entries, midpoints
+from plumbline.truth.ball_geometry import entries, midpoints
 from tests.helpers.former_equations.tree import (
     BallTree,
     equations_of_motion,
@@ -154,8 +154,8 @@ def enclose_loop(flint: Any, model: Model, state: State) -> dict[str, Any]:
         state: near an assembled state.
 
     Returns:
-        As `plumbline.truth.certified.enclose_quantities`; "scale" has besides the largest gap of the rows
-        that were not kept.
+        As `plumbline.truth.certified_state.enclose_quantities`; "scale" has besides the largest gap of the
+        rows that were not kept.
 
     Raises:
         ZeroDivisionError: no pose was proved to exist and to be unique, or a matrix has no inverse.

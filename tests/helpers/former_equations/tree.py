@@ -22,7 +22,7 @@ import numpy as np
 
 from plumbline.model.datatypes import KINDS, Model, State
 from plumbline.model.kinematics import own_rates, rate_count
-from plumbline.truth.balls import BallVectors, entries, quantity_scales
+from plumbline.truth.ball_geometry import BallVectors, entries, quantity_scales
 from plumbline.truth.joint_tree import JointTree
 from tests.helpers.former_equations.ball_elements import ball_elements
 
@@ -273,7 +273,7 @@ def moving_quantities(
         applied: further wrenches (6, 1) on bodies: moment about the origin, force.
 
     Returns:
-        By quantity, as `plumbline.truth.certified.enclose_quantities`, without mass matrix and scales.
+        By quantity, as `plumbline.truth.certified_state.enclose_quantities`, without mass matrix and scales.
 
     """
     first, wrenches = equations.first, list(equations.wrenches)
@@ -325,7 +325,7 @@ def enclose_tree(flint: Any, model: Model, state: State, mass_matrix: bool) -> d
         mass_matrix: whether to compute the mass matrix too.
 
     Returns:
-        As `plumbline.truth.certified.enclose_quantities`.
+        As `plumbline.truth.certified_state.enclose_quantities`.
 
     Raises:
         ZeroDivisionError: the mass matrix is not invertible, at this precision.

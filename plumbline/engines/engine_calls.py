@@ -1,0 +1,231 @@
+"""Calls made in worker processes: one engine, one task, numbers or a reason back.
+
+Nothing here judges.  Every function takes and returns small picklable records, so that the same task runs
+in a local process, in another environment or on another machine.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from importlib import metadata
+
+from plumbline.engines.adapter import EngineInfo
+from plumbline.engines.environments import BASE_REQUIREMENTS, declared_attribute
+from plumbline.engines.registry import load_adapter
+from plumbline.model.datatypes import (
+    Array,
+    Integrator,
+    Model,
+    State,
+    StateQuantities,
+    StepRun,
+    Trajectory,
+    Unsupported,
+)
+from plumbline.processes.exceptions import describe_exception
+
+# What every environment has: where one of these is missing, the checkout or the environment is broken.
+_OWN_PACKAGES = {"plumbline", "adapters", "reference_impl", *BASE_REQUIREMENTS, ""}
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """State quantities of an engine at a list of states, or the reason why there are none."""
+
+    quantities: list[StateQuantities]
+    unsupported: str | None  # the engine's reason for refusing
+    failure: str | None  # what the engine did instead
+    cpu_time: float  # CPU s inside the engine's calls
+    gap: str = ""  # the declared gap that the refusal follows from
+    declared: tuple[str, ...] = ()  # all gaps that the adapter declares
+
+
+@dataclass(frozen=True, eq=False)
+class RefinementRun:
+    """One run of a refinement study: a trajectory, or what the engine did instead."""
+
+    resolution: float  # step in s, or relative tolerance
+    trajectory: Trajectory | None
+    failure: str | None
+    cpu_time: float  # CPU s
+
+
+@dataclass(frozen=True, eq=False)
+class RefinementStudy:
+    """The runs of one integrator at all resolutions, coarse to fine."""
+
+    runs: list[RefinementRun]
+    unsupported: str | None  # the engine's reason for refusing
+    gap: str = ""  # the declared gap that this follows from
+
+
+@dataclass(frozen=True, eq=False)
+class StepAttempt:
+    """A few steps of one size from one state."""
+
+    state: int  # index of the state
+    step: float  # s
+    run: StepRun | None = None  # the steps, fewer where more were refused or failed
+    refusal: str = ""  # why the engine refused to take more steps
+    failure: str = ""  # what it did instead of taking more steps
+    gap: str = ""  # the declared gap that the refusal follows from
+
+
+@dataclass(frozen=True, eq=False)
+class StepEvaluation:
+    """Single steps of one integrator from several states."""
+
+    attempts: list[StepAttempt]
+    cpu_time: float  # CPU s
+
+
+def describe_engine(engine: str) -> EngineInfo:
+    """Load an engine and describe it.
+
+    Returns:
+        Its description; ``missing`` holds a sentence where the engine is not installed here, or in a
+        version that the adapter cannot use.
+
+    Raises:
+        ImportError: another module than the engine's is missing, or the engine is installed but broken.
+
+    """
+    try:
+        return load_adapter(engine).describe()
+    except (ModuleNotFoundError, AttributeError) as error:
+        return describe_missing(engine, error, "adapter")
+
+
+def describe_missing(name: str, error: ModuleNotFoundError | AttributeError, subject: str) -> EngineInfo:
+    """Describe an engine that cannot be loaded, or raise the error again where it is not the engine's.
+
+    Args:
+        name: of an engine or an importer, in the registry.
+        error: a module or an interface that is missing.
+        subject: what translates to the engine: "adapter" or "column".
+
+    Returns:
+        A description whose ``missing`` is a sentence.
+
+    """
+    if isinstance(error, ModuleNotFoundError):
+        if (error.name or "").partition(".")[0] in _OWN_PACKAGES:
+            raise error
+        return EngineInfo(name, name, "", (), f"{name} is not installed here: {error}")
+    package = declared_attribute(name, "package")
+    if not isinstance(package, str):  # no class of that name
+        raise error
+    version = metadata.version(package)
+    return EngineInfo(name, name, version, (), f"the {subject} cannot use version {version}: {error}")
+
+
+def evaluate_states(engine: str, model: Model, states: Sequence[State]) -> Evaluation:
+    """Evaluate the state quantities of one engine; what the engine raises becomes a reason.
+
+    Returns:
+        The quantities at each state, or the reason why there are none.
+
+    Raises:
+        MemoryError: the worker reached its memory limit, which the pool reports.
+
+    """
+    begin = time.process_time()
+    quantities: list[StateQuantities] = []
+    unsupported, failure, gap, declared = None, None, "", tuple[str, ...]()
+    try:
+        adapter = load_adapter(engine)
+        declared = (*adapter.unsupported, *adapter.gaps)
+        quantities = adapter.evaluate(model, states)
+        for name in adapter.unsupported:
+            if any(getattr(answer, name, None) is not None for answer in quantities):
+                failure = f"{engine} returns the {name} that its adapter declares as unsupported"
+    except Unsupported as refusal:
+        unsupported, gap = describe_exception(refusal), refusal.gap
+    except MemoryError:
+        raise
+    except Exception as error:  # an engine may raise anything: its message belongs in the results
+        failure = describe_exception(error)
+    return Evaluation(quantities, unsupported, failure, time.process_time() - begin, gap, declared)
+
+
+def run_refinement(
+    engine: str,
+    integrator: str,
+    model: Model,
+    state: State,
+    times: Array,
+    resolutions: Sequence[float],
+    is_enough: Callable[[Model, Integrator, Sequence[RefinementRun]], bool] | None = None,
+) -> RefinementStudy:
+    """Simulate the same motion at each resolution; a run that fails is kept with its reason.
+
+    Args:
+        times: sample times (T,) [s].
+        resolutions: steps [s] or relative tolerances, coarse to fine.
+        is_enough: asked after every run whether those so far will do; None to run at all resolutions.
+
+    Returns:
+        The runs; up to the first refusal where the engine does not support the motion.
+
+    Raises:
+        MemoryError: the worker reached its memory limit, which the pool reports.
+
+    """
+    adapter = load_adapter(engine)
+    runs: list[RefinementRun] = []
+    for resolution in resolutions:
+        begin = time.process_time()
+        trajectory, failure = None, None
+        try:
+            trajectory = adapter.simulate(model, state, times, integrator, resolution)
+        except Unsupported as refusal:
+            return RefinementStudy(runs, describe_exception(refusal), refusal.gap)
+        except MemoryError:
+            raise
+        except Exception as error:  # as above
+            failure = describe_exception(error)
+        runs.append(RefinementRun(resolution, trajectory, failure, time.process_time() - begin))
+        if is_enough is not None and is_enough(model, adapter.integrator(integrator), runs):
+            break
+    return RefinementStudy(runs, None)
+
+
+def run_steps(
+    engine: str,
+    integrator: str,
+    model: Model,
+    states: Sequence[State],
+    steps: Sequence[Sequence[float]],
+    counts: Sequence[int],
+) -> StepEvaluation:
+    """Take a few steps of each size from each state; what the engine raises becomes a reason.
+
+    Args:
+        steps: steps [s] from each state.
+        counts: numbers of steps, ascending; where the engine refuses the largest or fails, the next
+            smaller is tried: angles may become singular on the way, and an explicit method unstable.
+
+    Raises:
+        MemoryError: the worker reached its memory limit, which the pool reports.
+
+    """
+    begin = time.process_time()
+    adapter, attempts = load_adapter(engine), []
+    for index, (state, sizes) in enumerate(zip(states, steps, strict=True)):
+        for step in sizes:
+            attempt = StepAttempt(index, step)
+            for count in reversed(counts):
+                try:
+                    attempt = replace(attempt, run=adapter.step(model, state, integrator, step, count))
+                    break
+                except Unsupported as refusal:
+                    if not attempt.refusal:
+                        attempt = replace(attempt, refusal=describe_exception(refusal), gap=refusal.gap)
+                except MemoryError:
+                    raise
+                except Exception as error:  # as above
+                    attempt = replace(attempt, failure=attempt.failure or describe_exception(error))
+            attempts.append(attempt)
+    return StepEvaluation(attempts, time.process_time() - begin)

@@ -1,0 +1,466 @@
+"""One scenario on all engines: makes its tasks and judges their outcomes once the truth is known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from plumbline.diagnosis.result import Diagnosis
+from plumbline.engines import engine_calls, environments
+from plumbline.engines.adapter import EngineInfo
+from plumbline.execution.plan import (
+    STATES_PER_RANDOM_SCENARIO,
+    LevelSelection,
+    Plan,
+    TaskKey,
+    TaskKind,
+    scenario_level,
+    task_keys,
+)
+from plumbline.execution.result_cache import returned_type
+from plumbline.judging import outlier, relation_rows
+from plumbline.judging.known_issues import KnownIssues
+from plumbline.judging.long_runs import judge_long_runs
+from plumbline.judging.rows import Fingerprints, JudgingResult, Level, Row, RowContext, Verdict, mark_aliases
+from plumbline.judging.state_level import judge_states, singular_pose_row
+from plumbline.judging.step_level import judge_steps
+from plumbline.judging.trajectory_level import judge_trajectory
+from plumbline.measurements import relations
+from plumbline.measurements.long_run_study import plan_long_run, run_long_run_study
+from plumbline.measurements.order_and_limit import refinement_resolutions
+from plumbline.measurements.refinement_study import run_refinement_study
+from plumbline.measurements.single_steps import MAX_STEP_BODIES, STEP_STATES, run_step_study
+from plumbline.model.datatypes import Integrator, Model, State
+from plumbline.model.invariants import inertia_ratio
+from plumbline.model.loops import MIN_MOTION_SINGULAR_VALUE, is_singular, smallest_singular_value
+from plumbline.model.sampling import compared_states
+from plumbline.processes.record_encoding import EncodedRecord
+from plumbline.processes.worker_pool import Outcome, Packed, Task
+from plumbline.scenario.loader import Scenario
+from plumbline.truth import ground_truth
+from plumbline.truth.closed_form import exact_samples
+from plumbline.truth.ground_truth import MotionTruth, StateTruth
+from plumbline.truth.proved_motion import find_proof
+
+_LEVELS: dict[TaskKind, Level] = {
+    TaskKind.STATE: "state",
+    TaskKind.STEP: "step",
+    TaskKind.RELATIONS: "relations",
+    TaskKind.TRAJECTORY: "trajectory",
+    TaskKind.LONG_RUN: "invariants",
+}
+NO_REGULAR_POSE = (
+    "every pose that the loops allow is singular, as of a truss with its bars in one line: forces have no "
+    "unique values"
+)
+
+
+@dataclass(frozen=True)
+class TruthFailure:
+    """The truth could not be computed."""
+
+    reason: str
+
+
+def _family(engine: str) -> str:
+    """What an engine is a formulation or version of: its distribution."""
+    base = environments.split_version(engine)[0]
+    return environments.declared_attribute(base, "package") or base
+
+
+def uncompared_kinds(model: Model) -> dict[TaskKind, str]:
+    """List what is not compared of a mechanism on any engine.
+
+    Returns:
+        By kind of task why it is left out.
+
+    """
+    if model.n > MAX_STEP_BODIES and not model.has_loops:
+        return {TaskKind.STEP: f"single steps are compared of at most {MAX_STEP_BODIES} bodies"}
+    return {}
+
+
+class ScenarioRun:
+    """The cells of one scenario, from tasks to rows.
+
+    Attributes:
+        scenario: the scenario.
+        truths: truth by the kind of its task, as far as it has arrived.
+
+    """
+
+    def __init__(
+        self,
+        plan: Plan,
+        scenario: Scenario,
+        engines: Mapping[str, EngineInfo],
+        is_random: bool = False,
+        known: KnownIssues | None = None,
+        level: LevelSelection | None = None,
+    ) -> None:
+        """Draw the states of the scenario and list its tasks.
+
+        Args:
+            is_random: whether it is a random scenario, which is compared at few states and without long runs.
+            known: discrepancies whose cause is on record, so that it is not searched again.
+            level: levels to compare at; None for the plan's, or for those of its random scenarios.
+
+        """
+        self.scenario = scenario
+        self.truths: dict[TaskKind, StateTruth | MotionTruth | TruthFailure] = {}
+        self._plan, self._engines, self._known, self._is_random = plan, engines, known, is_random
+        levels = scenario_level(scenario, level or (plan.random_level if is_random else plan.level))
+        has_long_runs = plan.long_run_seconds > 0 and not is_random
+        # how near the initial pose is to a singular one
+        self._singular_value = np.inf
+        if scenario.model.has_loops:
+            arguments = scenario.model, scenario.state
+            self._singular_value = self._kept("singular value", smallest_singular_value, *arguments).load()
+        self._left_out = uncompared_kinds(scenario.model)
+        if self._singular_value < MIN_MOTION_SINGULAR_VALUE:
+            singular = (
+                f"singular: at the initial pose the smallest singular value is {self._singular_value:.2g}"
+            )
+            self._left_out |= dict.fromkeys(
+                (TaskKind.MOTION_TRUTH, TaskKind.TRAJECTORY, TaskKind.STEP, TaskKind.LONG_RUN), singular
+            )
+        count = plan.random_state_count
+        has_few_states = is_random or scenario.level == "state"
+        count = min(count, STATES_PER_RANDOM_SCENARIO) if has_few_states else count
+        self._states = self._compared_states(count)  # argument of many tasks
+        if scenario.model.has_loops and not self._states.load():
+            self._left_out |= dict.fromkeys((TaskKind.STATE_TRUTH, *_LEVELS), NO_REGULAR_POSE)
+        every = list(task_keys(scenario.name, engines, levels, has_long_runs))
+        self._keys = [key for key in every if key.kind not in self._left_out]
+        self._gaps = dict.fromkeys((key.engine, key.kind) for key in every if key.kind in _LEVELS)
+        self._pending = set(self._keys)  # without an outcome
+        self._findings: dict[TaskKey, JudgingResult] = {}
+        self._has_retried_truth = False
+        self._packed_truths: dict[TaskKind, Packed] = {}  # for judges and diagnoses in workers
+
+    def _compared_states(self, count: int) -> EncodedRecord:
+        """Draw the states that are compared."""
+        s = self.scenario
+        return self._kept("states", compared_states, s.model, s.state, s.seed, count)
+
+    def _kept(self, what: str, function: Callable[..., Any], *arguments: Any) -> EncodedRecord:
+        """Call a function that takes long for loops; named scenarios keep its value."""
+        cache = self._plan.result_cache
+        task = Task((what, self.scenario.name), function, arguments)
+        if not self._is_random and (known := cache.get(task)):
+            return known.raw_value  # type: ignore[no-any-return]
+        value = function(*arguments)
+        if not self._is_random:
+            cache.put(task, Outcome(task.key, value))
+        return EncodedRecord.of(value, returned_type(function))
+
+    @cached_property
+    def _step_states(self) -> list[State]:
+        states: list[State] = self._states.load()[:STEP_STATES]
+        return states
+
+    def tasks(self) -> Iterator[Task]:
+        """Make the tasks that can start: the truths that are missing, and the cells that need none.
+
+        Yields:
+            The tasks. Other cells follow their truth, because the worker judges them.
+
+        """
+        for key in self._keys:
+            if key.is_truth and key.kind not in self.truths:
+                yield self.truth_task(key)
+            elif not key.is_truth and key.needed_truth is None:
+                yield self._cell_task(key)
+
+    def truth_task(self, key: TaskKey, *compiled_bodies: int) -> Task:
+        """Make the task of a truth.
+
+        Args:
+            compiled_bodies: 0 to compute the motion without compiled code.
+
+        """
+        s = self.scenario
+        if key.kind == TaskKind.STATE_TRUTH:
+            return Task(key, ground_truth.state_truth, (s.model, self._states), self._plan.limits)
+        arguments = (s.model, s.state, s.times, exact_samples(s, s.times), *(compiled_bodies or (None,)))
+        proof = find_proof(s.model, s.state, s.times)
+        arguments += () if proof is None else (proof,)
+        return Task(key, ground_truth.motion_truth, arguments, self._plan.limits)
+
+    @property
+    def is_done(self) -> bool:
+        """Whether every task has its outcome."""
+        return not self._pending
+
+    def findings(self) -> JudgingResult:
+        """Collect what was found on the scenario.
+
+        Returns:
+            The rows and tables in the order of the tasks, whichever finished first.
+
+        """
+        found = JudgingResult()
+        for name, info in self._engines.items():
+            if info.missing is not None:
+                verdict = Verdict.UNSUPPORTED if info.version else Verdict.NOT_INSTALLED
+                verdict = Verdict.FAILED if info.has_failed else verdict
+                found.rows.append(self._context(name).make_row("state", "-", "all", verdict, info.missing))
+            for key in self._keys:
+                if key.engine == name and key in self._findings:
+                    found.rows += self._findings[key].rows
+                    found.tables += self._findings[key].tables
+                    found.deviations |= self._findings[key].deviations
+            for engine, kind in self._gaps:
+                if engine == name and kind in self._left_out:
+                    reason = f"not compared: {self._left_out[kind]}"
+                    row = self._context(name).make_row
+                    found.rows.append(row(_LEVELS[kind], "-", "all", Verdict.INFORMATION, reason))
+        found.rows = outlier.annotate_outliers(found.rows)
+        return found
+
+    def judged_rows(self, found: JudgingResult, known: KnownIssues) -> list[Row]:
+        """Mark what is recorded, and where all engines stand against the truth.
+
+        Args:
+            found: of `findings`.
+
+        Returns:
+            The rows in the same order.
+
+        """
+        model, truth = self.scenario.model, self.truths.get(TaskKind.STATE_TRUTH)
+        rows = known.mark_known(found.rows, model.n, inertia_ratio(model))
+        families = {name: _family(name) for name in self._engines}
+        is_certified = not isinstance(truth, StateTruth) or truth.is_certified
+        return outlier.doubt_truth(
+            rows, found.deviations, families, "" if is_certified else _family("reference")
+        )
+
+    def on_outcome(self, outcome: Outcome) -> list[Task]:
+        """Take the outcome of a task: keep a truth or what the judge found.
+
+        Returns:
+            The tasks that follow from it.
+
+        """
+        key: TaskKey = outcome.key
+        if outcome.failure and key.kind == TaskKind.MOTION_TRUTH and not self._has_retried_truth:
+            self._has_retried_truth = True  # the worker may have crashed in compiled code
+            return [self.truth_task(key, 0)]
+        self._pending.discard(key)
+        following = []
+        if key.kind == TaskKind.DIAGNOSIS:
+            self._add_diagnosis(outcome)
+        elif key.is_truth:
+            self.truths[key.kind] = TruthFailure(outcome.failure) if outcome.failure else outcome.value
+            if not outcome.failure:
+                self._packed_truths[key.kind] = outcome.packed
+            following = [self._cell_task(k) for k in self._keys if k.needed_truth == key.kind]
+        else:
+            found = self._findings[key] = self._judged(outcome)
+            if key.kind in (TaskKind.STATE, TaskKind.STEP):
+                following = self._diagnosis_tasks(outcome, found)
+        self._pending |= {task.key for task in following}
+        return following
+
+    def new_rows(self, outcome: Outcome) -> list[Row]:
+        """Return what was found by an outcome.
+
+        Args:
+            outcome: that `on_outcome` has taken.
+
+        Returns:
+            The rows; none of a truth or a diagnosis.
+
+        """
+        found = self._findings.get(outcome.key)
+        return found.rows if found else []
+
+    def fingerprints(self) -> dict[str, Fingerprints]:
+        """Collect what identifies the answers of each engine.
+
+        Returns:
+            By engine the hashes of its answers' bits; empty for a scenario with a closed form, in which
+            different computations may give equal bits, as at rest.
+
+        """
+        found: dict[str, Fingerprints] = {}
+        if self.scenario.closed_form is None:
+            for key, judged in self._findings.items():
+                found.setdefault(key.engine, {}).update(judged.fingerprints)
+        return found
+
+    def summary(self) -> dict[str, Any]:
+        """Describe the scenario for results.json.
+
+        Returns:
+            Its texts, model, initial state, and of its motion the truth and the horizon [s].
+
+        """
+        s, truth = self.scenario, self.truths.get(TaskKind.MOTION_TRUTH)
+        more = () if s.model.is_chain else ("r", "v", "x", "xdot")
+        state_keys = ("p", "omega", "u", "udot", *more)
+        about = {
+            "family": s.family,
+            "title": s.title,
+            "purpose": s.purpose,
+            "file": s.origin,
+            "own": not s.is_in_catalogue,
+            "bodies": s.model.n,
+            "joints": list(s.model.kind),
+            "duration": s.duration,
+            "sample": s.sample_interval,
+            "exact": s.closed_form,
+            "digest": s.digest,
+            "seed": s.seed,
+            "model": {key: np.asarray(value).tolist() for key, value in s.model.fields.items()},
+            "state": {key: getattr(s.state, key).tolist() for key in state_keys},
+        }
+        if isinstance(truth, MotionTruth):
+            about |= {
+                "horizon": truth.horizon,
+                "growth": float(truth.growth[-1]),
+                "truth": truth.method,
+                "truth_uncertainty": float(truth.uncertainty["position"][-1]),
+            }
+        return about
+
+    def truth_methods(self) -> list[str]:
+        """Describe how each truth was computed.
+
+        Returns:
+            One phrase per level with a truth.
+
+        """
+        levels = {TaskKind.STATE_TRUTH: "state", TaskKind.MOTION_TRUTH: "trajectory"}
+        return [
+            f"{levels[kind]} level: {truth.method}"
+            for kind, truth in self.truths.items()
+            if not isinstance(truth, TruthFailure)
+        ]
+
+    def _context(self, engine: str) -> RowContext:
+        info = self._engines[engine]
+        return RowContext(self.scenario.name, self.scenario.family, engine, info.title, info.version)
+
+    def _integrator(self, key: TaskKey) -> Integrator:
+        return next(i for i in self._engines[key.engine].integrators if i.name == key.integrator)
+
+    def _cell_task(self, key: TaskKey) -> Task:
+        call, arguments = self._call(key)
+        (base, _), info = environments.split_version(key.engine), self._engines[key.engine]
+        judge, judge_arguments = self._judge(key)
+        return Task(
+            key, call, (base, *arguments), self._plan.limits, info.version, info.python, key.engine, judge,
+            judge_arguments, JudgingResult.has_disagreement,  # only a diagnosis needs the answer
+        )  # fmt: skip
+
+    def _call(self, key: TaskKey) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+        """The function that computes a cell, and its arguments after the engine."""
+        s, plan = self.scenario, self._plan
+        if key.kind == TaskKind.STATE:
+            return engine_calls.evaluate_states, (s.model, self._states)
+        if key.kind == TaskKind.RELATIONS:
+            return relations.check_relations, (s.model, self._states)
+        integrator = self._integrator(key)
+        if key.kind == TaskKind.STEP:
+            return run_step_study, (integrator, s.model, self._step_states)
+        if key.kind == TaskKind.TRAJECTORY:
+            steps = refinement_resolutions(
+                integrator, s.model.n, s.duration, plan.extra_refinements, s.sample_interval
+            )
+            truth = self.truths.get(TaskKind.MOTION_TRUTH)  # ends before a singular pose
+            times = truth.trajectory.t if isinstance(truth, MotionTruth) else s.times
+            return run_refinement_study, (integrator.name, s.model, s.state, times, steps)
+        length = plan_long_run(integrator, s.model.n, plan.long_run_seconds, s.sample_interval, s.duration)
+        return run_long_run_study, (integrator.name, s.model, s.state, s.sample_interval, length)
+
+    def _judge(self, key: TaskKey) -> tuple[Callable[..., JudgingResult] | None, tuple[Any, ...]]:
+        """The function that judges a cell's answer in the worker, and its arguments; None without a truth."""
+        s, context = self.scenario, self._context(key.engine)
+        if key.kind == TaskKind.RELATIONS:
+            return relation_rows.judge_relations, (context,)
+        if key.kind == TaskKind.STEP:
+            return judge_steps, (context, self._integrator(key), s.model, self._step_states)
+        if key.kind == TaskKind.LONG_RUN:
+            is_regular = s.closed_form is not None
+            return judge_long_runs, (context, s.model, self._integrator(key), is_regular)
+        assert key.needed_truth is not None
+        truth = self._packed_truths.get(key.needed_truth)
+        if truth is None:
+            return None, ()
+        if key.kind == TaskKind.STATE:
+            return judge_states, (context, truth)
+        return judge_trajectory, (context, s.model, truth, self._integrator(key))
+
+    def _judged(self, outcome: Outcome) -> JudgingResult:
+        """What the judge of a cell found, or why there is none."""
+        key: TaskKey = outcome.key
+        truth = self.truths.get(key.needed_truth) if key.needed_truth else None
+        doubt = f"the answer cannot be judged: {outcome.judge_failure}" if outcome.judge_failure else ""
+        if isinstance(truth, TruthFailure):
+            doubt = f"{self.scenario.name} has no truth to judge by: {truth.reason}"
+        elif isinstance(truth, MotionTruth) and truth.conflict:
+            doubt = f"{self.scenario.name}: {truth.conflict}"
+        if outcome.failure or doubt:
+            verdict, lost = (
+                (Verdict.HARNESS_FAILED, doubt) if doubt else (Verdict.FAILED, outcome.failure or "")
+            )
+            quantity = "all_long" if key.kind == TaskKind.LONG_RUN else "all"
+            row = self._context(key.engine).make_row(
+                _LEVELS[key.kind], key.integrator or "-", quantity, verdict, lost
+            )
+            return JudgingResult(rows=[row])
+        found: JudgingResult = outcome.judge_result
+        is_refused = any(row.verdict == Verdict.UNSUPPORTED and row.quantity == "all" for row in found.rows)
+        if key.kind == TaskKind.STATE and is_singular(self._singular_value) and not is_refused:
+            found.rows.append(singular_pose_row(self._context(key.engine), self._singular_value))
+        found.rows = mark_aliases(found.rows)
+        if self._plan.user_rtol is not None:
+            found.rows = [replace(row, user_rtol=self._plan.user_rtol) for row in found.rows]
+        return found
+
+    def _diagnosis_tasks(self, answer: Outcome, found: JudgingResult) -> list[Task]:
+        """The task that searches the cause of a cell's disagreement, or measures how the error scatters.
+
+        A cause that is on record is not searched again. In random scenarios, most of which have no relations,
+        the scatter is measured instead, by which the recorded mechanism is checked.
+        """
+        disputed = [row for row in found.rows if row.verdict == Verdict.DISAGREES]
+        model, marked = self.scenario.model, disputed
+        if self._known and disputed:
+            marked = self._known.mark_known(disputed, model.n, inertia_ratio(model))
+        is_known = all(row.known_issue is not None for row in marked)
+        key: TaskKey = answer.key
+        if not disputed or (is_known and not self._is_random):
+            return []
+        from plumbline.diagnosis.diagnose import explain_disagreement  # few runs need them
+        from plumbline.diagnosis.integrator_search import explain_disagreeing_steps
+
+        (base, _), info = environments.split_version(key.engine), self._engines[key.engine]
+        subject = TaskKey(TaskKind.DIAGNOSIS, self.scenario.name, key.engine, key.integrator)
+        call: Callable[..., Diagnosis] = explain_disagreement
+        arguments: tuple[Any, ...] = ()
+        if key.kind == TaskKind.STATE:
+            truth = self._packed_truths[TaskKind.STATE_TRUTH]
+            arguments = (base, model, answer.value.quantities, truth, is_known)
+        else:
+            call = explain_disagreeing_steps
+            arguments = (base, key.integrator, model, self._step_states, answer.value, is_known)
+        return [Task(subject, call, arguments, self._plan.limits, info.version, info.python, key.engine)]
+
+    def _add_diagnosis(self, outcome: Outcome) -> None:
+        diagnosis: Diagnosis = outcome.value or Diagnosis(f"no diagnosis: {outcome.failure}")
+        kind = TaskKind.STEP if outcome.key.integrator else TaskKind.STATE
+        cell = self._findings[replace(outcome.key, kind=kind)]
+        extra = {} if diagnosis.scatter is None else {"scatter": diagnosis.scatter}
+        cell.rows = [
+            replace(row, diagnosis=diagnosis.text or None, extra=row.extra | extra)
+            if row.verdict == Verdict.DISAGREES
+            else row
+            for row in cell.rows
+        ]

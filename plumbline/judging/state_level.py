@@ -1,0 +1,194 @@
+"""State level: each engine's quantities against the truth, per body, within the rounding bound.
+
+The tolerance is `plumbline.truth.rounding_bound`; `MAX_RELATIVE_BOUND` limits how loose it may be.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from plumbline.engines.engine_calls import Evaluation
+from plumbline.judging.identity import state_fingerprints
+from plumbline.judging.rows import Columns, Deviation, JudgingResult, Row, RowContext, Verdict
+from plumbline.model.datatypes import Array
+from plumbline.model.loops import MIN_SINGULAR_VALUE
+from plumbline.truth.ground_truth import StateTruth
+from plumbline.truth.rounding_bound import MAX_RELATIVE_BOUND
+
+STATE_UNITS = {
+    "acceleration": "m/s²",
+    "angular_acceleration": "rad/s²",
+    "joint_reaction": "N",
+    "joint_moment": "N m",
+    "kinetic_energy": "J",
+    "potential_energy": "J",
+    "angular_momentum": "kg m²/s",
+    "mass_matrix": "kg m²",
+}
+SINGULAR_POSE = "singular_pose"  # quantity of the row of an initial pose that is not compared
+TINY = float(np.finfo(float).tiny)  # replaces a bound of zero, so that an error of zero has the ratio 0
+
+
+def judge_states(context: RowContext, truth: StateTruth, evaluation: Evaluation) -> JudgingResult:
+    """Judge every state quantity of one engine, by the worst of all bodies and states.
+
+    Args:
+        truth: true quantities and rounding bounds at S states.
+        evaluation: the engine's quantities at the same states, or why there are none.
+
+    Returns:
+        One row per quantity, and per state the worst body (table "states").
+
+    """
+    if evaluation.unsupported is not None:
+        row = context.make_row(
+            "state", "-", "all", Verdict.UNSUPPORTED, evaluation.unsupported, gap=evaluation.gap
+        )
+        return JudgingResult([row])
+    if evaluation.failure is not None:
+        return JudgingResult([context.make_row("state", "-", "all", Verdict.FAILED, evaluation.failure)])
+    result = JudgingResult(fingerprints=state_fingerprints(evaluation.quantities))
+    for quantity, unit in STATE_UNITS.items():
+        if all(getattr(true, quantity) is None for true in truth.quantities):
+            continue  # a chain of rods and balls has no joint moments
+        if any(getattr(answer, quantity) is None for answer in evaluation.quantities):
+            gap = quantity if quantity in evaluation.declared else ""
+            reason = f"{context.title} offers no {quantity.replace('_', ' ')} of its own"
+            result.rows.append(
+                context.make_row("state", "-", quantity, Verdict.UNSUPPORTED, reason, unit, gap)
+            )
+            continue
+        deviation = _deviation(quantity, truth, evaluation)
+        worst, looseness = _worst_error_per_state(quantity, truth, deviation)
+        names = {"scenario": context.scenario, "engine": context.engine, "quantity": quantity}
+        result.tables.append(("states", names | worst))
+        row = _quantity_row(context, quantity, unit, worst, looseness, truth.method, evaluation.cpu_time)
+        if limit_error := float(np.max(_limit_errors(quantity, evaluation))):
+            share = f"; of it up to {limit_error:.2g} {unit} is the uncertainty of the engine's limit"
+            extra = row.extra | {"limit_error": limit_error}
+            row = replace(row, derivation=row.derivation + share, extra=extra)
+        result.rows.append(row)
+        if row.verdict == Verdict.DISAGREES:
+            result.deviations[row.key] = deviation
+    return result
+
+
+def singular_pose_row(context: RowContext, value: float) -> Row:
+    """Make the row of an initial state whose pose is singular, at which no engine can be judged.
+
+    Args:
+        value: the smallest singular value of the loops' rows that hold at poses nearby.
+
+    """
+    reason = (
+        f"singular: at t = 0 the smallest singular value of the loops' rows that hold elsewhere is "
+        f"{value:.2g} (limit {MIN_SINGULAR_VALUE:g}); accelerations and forces are not unique there, "
+        "and are not compared"
+    )
+    return context.make_row("state", "-", SINGULAR_POSE, Verdict.UNRESOLVED, reason, value=value)
+
+
+def _limit_errors(quantity: str, evaluation: Evaluation) -> Array:
+    """(S,) uncertainty of the limit that the engine's answers were extrapolated to; 0 where they were not."""
+    return np.array([(answer.limit_error or {}).get(quantity, 0.0) for answer in evaluation.quantities])
+
+
+def _deviation(quantity: str, truth: StateTruth, evaluation: Evaluation) -> Deviation:
+    """Answer − truth: vectors (S, N, 3), of scalars (S, 1, 1), of the matrix each entry (S, nu², 1)."""
+    pairs = zip(evaluation.quantities, truth.quantities, strict=True)
+    differences = np.array([getattr(answer, quantity) - getattr(true, quantity) for answer, true in pairs])
+    count, has_entries = len(differences), quantity == "mass_matrix"
+    components = 1 if differences.ndim == 1 or has_entries else 3
+    vectors = differences.reshape(count, -1, components)
+    bound = np.array([bound.tolerance(quantity) for bound in truth.bounds]).reshape(count, -1)
+    bound = bound + _limit_errors(quantity, evaluation)[:, None]
+    return Deviation(vectors, np.broadcast_to(bound, vectors.shape[:2]) if has_entries else bound)
+
+
+def _worst_error_per_state(quantity: str, truth: StateTruth, deviation: Deviation) -> tuple[Columns, Array]:
+    """Per state (S,): error, bound and scale of the body with the largest ratio of error and bound.
+
+    Besides them the ratio of bound and scale (S, N) of every body; inf where a bound is not a number.
+    """
+    error, bound = np.linalg.norm(deviation.vectors, axis=-1), deviation.tolerance
+    if quantity == "mass_matrix":
+        error, bound = np.max(error, axis=1, keepdims=True), bound[:, :1]
+    scale = np.array([bound.scale[quantity] for bound in truth.bounds]).reshape(error.shape)
+    known = np.isfinite(bound)
+    ratio = np.where(known, error / np.maximum(bound, TINY), -1.0)  # without a bound nothing is compared
+    state, body = np.arange(len(error)), np.argmax(ratio, axis=1)
+    at = state, body
+    relative = np.where(scale > 0, bound / np.where(scale > 0, scale, 1.0), np.where(bound > 0, np.inf, 0.0))
+    looseness = np.where(known, relative, np.inf)
+    worst = {"state": state, "body": body, "error": error[at], "bound": bound[at], "scale": scale[at]}
+    return worst, looseness
+
+
+def _quantity_row(
+    context: RowContext,
+    quantity: str,
+    unit: str,
+    worst: Columns,
+    looseness: Array,
+    method: str,
+    cpu_time: float,
+) -> Row:
+    """The row of one quantity.
+
+    A disagreement in any state decides. A state does not count as compared where the bound of its worst body
+    is too loose to detect an error, or any bound is not a number; of fewer than half of the states no
+    agreement follows. The reason counts the bodies with a loose bound in any case.
+    """
+    error, bound, scale = worst["error"], worst["bound"], worst["scale"]
+    known, has_scale = np.isfinite(bound), scale > 0
+    ratios = np.where(known, error / np.maximum(bound, TINY), 0.0)
+    at, ratio, count = int(np.argmax(ratios)), float(np.max(ratios)), len(ratios)
+    own = looseness[worst["state"], worst["body"]]
+    sharp = (own <= MAX_RELATIVE_BOUND) & np.all(np.isfinite(looseness), axis=1)
+    compared, loosest = int(np.sum(sharp)), float(np.max(looseness))
+    loose_count = int(np.sum(looseness > MAX_RELATIVE_BOUND))
+    relative = float(np.max(error[has_scale] / scale[has_scale], initial=0.0))
+    state, body = int(worst["state"][at]), int(worst["body"][at]) + 1
+    name, where = quantity.replace("_", " "), f"state {state}, body {body}"
+    loose = (
+        f"the rounding bound is up to {loosest:.1g} of the quantity's scale (limit {MAX_RELATIVE_BOUND:g}) "
+        f"at {count - compared} of {count} states and in {loose_count} of {looseness.size} comparisons, too "
+        "loose to detect an error"
+    )
+    if ratio > 1:
+        verdict = Verdict.DISAGREES
+        reason = (
+            f"the {name} of {context.title} is off by {error[at]:.3g} {unit} at {where}, {ratio:.3g} times "
+            f"the rounding bound; {int(np.sum(ratios > 1))} of {count} states disagree"
+        )
+    elif compared and 2 * compared >= count:
+        verdict = Verdict.AGREES
+        reason = f"{name} within {ratio:.2g} of the rounding bound at {compared} states"
+        reason += f"; {loose}" if loose_count else ""
+    else:
+        verdict, reason = Verdict.UNRESOLVED, f"inconclusive: {loose}"
+    return context.make_row(
+        "state",
+        "-",
+        quantity,
+        verdict,
+        reason,
+        unit,
+        value=float(error[at]),
+        tolerance=float(bound[at]),
+        ratio=ratio,
+        derivation=f"first-order rounding bound per body and state, {bound[at]:.2g} {unit} at {where}, "
+        f"and at most {loosest:.1g} of the scale at {count} states, {MAX_RELATIVE_BOUND:g} at {compared} of "
+        f"them; truth: {method}",
+        cpu_time=cpu_time,
+        extra={
+            "relative": relative,
+            "states": float(count),
+            "compared_states": float(compared),
+            "bound_relative": loosest,
+            "state": float(state),
+            "body": float(body),
+        },
+    )

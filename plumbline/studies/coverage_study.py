@@ -1,0 +1,169 @@
+"""Coverage tables of many scenarios, as records and as a file beside the results of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass
+
+import pyarrow as pa
+
+from plumbline.judging.rows import Level, Row
+from plumbline.judging.smallest_detectable_mistake import COVERED_LEVELS, CoverageEntry, scenario_coverage
+from plumbline.model.datatypes import BALL, CHAIN_FIELDS, ROD
+from plumbline.model.sampling import compared_states
+from plumbline.processes.cpu_time import CpuTimes
+from plumbline.processes.exceptions import PlumblineError
+from plumbline.processes.worker_pool import Executor, Task
+from plumbline.scenario.loader import Scenario
+from plumbline.storage.results_store import COVERAGE_TABLE
+from plumbline.studies.parquet_files import make_table
+from plumbline.truth.parameters import list_parameters
+
+FILE = "coverage.parquet"
+PARAMETERS_PER_TASK = (
+    160  # those of a chain of 100 bodies take minutes, and no worker has them all at the end
+)
+_CHAIN_KINDS = (*CHAIN_FIELDS, "attitude", "omega", "direction", "rod_rate")
+
+
+class CoverageFailure(PlumblineError):
+    """The coverage of a scenario could not be computed; the message names it and the reason."""
+
+
+def measure_coverage(
+    executor: Executor,
+    scenarios: Sequence[Scenario],
+    rows: Iterable[Row],
+    state_count: int,
+    levels: Sequence[Level] = COVERED_LEVELS,
+    progress: Callable[[int, int, str], None] = lambda done, total, what: None,
+    cpu_times: CpuTimes | None = None,
+) -> list[CoverageEntry]:
+    """Compute the coverage of scenarios.
+
+    Args:
+        executor: makes the calls, one per scenario and `PARAMETERS_PER_TASK` of its parameters.
+        scenarios: which to cover.
+        levels: of `COVERED_LEVELS`.
+        progress: called with calls done, calls in all and the scenario of the last one.
+        cpu_times: gets the CPU time as "judging".
+
+    Returns:
+        The entries, in the order of the scenarios.
+
+    Raises:
+        CoverageFailure: a call failed.
+
+    """
+    by_scenario: dict[str, list[Row]] = {s.name: [] for s in scenarios}
+    for row in rows:
+        if row.scenario in by_scenario:
+            by_scenario[row.scenario].append(row)
+    tasks = []
+    for s in sorted(scenarios, key=lambda s: -s.model.n):  # no long task alone at the end
+        states = compared_states(s.model, s.state, s.seed, state_count)
+        arguments = s.name, s.model, s.state, s.times, states, by_scenario[s.name], levels
+        for first in range(0, len(list_parameters(s.model, s.state)), PARAMETERS_PER_TASK):
+            part = slice(first, first + PARAMETERS_PER_TASK)
+            tasks.append(Task((s.name, first), scenario_coverage, (*arguments, part), executor.limits))
+    found: dict[tuple[str, int], list[CoverageEntry]] = {}
+    for outcome in executor.run(tasks):
+        name, _ = outcome.key
+        if cpu_times is not None:
+            cpu_times.add_outcome(outcome, "judging")
+        if outcome.failure:
+            raise CoverageFailure(f"no coverage of {name}: {outcome.failure}")
+        found[outcome.key] = outcome.value
+        progress(len(found), len(tasks), name)
+    order = {s.name: k for k, s in enumerate(scenarios)}
+    entries = [entry for key in sorted(found, key=lambda key: key[1]) for entry in found[key]]
+    return sorted(entries, key=lambda entry: (order[entry.scenario], COVERED_LEVELS.index(entry.level)))
+
+
+def coverage_table(entries: Iterable[CoverageEntry]) -> pa.Table:
+    """Put coverage entries into a table.
+
+    Args:
+        entries: of `measure_coverage`.
+
+    Returns:
+        One row per entry, with the columns of `COVERAGE_TABLE`.
+
+    """
+    return make_table([asdict(entry) for entry in entries], COVERAGE_TABLE)
+
+
+@dataclass(frozen=True)
+class CoverageSummary:
+    """One kind of parameter at one level, over all bodies and scenarios."""
+
+    level: Level
+    kind: str
+    entries: int
+    seen: int
+    sharpest: float | None  # smallest mistake over its scale, the least of all entries
+    median: float | None
+    bluntest: float | None
+    invisible: int  # entries with a proof
+    blind: int  # entries that are neither seen nor proven to be invisible
+
+
+def summarize_coverage(entries: Iterable[CoverageEntry]) -> list[CoverageSummary]:
+    """Summarize entries by level and kind of parameter.
+
+    Args:
+        entries: of any scenarios.
+
+    Returns:
+        The summaries, in the order of first appearance.
+
+    """
+    groups: dict[tuple[Level, str], list[CoverageEntry]] = {}
+    for entry in entries:
+        groups.setdefault((entry.level, entry.kind), []).append(entry)
+    found = []
+    for (level, kind), members in groups.items():
+        seen = sorted(entry.smallest for entry in members if entry.smallest is not None)
+        proven = sum(bool(entry.proof) for entry in members)
+        found.append(
+            CoverageSummary(
+                level,
+                kind,
+                len(members),
+                len(seen),
+                sharpest=seen[0] if seen else None,
+                median=seen[len(seen) // 2] if seen else None,
+                bluntest=seen[-1] if seen else None,
+                invisible=proven,
+                blind=len(members) - len(seen) - proven,
+            )
+        )
+    return found
+
+
+def blind_spots(entries: Iterable[CoverageEntry]) -> list[str]:
+    """List what no scenario shows at a level.
+
+    A parameter is looked for by the kind of joint that the body hangs by, and of chains' parameters on rods
+    and balls separately on the first body and on later ones. It counts as seen where its value is not zero
+    and a mistake relative to that value is reported: an engine that ignores drag is right wherever there is
+    none.
+
+    Returns:
+        Sentences; empty where every parameter is seen at every level, or has a proof wherever it is not.
+
+    """
+    seen: dict[tuple[str, ...], bool] = {}
+    for entry in entries:
+        place = "body" if entry.body else "gravity"
+        if entry.joint in (ROD, BALL) and entry.kind in _CHAIN_KINDS:
+            place = "first body" if entry.body == 1 else "later body"
+        key = entry.level, entry.parameter, place, entry.joint
+        counts = entry.is_seen and (entry.scale == abs(entry.value) or entry.unit == "rad")
+        always = entry.level == "invariants" and bool(entry.proof)
+        seen[key] = seen.get(key, False) or counts or always
+    return [
+        f"{level} level: no scenario sees {parameter}" + (f" of a {place} on a {joint}" if joint else "")
+        for (level, parameter, place, joint), is_seen in seen.items()
+        if not is_seen
+    ]

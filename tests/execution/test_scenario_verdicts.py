@@ -1,0 +1,158 @@
+"""A scenario's cells: what waits for the truth, and what a lost truth costs."""
+
+import os
+from dataclasses import replace
+
+import pytest
+
+from plumbline.execution.plan import Plan, TaskKind
+from plumbline.execution.runner import describe_engines, run_plan
+from plumbline.execution.scenario_verdicts import ScenarioRun
+from plumbline.processes.worker_pool import Limits, Outcome, WorkerPool, run_task
+from plumbline.scenario import loader
+
+pytest.importorskip("mujoco")
+
+
+@pytest.fixture(scope="module")
+def engines():
+    with WorkerPool(1) as workers:
+        return describe_engines(workers, ["reference", "mujoco"])
+
+
+def make_scenario_run(engines, level):
+    chosen = loader.load_scenario(loader.find_scenario_file("rest"))
+    return ScenarioRun(Plan([chosen], list(engines), level, random_state_count=2), chosen, engines)
+
+
+def outcome_of(task, **lost):
+    return Outcome(task.key, **lost) if lost else run_task(task)
+
+
+def test_runs_follow_their_truth_and_may_finish_in_any_order(engines):
+    rows = []
+    for turned in (False, True):
+        bench = make_scenario_run(engines, "trajectory")
+        (truth,) = bench.tasks()
+        tasks = bench.on_outcome(outcome_of(truth))
+        for task in reversed(tasks) if turned else tasks:
+            assert not bench.is_done
+            assert bench.on_outcome(outcome_of(task)) == []
+        assert bench.is_done
+        rows.append([(r.key, r.value, r.verdict) for r in bench.findings().rows])
+    assert rows[0] == rows[1] and len(rows[0]) > 14
+
+
+def test_states_follow_their_truth_and_are_judged_by_the_worker(engines):
+    bench = make_scenario_run(engines, "state")
+    (truth,) = bench.tasks()
+    cells = bench.on_outcome(outcome_of(truth))
+    assert [(task.key.engine, task.key.kind) for task in cells] == [
+        (name, TaskKind.STATE) for name in ("reference", "mujoco")
+    ]
+    for task in cells:
+        assert not bench.is_done
+        found = outcome_of(task)
+        assert len(found.judge_result.rows) == 7
+        bench.on_outcome(found)
+    assert bench.is_done and len(bench.findings().rows) == 14
+
+
+def raise_key_error(*_):
+    raise KeyError("a mistake")
+
+
+def test_a_judge_that_raises_is_a_failure_of_the_harness(engines):
+    bench = make_scenario_run(engines, "state")
+    (truth,) = bench.tasks()
+    for task in bench.on_outcome(outcome_of(truth)):
+        bench.on_outcome(outcome_of(replace(task, judge=raise_key_error)))
+    assert [(r.verdict, r.reason) for r in bench.findings().rows] == [
+        ("harness failed", "the answer cannot be judged: KeyError: 'a mistake'")
+    ] * 2
+
+
+def test_a_lost_truth_of_states_fails_every_cell_with_the_reason(engines):
+    bench = make_scenario_run(engines, "state")
+    (truth,) = bench.tasks()
+    for task in bench.on_outcome(Outcome(truth.key, failure="crashed")):
+        bench.on_outcome(outcome_of(task))
+    assert bench.is_done
+    assert [(r.verdict, r.reason) for r in bench.findings().rows] == [
+        ("harness failed", "rest has no truth to judge by: crashed")
+    ] * 2
+
+
+def test_a_motion_truth_whose_worker_died_is_computed_again_without_a_compiler(engines):
+    bench = make_scenario_run(engines, "trajectory")
+    (truth,) = bench.tasks()
+    (second,) = bench.on_outcome(Outcome(truth.key, failure="crashed: the worker died of SIGSEGV"))
+    assert second.key == truth.key and second.arguments[-1] == 0 and not bench.is_done
+    for task in bench.on_outcome(outcome_of(second)):
+        bench.on_outcome(outcome_of(task))
+    assert bench.is_done
+    assert not any(row.verdict.needs_attention for row in bench.findings().rows)
+    assert "Taylor" not in bench.truths[TaskKind.MOTION_TRUTH].method.split("closed form")[0]
+
+
+def test_a_truth_that_is_lost_twice_fails_every_cell_with_the_reason(engines):
+    bench = make_scenario_run(engines, "trajectory")
+    (truth,) = bench.tasks()
+    bench.on_outcome(Outcome(truth.key, failure="crashed"))
+    cells = bench.on_outcome(Outcome(truth.key, failure="crashed twice"))
+    for task in cells:
+        bench.on_outcome(outcome_of(task))
+    assert bench.is_done
+    rows = bench.findings().rows
+    assert len(rows) == len(cells)
+    reason = "rest has no truth to judge by: crashed twice"
+    assert all(r.verdict == "harness failed" and r.reason == reason for r in rows)
+
+
+def exit_process(*_):
+    """Ends its process as a crash does."""
+    os._exit(11)
+
+
+def test_in_a_run_the_second_truth_is_handed_over(monkeypatch):
+    truth, requested = ScenarioRun.truth_task, []
+
+    def first_crashes(self, key, *uncompiled):
+        requested.append(truth(self, key, *uncompiled))
+        return requested[-1] if uncompiled else replace(requested[-1], function=exit_process)
+
+    monkeypatch.setattr(ScenarioRun, "truth_task", first_crashes)
+    chosen = loader.load_scenario(loader.find_scenario_file("rest"))
+    result = run_plan(Plan([chosen], ["mujoco"], "trajectory", limits=Limits(120)), lambda *_: None)
+    assert len(requested) == 2
+    assert result.metadata["exit_code"] == 0, result.metadata["sentence"]
+
+
+class Recorded:
+    """Known issues about some quantities."""
+
+    def __init__(self, *quantities):
+        self.quantities = quantities
+
+    def mark_known(self, rows, bodies, inertia_ratio):
+        return [replace(row, known_issue="id") if row.quantity in self.quantities else row for row in rows]
+
+
+@pytest.mark.parametrize(
+    ("quantities", "diagnosed"),
+    [((), True), (("acceleration",), True), (("acceleration", "joint_reaction"), False)],
+)
+def test_a_cell_whose_disagreements_are_all_recorded_is_not_diagnosed(engines, quantities, diagnosed):
+    chosen = loader.load_scenario(loader.find_scenario_file("rest"))
+    plan = Plan([chosen], ["mujoco"], "state", random_state_count=2)
+    run = ScenarioRun(plan, chosen, {"mujoco": engines["mujoco"]}, known=Recorded(*quantities))
+    (truth,) = run.tasks()
+    (cell,) = run.on_outcome(outcome_of(truth))
+    found = outcome_of(replace(cell, needs_answer=None))
+    wrong = [
+        replace(row, verdict="disagrees") if row.quantity in ("acceleration", "joint_reaction") else row
+        for row in found.judge_result.rows
+    ]
+    following = run.on_outcome(replace(found, judge_result=replace(found.judge_result, rows=wrong)))
+    assert [task.key.kind for task in following] == [TaskKind.DIAGNOSIS] * diagnosed
+    assert run.is_done is not diagnosed

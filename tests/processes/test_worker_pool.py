@@ -1,0 +1,509 @@
+"""Worker processes: every way to lose one costs one task and is reported."""
+
+import contextlib
+import ctypes
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from plumbline.processes.isolation import remove_orphaned_folders
+from plumbline.processes.worker_pool import Limits, Outcome, ResultCache, Scheduler, Task, WorkerPool
+from tests.helpers.immediate_executor import Immediate
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def double(x):
+    return 2 * x
+
+
+def segfault():
+    ctypes.string_at(0)
+
+
+def abort():
+    os.abort()
+
+
+def hang():
+    time.sleep(600)
+
+
+def hang_holding_gil():
+    """Native code that never returns and never releases the interpreter lock."""
+    ctypes.PyDLL(None).sleep(600)
+
+
+def exhaust_memory():
+    return len(bytearray(64 * 2**30))
+
+
+def exit_process():
+    os._exit(7)
+
+
+def exit_quietly():
+    os._exit(0)
+
+
+def exit_from_c():
+    ctypes.CDLL(None).exit(0)
+
+
+def exit_from_a_thread():
+    threading.Thread(target=os._exit, args=(0,)).start()
+    time.sleep(600)
+
+
+def exit_beside_a_child():
+    """The child, which holds the pipe open, lives longer than its parent."""
+    if os.fork():
+        os._exit(0)
+    time.sleep(600)
+
+
+def interrupt():
+    raise KeyboardInterrupt
+
+
+def interrupt_by_signal():
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(600)
+
+
+def leave():
+    sys.exit(0)
+
+
+class Unprintable(BaseException):
+    """Has neither a message nor a representation, and cannot be pickled."""
+
+    def __str__(self):
+        raise RuntimeError
+
+    __repr__ = __reduce__ = __str__
+
+
+def raise_unprintable():
+    raise Unprintable
+
+
+def raise_long_text():
+    raise RuntimeError("word " * 200_000 + "\x1b[2J")
+
+
+def return_what_cannot_be_pickled():
+    return lambda: 0
+
+
+class Unloadable:
+    """Can be pickled, and not loaded."""
+
+    def __reduce__(self):
+        return int, ("x",)
+
+
+def write_into_every_descriptor():
+    for descriptor in range(3, 64):
+        with contextlib.suppress(OSError):
+            os.write(descriptor, b"noise")
+    time.sleep(600)
+
+
+def close_every_descriptor():
+    os.closerange(0, 4096)
+
+
+def stop_itself():
+    os.kill(os.getpid(), signal.SIGSTOP)
+
+
+def end_process_group():
+    os.killpg(0, signal.SIGTERM)
+
+
+def come_back_twice():
+    os.fork()
+    return "twice"
+
+
+def write_file_and_flood_output():
+    """Write a file into the working folder and flood both outputs, as engines do."""
+    Path("dropped.txt").write_text("x")
+    os.write(1, b"noise\n" * 10_000)
+    os.write(2, b"noise\n" * 10_000)
+    return os.getcwd()
+
+
+def process_id():
+    return os.getpid()
+
+
+LOSSES = [
+    (segfault, "crashed: the worker died of SIGSEGV"),
+    (abort, "crashed: the worker died of SIGABRT"),
+    (exit_process, "crashed: the worker exited with code 7"),
+    (exhaust_memory, "out of memory"),
+    (hang, "timeout: no answer within"),
+    (hang_holding_gil, "timeout: no answer within"),
+    (stop_itself, "timeout: no answer within"),
+]
+
+
+# Each is noticed at once: a time limit that no test waits for.
+FAULTS = [
+    (exit_quietly, "crashed: the worker exited with code 0"),
+    (exit_from_c, "crashed: the worker exited with code 0"),
+    (exit_from_a_thread, "crashed: the worker exited with code 0"),
+    (exit_beside_a_child, "crashed: the worker exited with code 0"),
+    (interrupt, "KeyboardInterrupt: no message"),
+    (interrupt_by_signal, "KeyboardInterrupt: no message"),
+    (leave, "SystemExit: 0"),
+    (raise_unprintable, "Unprintable: no readable message"),
+    (raise_long_text, "word  … (cut: 1,000,004 characters)"),
+    (return_what_cannot_be_pickled, "Can't pickle local object"),
+    (write_into_every_descriptor, "crashed: the worker did not reply, but"),
+    (close_every_descriptor, "crashed: the worker"),
+    (end_process_group, "crashed: the worker died of SIGTERM"),
+]
+
+
+def test_faults_are_reported_at_once_and_change_no_other_task():
+    limits = Limits(seconds=600, gigabytes=4)
+    with WorkerPool(2, limits) as workers:
+        tasks = [Task(fault.__name__, fault, (), limits, engine="faulty") for fault, _ in FAULTS]
+        tasks += [Task(i, double, (i,), limits) for i in range(len(FAULTS))]
+        outcomes = {o.key: o for o in workers.run(tasks)}
+    for fault, words in FAULTS:
+        assert words in (outcomes[fault.__name__].failure or ""), fault.__name__
+        assert len(outcomes[fault.__name__].failure) < 2200
+    assert [outcomes[i].value for i in range(len(FAULTS))] == [2 * i for i in range(len(FAULTS))]
+
+
+def test_an_engine_that_forks_answers_once():
+    with WorkerPool(1) as workers:
+        tasks = [Task(0, come_back_twice, engine="e"), Task(1, double, (3,), engine="e")]
+        found = {outcome.key: outcome.value for outcome in workers.run(tasks)}
+    assert found == {0: "twice", 1: 6}
+
+
+def abort_on(_):
+    os.abort()
+
+
+def raise_on(_):
+    raise ValueError("the judge's")
+
+
+def test_answers_that_cannot_be_loaded_are_the_engine_s_fault_and_judges_their_own():
+    with WorkerPool(1) as workers:
+        tasks = [
+            Task("unloadable", Unloadable, judge=double, engine="e"),
+            Task("judge", double, (1,), judge=raise_on, engine="e"),
+            Task("judge dies", double, (1,), judge=abort_on, engine="e"),
+        ]
+        found = {outcome.key: outcome for outcome in workers.run(tasks)}
+    assert "the answer cannot be read: ValueError" in found["unloadable"].failure
+    assert found["judge"].failure is None and found["judge"].judge_failure == "ValueError: the judge's"
+    assert found["judge dies"].failure is None and "crashed" in found["judge dies"].judge_failure
+
+
+def spoil_process():
+    """Change everything that calls in the same process share."""
+    np.sum = np.cross = None
+    np.seterr(all="raise")
+    os.environ["SPOILED"] = "yes"
+    os.chdir("/")
+    sys.path.clear()
+
+
+def is_spoiled():
+    return np.sum is None or os.getcwd() == "/" or "SPOILED" in os.environ or not sys.path
+
+
+def is_spoiled_beside(answer):
+    return is_spoiled()
+
+
+def test_an_engine_changes_neither_others_nor_judges():
+    with WorkerPool(1) as workers:
+        tasks = [
+            Task("spoils", spoil_process, judge=is_spoiled_beside, engine="bad"),
+            Task("itself", is_spoiled, engine="bad"),
+            Task("other", is_spoiled, engine="good"),
+            Task("truth", is_spoiled),
+        ]
+        found = {outcome.key: outcome for outcome in workers.run(tasks)}
+    assert found["spoils"].judge_result is False and found["itself"].value is True
+    assert found["other"].value is False and found["truth"].value is False
+
+
+def leave_processes():
+    """A child, a child in a session of its own, a grandchild whose parent has ended."""
+    started = []
+    for make in (lambda: None, os.setsid):
+        child = os.fork()
+        if not child:
+            make()
+            time.sleep(600)
+            os._exit(0)
+        started.append(child)
+    read, write = os.pipe()
+    if not os.fork():
+        os.setsid()
+        grandchild = os.fork()
+        if grandchild:
+            os.write(write, str(grandchild).encode())
+            os._exit(0)
+        time.sleep(600)
+        os._exit(0)
+    os.wait()
+    started.append(int(os.read(read, 100)))
+    started.append(subprocess.Popen(["sleep", "600"], start_new_session=True).pid)
+    return started
+
+
+def leave_processes_and_hang(path):
+    Path(path).write_text(" ".join(map(str, leave_processes())))
+    time.sleep(600)
+
+
+def wait_until_ended(processes):
+    deadline = time.monotonic() + 20
+    while (left := [p for p in processes if is_alive(p)]) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return not left
+
+
+def is_alive(process):
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+    except OSError:
+        return False
+
+
+linux_only = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="subreapers are Linux's")
+
+
+@linux_only
+def test_processes_that_an_engine_starts_end_with_the_pool(tmp_path):
+    """In a process of its own: another test may have ended the warm process, which adopts what is left."""
+    script = tmp_path / "parent.py"
+    script.write_text(
+        "import sys\n"
+        f"sys.path[:0] = {[str(ROOT), str(Path(__file__).parent)]!r}\n"
+        "from test_workers import leave_processes, leave_processes_and_hang, wait_until_ended\n"
+        "from plumbline.processes.worker_pool import Limits, Task, WorkerPool\n"
+        "if __name__ == '__main__':\n"
+        "    limits, path = Limits(seconds=4), sys.argv[1]\n"
+        "    hangs = Task('hangs', leave_processes_and_hang, (path,), limits, engine='e')\n"
+        "    with WorkerPool(1, limits) as workers:\n"
+        "        answered, lost = workers.run([Task('answers', leave_processes, engine='e'), hangs])\n"
+        "    started = [*answered.value, *map(int, open(path).read().split())]\n"
+        "    print(len(started), wait_until_ended(started), 'timeout' in lost.failure)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, script, tmp_path / "started"], capture_output=True, text=True, check=False
+    )
+    assert done.stdout.split() == ["8", "True", "True"], done.stdout + done.stderr
+
+
+@linux_only
+def test_processes_that_an_engine_starts_end_with_a_killed_run(tmp_path):
+    script = tmp_path / "parent.py"
+    script.write_text(
+        "import sys\n"
+        f"sys.path[:0] = {[str(ROOT), str(Path(__file__).parent)]!r}\n"
+        "from test_workers import hang, leave_processes\n"
+        "from plumbline.processes.worker_pool import Task, WorkerPool\n"
+        "if __name__ == '__main__':\n"
+        "    with WorkerPool(1) as workers:\n"
+        "        for outcome in workers.run([Task(0, leave_processes), Task(1, hang)]):\n"
+        "            print(*outcome.value, flush=True)\n"
+    )
+    parent = subprocess.Popen([sys.executable, script], stdout=subprocess.PIPE, text=True)
+    started = [int(word) for word in parent.stdout.readline().split()]
+    assert len(started) == 4 and all(map(is_alive, started))
+    parent.send_signal(signal.SIGKILL)
+    parent.wait()
+    assert wait_until_ended(started)
+
+
+def test_each_loss_costs_one_task_and_is_reported():
+    limits = Limits(seconds=5, gigabytes=4)
+    quick = Limits(seconds=2, gigabytes=4)
+    with WorkerPool(2, limits) as workers:
+        tasks = [Task(("fine", i), double, (i,), limits) for i in range(6)]
+        for k, (loss, _) in enumerate(LOSSES):
+            tasks.insert(2 * k, Task(("lost", k), loss, (), quick))
+        outcomes = {o.key: o for o in workers.run(tasks)}
+    assert [outcomes["fine", i].value for i in range(6)] == [2 * i for i in range(6)], outcomes
+    for k, (loss, words) in enumerate(LOSSES):
+        assert words in (outcomes["lost", k].failure or ""), loss.__name__
+
+
+def test_a_task_that_an_outcome_submits_runs_while_others_do():
+    finished = []
+    with WorkerPool(2) as workers:
+        scheduler = Scheduler(workers)
+        for outcome in scheduler.run([Task("long", sleep_for, (4.0,)), Task("short", sleep_for, (0.0,))]):
+            assert outcome.failure is None
+            finished.append(outcome.key)
+            if outcome.key == "short":
+                scheduler.submit(Task("follows", sleep_for, (0.0,)))
+    assert finished == ["short", "follows", "long"]
+
+
+class Remembering(ResultCache):
+    """Knows the answer of "known"; keeps what it gets."""
+
+    def __init__(self):
+        self.kept = []
+
+    def get(self, task):
+        return Outcome("known", "from before") if task.key == "known" else None
+
+    def put(self, task, outcome):
+        self.kept.append(outcome.key)
+        return outcome
+
+
+def test_the_scheduler_takes_submitted_tasks_first_and_cached_answers_at_once():
+    executor, cache, found = Immediate(), Remembering(), []
+    scheduler = Scheduler(executor, cache)
+    tasks = [Task(key, double, (1,)) for key in ("a", "known", "b", "c")]
+    for outcome in scheduler.run(iter(tasks)):
+        found.append((outcome.key, outcome.value))
+        if outcome.key == "known":
+            scheduler.submit(Task("of known", double, (2,)))
+        if outcome.key == "c":
+            scheduler.submit(Task("of c", double, (3,)))
+    assert executor.started == ["a", "of known", "b", "c", "of c"] and cache.kept == [k for k, _ in found[1:]]
+    assert found[0] == ("known", "from before") and dict(found[1:]) == {
+        "a": 2, "of known": 4, "b": 2, "c": 2, "of c": 6
+    }  # fmt: skip
+
+
+def test_files_and_output_of_an_engine_go_nowhere(capfd, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with WorkerPool(1) as workers:
+        (outcome,) = workers.run([Task("x", write_file_and_flood_output)])
+    assert outcome.value != str(tmp_path)
+    assert not Path(outcome.value).exists(), "the scratch folder is removed"
+    assert list(tmp_path.iterdir()) == []
+    assert "noise" not in "".join(capfd.readouterr())
+
+
+def sleep_for(seconds):
+    time.sleep(seconds)
+    return seconds
+
+
+def test_a_clock_that_is_set_neither_kills_nor_spares(monkeypatch):
+    """By the clock of the wall the nap would be over its limit, and the hang within it for an hour."""
+    real, off = time.time, [0.0]
+    monkeypatch.setattr(time, "time", lambda: real() + off[0])
+    with WorkerPool(3) as workers:
+        list(workers.run([Task(k, sleep_for, (1.0,)) for k in range(6)]))  # now all three are there
+        for step in (3600.0, -3600.0):
+            tasks = [
+                Task("nap", sleep_for, (3.0,), Limits(seconds=60)),
+                Task("hang", hang, (), Limits(seconds=4)),
+                Task("go", sleep_for, (1.0,)),
+            ]
+            found = {}
+            for outcome in workers.run(tasks):
+                if outcome.key == "go":
+                    off[0] += step  # while the others run
+                found[outcome.key] = outcome
+            assert found["nap"].value == 3.0
+            assert "timeout" in (found["hang"].failure or "")
+
+
+def test_what_a_killed_run_leaves_is_removed_by_the_next(tmp_path, monkeypatch):
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    script = (
+        "import time; from plumbline.processes.isolation import ScratchFolder\n"
+        "mine = ScratchFolder(); print(mine.path, flush=True); time.sleep(600)"
+    )
+    owners = [
+        subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, cwd=ROOT)
+        for _ in range(2)
+    ]
+    dead, alive = (Path(p.stdout.readline().strip()) for p in owners)
+    (dead / "deep").mkdir()
+    (dead / "deep" / "file").write_text("x")
+    (tmp_path / "plumbline-of-somebody").mkdir()  # none of ours: nobody locks it
+    owners[0].kill()
+    owners[0].wait()
+    assert dead.is_dir() and alive.is_dir(), "nobody has come by yet"
+    with WorkerPool(1) as workers:
+        mine = workers._scratch.path
+        left = {path.name for path in tmp_path.iterdir()}
+        assert {alive.name, mine.name, "plumbline-of-somebody"} <= left and dead.name not in left
+    owners[1].kill()
+    owners[1].wait()
+    assert not mine.exists() and remove_orphaned_folders("plumbline-") == [alive]
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the parent-death signal is Linux's")
+def test_no_orphan_is_left_when_the_parent_is_killed(tmp_path):
+    script = tmp_path / "parent.py"
+    script.write_text(
+        "import sys\n"
+        f"sys.path[:0] = {[str(Path(__file__).resolve().parents[2]), str(Path(__file__).parent)]!r}\n"
+        "from test_workers import hang, process_id\n"
+        "from plumbline.processes.worker_pool import Task, WorkerPool\n"
+        "if __name__ == '__main__':\n"
+        "    with WorkerPool(1) as workers:\n"
+        "        for outcome in workers.run([Task(0, process_id), Task(1, hang)]):\n"
+        "            print(outcome.value, flush=True)\n"
+    )
+    parent = subprocess.Popen([sys.executable, script], stdout=subprocess.PIPE, text=True)
+    assert parent.stdout is not None
+    worker = int(parent.stdout.readline())
+    parent.send_signal(signal.SIGKILL)
+    parent.wait()
+    deadline = time.monotonic() + 20
+    while Path(f"/proc/{worker}").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not Path(f"/proc/{worker}").exists()
+
+
+@pytest.mark.skipif(not hasattr(os, "killpg"), reason="no process groups")
+def test_a_run_that_is_stopped_and_continued_loses_no_task(tmp_path):
+    """As Ctrl-Z and fg: the process and its workers stand still for longer than the time limit."""
+    script = tmp_path / "stopped.py"
+    script.write_text(
+        "import sys\n"
+        f"sys.path[:0] = {[str(ROOT), str(Path(__file__).parent)]!r}\n"
+        "from test_workers import hang, process_id, sleep_for\n"
+        "from plumbline.processes.worker_pool import Limits, Task, WorkerPool\n"
+        "if __name__ == '__main__':\n"
+        "    limits = Limits(seconds=5)\n"
+        "    with WorkerPool(1) as workers:\n"
+        "        for tasks in ([Task(0, process_id)], [Task(1, sleep_for, (1.5,), limits)],\n"
+        "                      [Task(2, hang, (), limits)]):\n"
+        "            for outcome in workers.run(tasks):\n"
+        "                print(outcome.failure or outcome.value, flush=True)\n"
+    )
+    parent = subprocess.Popen(
+        [sys.executable, script], stdout=subprocess.PIPE, text=True, start_new_session=True
+    )
+    assert parent.stdout.readline().strip().isdigit()
+    time.sleep(0.5)
+    os.killpg(parent.pid, signal.SIGSTOP)
+    time.sleep(7)
+    os.killpg(parent.pid, signal.SIGCONT)
+    assert parent.stdout.readline().strip() == "1.5"
+    assert "timeout: no answer within 5 s" in parent.stdout.readline(), "a hang is still found"
+    assert parent.wait(timeout=60) == 0

@@ -1,0 +1,120 @@
+"""Scenario files with `closes`: what they build, and what they refuse, where; published accelerations."""
+
+import re
+
+import numpy as np
+import pytest
+
+from plumbline.engines.registry import load_adapter
+from plumbline.model.kinematics import joint_coordinates
+from plumbline.model.loops import loop_gaps, smallest_singular_value
+from plumbline.model.sampling import random_loop_states
+from plumbline.scenario.line_and_column_errors import ScenarioError
+from plumbline.scenario.loader import find_scenario_file, load_scenario, load_scenario_text
+from plumbline.truth.certified_state import certify_state
+
+FOUR_BAR = find_scenario_file("four-bar").read_text(encoding="utf-8")
+PUBLISHED_SQUEEZER = [14222.4439199541138706, -10666.8329399655854029]  # β̈(0), Θ̈(0): IVP test set
+
+
+def problems(old, new):
+    assert old in FOUR_BAR
+    with pytest.raises(ScenarioError) as error:
+        load_scenario_text(FOUR_BAR.replace(old, new, 1))
+    return [str(problem) for problem in error.value.problems]
+
+
+@pytest.mark.parametrize("name", ["four-bar", "slider-crank", "bricard", "squeezer", "flyball-governor"])
+def test_loops_are_closed_to_rounding(name):
+    s = load_scenario(find_scenario_file(name))
+    gaps, rates = loop_gaps(s.model, s.state)
+    assert np.max(gaps) < 1e-15 and np.max(rates) < 1e-14
+    assert s.model.has_loops and not s.model.is_chain and len(s.model.kind) > s.model.n
+
+
+def test_the_rates_that_are_given_stay_and_the_others_follow():
+    s = load_scenario_text(FOUR_BAR)
+    assert s.state.xdot[0, 0] == 4.0
+    assert np.all(np.abs(s.state.xdot[1:, 0]) > 0.1)
+    x = joint_coordinates(s.model, s.state)[2]
+    turned = x[0, 0] + x[1, 0] + 0  # the coupler's angle; the closing hinge turns from it to the rocker
+    assert x[3, 0] == pytest.approx(x[2, 0] - turned, abs=1e-14)
+
+
+@pytest.mark.parametrize(
+    "old, new, message",
+    [
+        (
+            "proximal: [0.2, 0, 0]",
+            "proximal: [0.21, 0, 0]",
+            "does not close: points or axes are apart by 0.0",
+        ),
+        ("axis: [0, 1, 0]}\n", "axis: [0, 1, 0.01]}\n", "does not close"),
+        ("body: rocker", "body: rockr", "is 'rockr', no body's name. did you mean"),
+        ("body: rocker\n    parent: coupler", "body: rocker\n    parent: rocker", "like the parent"),
+        ("anchor: [0.25, 0, 0.02]", "anchor: [0.25, 0, -0.02]", "does not close"),
+        ("axis: [0, 1, 0]}\n", "axis: [0, 1, 0], coordinates: [1]}\n", "gives coordinates, which follow"),
+        ("parent: world\n    anchor: [0.45", "parent: rocker\n    anchor: [0.45", "not above this body"),
+    ],
+)
+def test_a_loop_that_cannot_be_is_refused_with_its_place(old, new, message):
+    if old.startswith("axis"):  # the closing joint's is the last
+        new = FOUR_BAR[FOUR_BAR.rindex("  - body") :].replace(old, new)
+        old = FOUR_BAR[FOUR_BAR.rindex("  - body") :]
+    (problem,) = problems(old, new)
+    assert message in problem
+    assert re.match(r"^\S+:\d+:\d+: ", problem)
+
+
+def test_rates_that_open_the_loop_are_refused():
+    rates = re.sub(r"(coordinates: \[[-0-9.]+\])\}", r"\1, rates: [1.0]}", FOUR_BAR)
+    with pytest.raises(ScenarioError, match="opens: rates differ by"):
+        load_scenario_text(rates)
+
+
+def test_the_squeezer_starts_as_published():
+    s = load_scenario(find_scenario_file("squeezer"))
+    truth = certify_state(s.model, s.state).quantities
+    alpha = truth.angular_acceleration[:2, 2]
+    np.testing.assert_allclose([alpha[0], alpha[1] - alpha[0]], PUBLISHED_SQUEEZER, rtol=1e-12)
+
+
+@pytest.mark.parametrize("name, windows", [("four-bars-2", 2), ("four-bars-6", 6)])
+def test_four_bars_move_as_the_parallelogram_does(name, windows):
+    """θ̈ = g sin θ ((N+1)/2 + N)/((N+1) I + N), θ from the upright, I = 1/4 + J of a bar about its end."""
+    s = load_scenario(find_scenario_file(name))
+    truth = certify_state(s.model, s.state).quantities
+    np.testing.assert_allclose(truth.angular_acceleration, 0, atol=1e-12)  # upright: no torque
+    np.testing.assert_allclose(truth.acceleration[0], [0, 0, -0.5], atol=1e-12)  # ω² ℓ/2 towards the world
+    (state,) = random_loop_states(s.model, s.state, 1, 3)
+    found = certify_state(s.model, state).quantities
+    theta, J = state.x[0, 0], s.model.inertia[0, 1, 1]
+    weight = 9.81 * np.sin(theta) * ((windows + 1) / 2 + windows)
+    assert found.angular_acceleration[0, 1] == pytest.approx(
+        weight / ((windows + 1) * (0.25 + J) + windows), rel=1e-12
+    )
+
+
+def test_flat_four_bars_are_singular():
+    s = load_scenario(find_scenario_file("four-bars-2-flat"))
+    assert smallest_singular_value(s.model, s.state) < 1e-6
+    upright = load_scenario(find_scenario_file("four-bars-2"))
+    assert smallest_singular_value(upright.model, upright.state) > 0.1
+
+
+def test_dead_centres_of_a_slider_crank_are_regular():
+    """There the slider stands still while the crank turns: the rows keep their rank."""
+    text = find_scenario_file("slider-crank").read_text(encoding="utf-8")
+    s = load_scenario_text(text)
+    values = [
+        smallest_singular_value(s.model, state) for state in random_loop_states(s.model, s.state, 40, 1)
+    ]
+    assert min(values) > 0.1
+
+
+def test_engines_agree_on_what_dependent_rows_leave_determinate():
+    s = load_scenario(find_scenario_file("bricard"))
+    answers = [load_adapter(name).evaluate(s.model, [s.state])[0] for name in ("reference", "exudyn")]
+    for name in ("joint_reaction", "joint_moment"):
+        one, other = (getattr(answer, name) for answer in answers)
+        assert np.max(np.abs(one - other)) < 1e-12 * np.max(np.abs(one))

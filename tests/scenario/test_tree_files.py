@@ -1,0 +1,197 @@
+"""Scenario files with parents and joints with axes: what they build, and what they refuse, where."""
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from plumbline.model.datatypes import JOINT_ELEMENTS
+from plumbline.model.kinematics import rotation_matrix
+from plumbline.scenario.line_and_column_errors import ScenarioError
+from plumbline.scenario.loader import load_scenario_text
+from plumbline.storage.results_schema import _Scenario
+from reference_impl.mechanism import Mechanism
+
+HEAD = "schema_version: 1\ntitle: t\npurpose: p\nbodies:\n"
+BODY = "mass: 1, inertia: {principal: [1, 1, 1]}, proximal: [0, 0, 1]"
+
+
+def load(*bodies, springs=()):
+    text = HEAD + "".join(f"  - {{{BODY}, {body}}}\n" for body in bodies)
+    return load_scenario_text(
+        text + "springs:\n" * bool(springs) + "".join(f"  - {{{s}}}\n" for s in springs)
+    )
+
+
+def problems(*bodies, springs=()):
+    with pytest.raises(ScenarioError) as error:
+        load(*bodies, springs=springs)
+    return [str(problem) for problem in error.value.problems]
+
+
+def test_a_tree_is_built_as_written():
+    s = load(
+        "name: a, joint: {kind: hinge, axis: [0, 2, 0], coordinates: [0.5], rates: [2]}, distal: [0, 0, -1]",
+        "name: b, joint: {kind: slide, axis: [1, 0, 0], coordinates: [0.25], rates: [-1]}",
+        "parent: a, anchor: [1, 2, 3], joint: {kind: ball}, attitude: {quaternion: [1, 0, 0, 0]}",
+        "parent: world, anchor: [4, 0, 0], joint: {kind: universal, coordinates: [0.1, 0.2]}",
+        "joint: {kind: free, position: [1, 1, 1], velocity: [0, 0, 2]}, attitude: {quaternion: [0, 1, 0, 0]}",
+    )
+    assert s.model.kind == ("hinge", "slide", "ball", "universal", "free")
+    assert s.model.body[:, 0].tolist() == [-1, 0, 0, -1, -1] and not s.model.is_chain
+    np.testing.assert_array_equal(
+        s.model.point[:, 0], [[0, 0, 0], [0, 0, -1], [1, 2, 3], [4, 0, 0], [0, 0, 0]]
+    )
+    axis = rotation_matrix(s.model.turn[:2, 0])[..., 2]
+    np.testing.assert_allclose(axis, [[0, 1, 0], [1, 0, 0]], atol=1e-15)
+    c, sin = np.cos(0.5), np.sin(0.5)
+    np.testing.assert_allclose(
+        s.state.r[0], [-sin, 0, -c], atol=1e-15
+    )  # hangs from the origin, turned about y
+    np.testing.assert_allclose(s.state.v[0], 2 * np.array([-c, 0, sin]), atol=1e-15)
+    np.testing.assert_allclose(s.state.r[1], [-3 * sin + 0.25 * c, 0, -3 * c - 0.25 * sin], atol=1e-15)
+    np.testing.assert_array_equal(s.state.r[4], [1, 1, 2])  # its proximal point is at the position
+    assert s.state.x.tolist() == [[0.5, 0], [0.25, 0], [0, 0], [0.1, 0.2], [0, 0]]
+
+
+@pytest.mark.parametrize("axis", [[0, 0, 1], [0, 0, -1], [1e-9, 0, -1], [1, -2, -0.5], [3, 1, 0]])
+def test_an_axis_may_point_anywhere(axis):
+    s = load(f"joint: {{kind: hinge, axis: {axis}}}")
+    wanted = np.array(axis) / np.linalg.norm(axis)
+    np.testing.assert_allclose(rotation_matrix(s.model.turn[0, 1])[:, 2], wanted, atol=1e-15)
+
+
+BALL = "joint: {kind: ball}, attitude: {quaternion: [1, 0, 0, 0]}"
+MISTAKES = {
+    "unknown": (
+        (f"name: arm, {BALL}", f"parent: amr, {BALL}"),
+        ["6:", "parent: is 'amr', no body's name", "'arm'"],
+    ),
+    "itself": ((f"name: a, parent: a, {BALL}",), ["5:", "parent: is 'a', which is not above this body"]),
+    "later": ((f"parent: b, {BALL}", f"name: b, parent: world, {BALL}"), ["5:", "which is not above"]),
+    "twice": (
+        (f"name: a, {BALL}", f"name: a, parent: world, {BALL}", f"parent: a, anchor: [0, 0, 0], {BALL}"),
+        ["7:", "the name of 2 bodies"],
+    ),
+    "branch": (
+        (
+            f"name: a, {BALL}", f"name: b, parent: a, anchor: [0, 0, 0], {BALL}",
+            f"name: c, parent: a, anchor: [0, 0, 0], {BALL}", f"parent: b, anchor: [0, 0, 0], {BALL}",
+        ),
+        ["8:", "whose branch ended above"],
+    ),
+    "no distal": (
+        (f"name: a, {BALL}", f"parent: a, {BALL}"),
+        ["6:", "anchor: is missing: the parent has no distal"],
+    ),
+    "no axis": (("joint: {kind: hinge, axis: [0, 0, 0]}",), ["5:", "axis: is all zeros"]),
+    "two axes": (
+        ("joint: {kind: hinge, axis: [0, 0, 1], frame: {quaternion: [1, 0, 0, 0]}}",),
+        ["gives axis and a frame"],
+    ),
+    "axis of a weld": (
+        (f"{BALL}, distal: [0, 0, 0]", "joint: {kind: weld, axis: [0, 0, 1]}"),
+        ["6:", "gives an axis"],
+    ),
+    "weld to the world": (("joint: {kind: weld}",), ["5:", "welds a body to the world"]),
+    "coordinates": (
+        ("joint: {kind: hinge, coordinates: [1, 2]}",),
+        ["5:", "coordinates: has 2 numbers", "1 for a hinge"],
+    ),
+    "attitude": (
+        ("joint: {kind: hinge}, attitude: {quaternion: [1, 0, 0, 0]}",),
+        ["5:", "attitude: is given for a body on a hinge"],
+    ),
+    "no attitude": (("joint: {kind: ball}",), ["5:", "attitude: is missing"]),
+    "rates": (
+        ("joint: {kind: hinge}, angular_velocity: [1, 0, 0]",),
+        ["5:", "angular_velocity: is given for a body"],
+    ),
+    "free on a body": (
+        (f"name: a, {BALL}", "parent: a, joint: {kind: free}, attitude: {quaternion: [1, 0, 0, 0]}"),
+        ["6:", "parent: is given for a free body"],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_mistakes_are_named_with_their_place(name):
+    bodies, words = MISTAKES[name]
+    found = "\n".join(problems(*bodies))
+    assert all(word in found for word in words), found
+
+
+ARM = "name: arm, joint: {kind: hinge, axis: [0, 0, 1]}, distal: [0, 0, -1]"
+BOB = f"name: bob, {BALL}"
+
+
+def test_passive_elements_are_built_as_written():
+    s = load(
+        ARM.replace("1]}", "1], armature: 0.5, stiffness: [3], rest: 1, effort: -2}"),
+        f"name: bob, {BALL.replace('ball', 'ball, damping: 0.25, armature: 1')}",
+        "joint: {kind: universal, damping: [1, 2], effort: [0, 4]}, parent: arm",
+        springs=(
+            "bodies: [world, bob], points: [[0, 0, 1], [0, 1, 0]], stiffness: 7, length: 0.5",
+            "bodies: [bob, arm], points: [[0, 0, 3], [0, 0, 0]], damping: 2",
+        ),
+    ).model
+    assert s.armature.tolist() == [[0.5, 0], [1, 0], [0, 0]]
+    assert s.damping.tolist() == [[0, 0], [0.25, 0], [1, 2]]
+    assert s.stiffness.tolist() == [[3, 0], [0, 0], [0, 0]] and s.rest.tolist() == [[1, 0], [0, 0], [0, 0]]
+    assert s.effort.tolist() == [[-2, 0], [0, 0], [0, 4]]
+    assert s.spring_body.tolist() == [[-1, 1], [1, 0]] and s.spring_point[0].tolist() == [
+        [0, 0, 1],
+        [0, 1, 0],
+    ]
+    assert s.spring_stiffness.tolist() == [7, 0] and s.spring_damping.tolist() == [0, 2]
+    assert s.spring_length.tolist() == [0.5, 0]
+    again = Mechanism.from_fields({k: np.asarray(v).tolist() for k, v in s.fields.items()})
+    assert all(np.array_equal(getattr(again, name), value) for name, value in vars(s).items())
+
+
+def test_a_chain_with_an_element_is_no_bare_chain_and_bare_files_keep_their_digest():
+    bare, damped = load(BALL), load(BALL.replace("ball", "ball, damping: 1"))
+    assert bare.model.is_chain and not damped.model.is_chain and damped.model.has_elements
+    assert "springs" not in bare.document and set(bare.document["bodies"][0]["joint"]) == {"kind"}
+    assert bare.digest != damped.digest
+    assert not set(bare.model.fields) & {"armature", "spring_body"}
+    assert set(load(ARM, BOB).model.fields) & {"armature", "spring_body"} == set()
+
+
+def spring(bodies, more="stiffness: 1", points="[[0, 0, 1], [0, 1, 0]]"):
+    return (f"bodies: {bodies}, points: {points}, {more}",)
+
+
+ELEMENT_MISTAKES = {
+    "too many": (ARM.replace("1]}", "1], damping: [1, 2]}"), (), ["5:", "has 2 numbers", "1 for a hinge"]),
+    "too few": ("joint: {kind: universal, armature: 1}", (), ["5:", "has 1 number", "2 for a univ"]),
+    "negative": (BALL.replace("ball", "ball, stiffness: -1"), (), ["5:", "stiffness: is -1.0, below 0"]),
+    "of a weld": ("parent: bob, joint: {kind: weld, damping: 1}", (), ["given for a weld"]),
+    "effort of a ball": (BALL.replace("ball", "ball, effort: 1"), (), ["5:", "effort: unknown field"]),
+    "rest alone": (ARM.replace("1]}", "1], rest: 1}"), (), ["gives rest without stiffness"]),
+    "a word": (ARM.replace("1]}", "1], damping: high}"), (), ["damping: is the text 'high'"]),
+    "no such body": (ARM, spring("[arm, bbo]"), ["8:", "springs[0].bodies[1]: is 'bbo', no body's name"]),
+    "one body": (ARM, spring("[arm, arm]"), ["springs[0].bodies[1]: is 'arm' like the other end"]),
+    "the world twice": (ARM, spring("[world, world]"), ["is 'world' like the other end"]),
+    "a single body": (ARM, spring("[arm]"), ["springs[0].bodies: has 1 entries", "exactly 2"]),
+    "a name twice": (f"name: bob, {BALL}", spring("[world, bob]"), ["is 'bob', the name of 2 bodies"]),
+    "no distance": (ARM, spring("[world, bob]", points="[[0, 0, 0], [0, 0, 1]]"), ["8:", "coincide"]),
+    "negative length": (ARM, spring("[world, bob]", "length: -1"), ["springs[0].length: is -1"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ELEMENT_MISTAKES)
+def test_mistakes_in_elements_are_named_with_their_place(name):
+    first, springs, words = ELEMENT_MISTAKES[name]
+    found = "\n".join(problems(first, f"parent: world, {BOB}", springs=springs))
+    assert all(word in found for word in words), found
+
+
+def test_stored_models_need_no_elements_and_check_those_they_have():
+    model = load(ARM.replace("1]}", "1], damping: 2}"), BOB, springs=spring("[world, bob]")).model
+    stored = {k: np.asarray(v).tolist() for k, v in model.fields.items()}
+    about = {"family": "tree", "title": "t", "bodies": 2}
+    _Scenario.model_validate(about | {"model": stored})
+    _Scenario.model_validate(about | {"model": {k: v for k, v in stored.items() if k not in JOINT_ELEMENTS}})
+    for name in ("damping", "spring_point", "spring_length"):
+        with pytest.raises(ValidationError, match=f"model.{name} does not fit"):
+            _Scenario.model_validate(about | {"model": stored | {name: [[1.0]]}})

@@ -1,0 +1,157 @@
+"""The certified truth: enclosures that hold, and two formulations that share nothing with it."""
+
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from plumbline.model.kinematics import rotation_matrix, state_from_minimal
+from plumbline.truth import TruthUnavailable, import_truth_tool
+from plumbline.truth.certified_state import (
+    MAX_RELATIVE_RADIUS,
+    CertificationFailure,
+    certify_state,
+    enclose_quantities,
+)
+from tests.helpers.kane import kane_solution
+from tests.helpers.notes_system_multiprecision import notes_solution
+from tests.helpers.random_chains import random_chain
+
+flint = pytest.importorskip("flint")
+mpmath = pytest.importorskip("mpmath")
+
+JOINT_PATTERNS = [[0], [1], [0, 0], [1, 1], [0, 1], [1, 0], [1, 0, 1, 0]]
+
+
+def max_difference(enclosure, other):
+    """Largest distance of two lists of 3-vectors, one in balls and one in mpf, at 60 digits."""
+    with mpmath.workdps(60):
+        pairs = zip((x for row in enclosure for x in row), (y for row in other for y in row), strict=True)
+        return float(max(abs(mpmath.mpf(x.mid().str(58, radius=False)) - y) for x, y in pairs))
+
+
+@pytest.mark.parametrize("rods", JOINT_PATTERNS, ids=str)
+@pytest.mark.parametrize("loads", [False, True])
+def test_the_notes_full_system_at_fifty_digits_agrees(rods, loads):
+    model, state = random_chain(np.random.default_rng(3), rods, mass_decades=1, loads=loads, drag=loads)
+    balls, other = enclose_quantities(model, state, 250), notes_solution(model, state)
+    for quantity, value in other.items():
+        assert max_difference(balls[quantity], value) < 1e-44 * balls["scale"][quantity], quantity
+
+
+@pytest.mark.parametrize("rods", [[0], [1], [0, 0]], ids=str)
+def test_kanes_equations_agree(rods):
+    check_kane(rods)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("rods", [[0, 1], [1, 0], [1, 1]], ids=str)
+def test_kanes_equations_agree_with_rods(rods):
+    check_kane(rods)
+
+
+def check_kane(rods):
+    pytest.importorskip("sympy")
+    for seed in range(3):
+        model, state = random_chain(np.random.default_rng(seed), rods, loads=True, drag=True)
+        balls, other = enclose_quantities(model, state, 250), kane_solution(model, state)
+        for quantity, value in other.items():
+            assert max_difference(balls[quantity], value) < 1e-44 * balls["scale"][quantity], quantity
+
+
+def test_kanes_equations_agree_for_rods_in_every_direction():
+    pytest.importorskip("sympy")
+    model, state = random_chain(np.random.default_rng(5), [1])
+    for u in ([0, 0, 1.0], [0, 0, -1.0], [1.0, 0, 0], [0.6, 0, -0.8]):
+        u = np.array([u])
+        turned = state_from_minimal(model, state.p, state.omega, u, np.cross([[0.3, -1.2, 2.0]], u))
+        balls, other = enclose_quantities(model, turned, 250), kane_solution(model, turned)
+        assert (
+            max_difference(balls["acceleration"], other["acceleration"])
+            < 1e-44 * balls["scale"]["acceleration"]
+        )
+
+
+def test_enclosures_contain_the_results_of_a_higher_precision():
+    model, state = random_chain(np.random.default_rng(7), [0, 1, 0, 0, 1], mass_decades=2)
+    coarse, fine = enclose_quantities(model, state, 120, True), enclose_quantities(model, state, 500, True)
+    for quantity in set(coarse) - {"scale"}:
+        for x, y in zip(np.ravel(coarse[quantity]), np.ravel(fine[quantity]), strict=True):
+            assert x.contains(y), quantity
+
+
+def test_precision_rises_until_the_radius_is_small():
+    model, state = random_chain(np.random.default_rng(1), [0] * 6, mass_decades=3)
+    answer = certify_state(model, state, bits=60)
+    assert answer.bits > 60
+    assert answer.radius["acceleration"] <= MAX_RELATIVE_RADIUS * max(
+        max_norm(answer.quantities.acceleration), 9.81
+    )
+
+
+def max_norm(v):
+    return float(np.max(np.linalg.norm(v, axis=-1)))
+
+
+def test_energy_momentum_and_mass_matrix_follow_their_definitions():
+    model, state = random_chain(np.random.default_rng(2), [1, 0, 1])
+    reported = certify_state(model, state, mass_matrix=True).quantities
+    A = rotation_matrix(state.p)
+    spin = np.einsum("kij,kj->ki", model.inertia, state.omega)
+    kinetic = 0.5 * np.sum(model.mass * np.sum(state.v**2, 1)) + 0.5 * np.sum(state.omega * spin)
+    momentum = np.sum(np.cross(state.r, model.mass[:, None] * state.v) + (A @ spin[..., None])[..., 0], 0)
+    assert reported.kinetic_energy == pytest.approx(kinetic, rel=1e-13)
+    assert reported.potential_energy == pytest.approx(9.81 * np.sum(model.mass * state.r[:, 2]), rel=1e-13)
+    assert reported.angular_momentum == pytest.approx(momentum, rel=1e-12)
+    rates = np.concatenate([state.udot[model.rods].ravel(), state.omega.ravel()])
+    assert 0.5 * rates @ reported.mass_matrix @ rates == pytest.approx(kinetic, rel=1e-13)
+    assert np.array_equal(reported.mass_matrix, reported.mass_matrix.T)
+
+
+def test_power_of_gravity_equals_the_change_of_kinetic_energy():
+    """d/dt T = Σ m ṙ·r̈ + ω′·(J ω̇′) = Σ m g·ṙ + loads: the accelerations do what the energies say."""
+    model, state = random_chain(np.random.default_rng(4), [0, 1, 1], loads=True)
+    reported = certify_state(model, state).quantities
+    change = np.sum(model.mass[:, None] * state.v * reported.acceleration)
+    change += np.sum(state.omega * np.einsum("kij,kj->ki", model.inertia, reported.angular_acceleration))
+    work = np.sum(state.v * (model.mass[:, None] * model.gravity + model.force)) + np.sum(
+        state.omega * model.moment
+    )
+    assert change == pytest.approx(work, rel=1e-12)
+
+
+def test_a_rod_at_rest_hangs_by_its_weight():
+    model, _ = random_chain(np.random.default_rng(0), [1])
+    model = model.changed(proximal=np.zeros((1, 3)))
+    down = np.array([[0.0, 0.0, -1.0]])
+    state = state_from_minimal(model, np.array([[1.0, 0, 0, 0]]), np.zeros((1, 3)), down, np.zeros((1, 3)))
+    answer = certify_state(model, state)
+    weight = model.mass * 9.81
+    assert np.all(answer.quantities.acceleration == 0)
+    assert answer.quantities.joint_reaction[0] == pytest.approx([0, 0, weight[0]], rel=1e-15)
+
+
+def test_fifty_bodies_take_a_fraction_of_a_second():
+    for rods in ([0] * 50, [1] * 50):
+        model, state = random_chain(np.random.default_rng(0), rods)
+        start = time.perf_counter()
+        certify_state(model, state)
+        assert time.perf_counter() - start < 2.0
+
+
+def test_a_singular_system_is_not_certified():
+    model, state = random_chain(np.random.default_rng(0), [0, 0])
+    inertia = model.inertia.copy()
+    inertia[1] = 0.0  # nothing resists a spin about the line from the ball joint to the point mass
+    with pytest.raises(CertificationFailure, match="singular"):
+        certify_state(model.changed(inertia=inertia), state)
+
+
+def test_missing_truth_tools_raise_with_an_explanation(monkeypatch):
+    monkeypatch.setitem(sys.modules, "flint", None)
+    model, state = random_chain(np.random.default_rng(0), [0])
+    with pytest.raises(TruthUnavailable, match="truth tools not installed"):
+        certify_state(model, state)
+    with pytest.raises(ImportError):
+        import_truth_tool("flint")
