@@ -68,7 +68,7 @@ __all__ = [
 CATALOGUE_FOLDER = Path(__file__).resolve().parents[2] / "scenarios"
 LOOP_TOLERANCE = 1e-9  # of a loop's gap at t = 0 [m, rad], and of its rate over the largest speed
 MAX_MAGNITUDE = 1e30  # beyond it squares and products leave the range where engines can compute
-FAMILIES = ("single", "double", "chain", "hinge", "tree", "loop", "classic")
+FAMILIES = ("single", "double", "chain", "joint", "tree", "loop", "classic")
 
 
 @dataclass(frozen=True, eq=False)

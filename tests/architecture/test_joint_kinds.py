@@ -10,13 +10,13 @@ from tests.architecture.test_layers import MODULES
 
 OWN_TABLES = r"""
     reference_impl\.joint_kinds      # the table
-    | plumbline\.truth\.enclosure_(file|checker)  # certificates are checked without the code that made them
+    | plumbline\.truth\.certificate_(file|checker)  # certificates are checked without the code that made them
     | plumbline\.(importers|model_files|cli)\..*  # elementary joints of robots' files; --base free
     | plumbline\.storage\.results_store  # the base of a model file
     | plumbline\.truth\.taylor_tree  # not yet
     | adapters\..* | bench\..*
 """
-OTHER_MEANINGS = {"slide": "a motion", "hinge": "a family of scenarios"}
+OTHER_MEANINGS = {"slide": "a motion"}
 FILES = [
     name
     for name in MODULES

@@ -7,7 +7,7 @@ import pyarrow.parquet as pq
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGE = (ROOT / "docs" / "notes" / "reference-performance.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "measurements" / "reference-performance.md").read_text(encoding="utf-8")
 FIGURES = json.loads((ROOT / "bench" / "results" / "figures.json").read_text(encoding="utf-8"))
 COLUMNS = {
     "structured": "reference",

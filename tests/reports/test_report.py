@@ -540,5 +540,10 @@ def test_every_further_number_of_a_row_has_a_label():
     table = re.search(r"^const EXTRA = \{(.*?)^\};", script, re.MULTILINE | re.DOTALL)[1]
     labels = set(re.findall(r"(\w+): \[\"", table))
     written = further_numbers()
-    assert {file for file, _ in written} >= {"state.py", "step.py", "trajectory.py", "relation_rows.py"}
+    assert {file for file, _ in written} >= {
+        "state_level.py",
+        "step_level.py",
+        "trajectory_level.py",
+        "relation_rows.py",
+    }
     assert not {(file, key) for file, key in written if key not in labels}
