@@ -15,7 +15,7 @@ export UV_COMPILE_BYTECODE := 1
 export PYTHONDONTWRITEBYTECODE :=
 MUTANTS ?= --sample 300 --seed 1 --jobs 2
 
-.PHONY: help install run test fast-tests nightly bench benchmarks mutants importers models lint lock clean
+.PHONY: help install run test fast-tests nightly bench benchmarks mutants importers models lint lock release clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' Makefile | sed 's/:.*##/\t/' | expand -t 12
@@ -71,7 +71,7 @@ $(LAUNCHER): tools/launcher.sh Makefile | .venv/pyvenv.cfg
 	$(INSTALL) -r locks/main.lock
 	@touch $@
 
-# Certified truth is wanted and not needed: trouble with its packages never stops the main job.
+# Taylor's method is wanted and not needed: trouble with its packages never stops the main job.
 .venv/truth.tried: locks/truth.lock .venv/main.done
 	-$(INSTALL) -r locks/truth.lock
 	@touch $@
@@ -115,14 +115,17 @@ models: .venv/test.done importers .corpora/.done  ## public robots through every
 LOCK = $(UV) pip compile --quiet --universal --python-version 3.11 --generate-hashes \
 	--no-emit-index-url --no-header --no-annotate
 lock: | .venv/pyvenv.cfg  ## resolve the dependencies again (needs the network)
-	$(LOCK) pyproject.toml --upgrade -o locks/main.lock
-	$(LOCK) pyproject.toml -c locks/main.lock --group truth -o locks/truth.lock
-	$(LOCK) pyproject.toml -c locks/truth.lock $(addprefix --group ,test truth browser history cluster bench) \
-		-o locks/test.lock
-	$(LOCK) pyproject.toml -c locks/test.lock --group mutation -o locks/mutation.lock
+	$(LOCK) pyproject.toml --extra all --upgrade -o locks/main.lock
+	$(LOCK) pyproject.toml --extra all -c locks/main.lock --group truth -o locks/truth.lock
+	$(LOCK) pyproject.toml --extra all -c locks/truth.lock \
+		$(addprefix --group ,test truth browser history cluster bench) -o locks/test.lock
+	$(LOCK) pyproject.toml --extra all -c locks/test.lock --group mutation -o locks/mutation.lock
 	$(LOCK) --group importers -c locks/main.lock -o locks/importers.lock
 	$(LOCK) --group exudyn-importer -o locks/exudyn-importer.lock
 	$(LOCK) --group corpora --no-deps -o locks/corpora.lock
 
+release: .venv/test.done  ## build and check the wheel, tag the commit, write the notes of CHANGELOG.md into dist
+	UV=$(UV) $(PYTHON) -m tools.release
+
 clean:  ## remove the environment and what runs made
-	rm -rf .venv .uv .importers .importers-exudyn .corpora reports/node_modules reports/out
+	rm -rf .venv .uv .importers .importers-exudyn .corpora reports/node_modules reports/out dist

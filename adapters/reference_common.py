@@ -6,9 +6,6 @@ T = diag(M, 4 LᵀJL), the upper left block of S, the kinetic energy is ½ yᵀ 
 
 from __future__ import annotations
 
-import tomllib
-from pathlib import Path
-
 import numpy as np
 
 from plumbline.model.datatypes import Array, Integrator, Model, State, StateQuantities, Trajectory
@@ -25,12 +22,6 @@ DOP853 = Integrator(
     note="scipy's DOP853 on y = (r, p, ṙ, ṗ), no stabilisation; resolution is rtol, atol is rtol "
     "times the natural size of each part of y",
 )
-
-
-def checkout_version() -> str:
-    """Read the version of this checkout."""
-    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))
-    return str(project["project"]["version"])
 
 
 def notes_state(state: State) -> tuple[Array, Array, Array, Array]:

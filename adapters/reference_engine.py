@@ -10,11 +10,11 @@ import numpy as np
 from adapters.reference_common import (
     DOP853,
     NO_WELD,
-    checkout_version,
     notes_state,
     state_quantities,
     trajectory,
 )
+from plumbline import __version__
 from plumbline.engines.metamorphic_hooks import MetamorphicHooks
 from plumbline.model.datatypes import (
     Array,
@@ -58,7 +58,7 @@ class Reference(MetamorphicHooks):
 
     def version(self) -> str:
         """Return the version of this checkout."""
-        return checkout_version()
+        return __version__
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
         system = DirectSystem(model)

@@ -14,11 +14,11 @@ import numpy as np
 from adapters.reference_common import (
     DOP853,
     NO_WELD,
-    checkout_version,
     notes_state,
     state_quantities,
     trajectory,
 )
+from plumbline import __version__
 from plumbline.engines.metamorphic_hooks import MetamorphicHooks
 from plumbline.model.datatypes import (
     Array,
@@ -51,7 +51,7 @@ class ReferencePrinted(MetamorphicHooks):
 
     def version(self) -> str:
         """Return the version of this checkout."""
-        return checkout_version()
+        return __version__
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
         self._check_printed(model)

@@ -24,6 +24,7 @@ from plumbline.engines.registry import IMPORTERS
 from plumbline.execution.runner import git_commit
 from plumbline.importers.neutral_model import MODEL_UNITS, Feature
 from plumbline.judging.rows import Row, Verdict
+from plumbline.layout import IS_INSTALLED
 from plumbline.model_files.importer_cause import Explanation
 from plumbline.model_files.model_rows import REFUSED, FileResult
 from plumbline.model_files.model_run import ModelPlan, ModelRunResult, run_model_files
@@ -265,7 +266,8 @@ def _print_missing(result: ModelRunResult) -> None:
     optional = [n for n in absent if is_optional_importer(n) and not result.engines[n].version]
     if optional:
         it = "it" if len(optional) == 1 else "them"
-        click.echo(f"{glyph} {', '.join(optional)}: not installed here; `make importers` installs {it}")
+        way = "pip" if IS_INSTALLED else "`make importers`"
+        click.echo(f"{glyph} {', '.join(optional)}: not installed here; {way} installs {it}")
     for name in absent:
         if name not in optional:
             click.echo(f"{glyph} {name}: {result.engines[name].missing}")

@@ -30,7 +30,6 @@ from plumbline.truth.closed_form import ClosedFormMismatch, closed_form_motion
 if TYPE_CHECKING:
     from plumbline.execution.result_cache import DiskResultCache
 
-DEFAULT_OUT = Path("reports") / "out"
 LOCK_FILE = ".lock"  # of an output folder, held by the command that writes to it
 MIN_TIMEOUT, MAX_TIMEOUT = 1.0, 1e7  # s; starting an engine takes longer than less
 MIN_MEMORY, MAX_MEMORY = 1.0, 1e6  # GB of address space; a worker with an engine does not start with less
@@ -388,7 +387,7 @@ def check_history_tool() -> None:
     """
     if find_spec("duckdb") is None:
         raise click.UsageError(
-            "histories are read with DuckDB, which is not installed; `make test` installs it"
+            "histories are read with DuckDB, which is not installed; `pip install duckdb` installs it"
         )
 
 

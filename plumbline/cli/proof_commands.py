@@ -12,6 +12,7 @@ from typing import Any
 import click
 import numpy as np
 
+from plumbline import layout
 from plumbline.cli import options
 from plumbline.cli.help_texts import EXIT_CODES, examples
 from plumbline.cli.terminal_output import ProgressDisplay, count_noun, print_table
@@ -49,7 +50,7 @@ MAX_DURATION = 1000.0  # s; two bodies take minutes for 30 s
     default="quad",
     help="Of the candidate: quad for radii near 1e-25 m after 2 s, octuple for longer or chaotic motions.",
 )
-@options.out_option(Path("certificates"), " of the certificates, SCENARIO.json.gz")
+@options.out_option(layout.output_folder("certificates"), " of the certificates, SCENARIO.json.gz")
 @options.json_option
 def prove(names: tuple[str, ...], duration: float | None, precision: Any, out: Path, as_json: bool) -> None:
     """Enclose the motion of scenarios rigorously, and write certificates that `verify` proves again.

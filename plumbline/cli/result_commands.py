@@ -10,6 +10,7 @@ from typing import Any
 import click
 
 import reports
+from plumbline import layout
 from plumbline.cli import options
 from plumbline.cli.help_texts import examples
 from plumbline.cli.terminal_output import count_noun, make_console, print_table
@@ -111,7 +112,7 @@ def _reproduce_model(folder: Path, keys: tuple[str, ...], form: str | None) -> N
 
 
 @click.command()
-@click.argument("folder", default=options.DEFAULT_OUT, type=options.ResultsPath())
+@click.argument("folder", default=layout.DEFAULT_OUT, type=options.ResultsPath())
 @click.option(
     "--history",
     "history_folder",

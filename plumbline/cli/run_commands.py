@@ -10,6 +10,7 @@ from typing import Any
 import click
 
 import reports
+from plumbline import layout
 from plumbline.cli import options
 from plumbline.cli.help_texts import EXIT_CODES, examples
 from plumbline.cli.run_display import RunDisplay
@@ -48,7 +49,7 @@ MAX_PROOF_CPU_SECONDS = 1e6
 @options.jobs_option
 @options.scheduler_option
 @options.known_option
-@options.out_option(options.DEFAULT_OUT)
+@options.out_option(layout.DEFAULT_OUT)
 @options.json_option
 @click.option(
     "--user-rtol",
@@ -159,7 +160,7 @@ def run(
 @options.jobs_option
 @options.scheduler_option
 @options.known_option
-@options.out_option(Path("nightly"), "; complete nights are in its folder `history`")
+@options.out_option(layout.output_folder("nightly"), "; complete nights are in its folder `history`")
 @options.timeout_option(1800.0)
 @options.memory_option
 def nightly(
@@ -187,7 +188,7 @@ def nightly(
             random_trajectory_count=random_trajectories, seed=seed, jobs=jobs,
             limits=Limits(timeout, memory), is_full_catalogue=not names and engines == list(ENGINES),
             extra_refinements=extra_refinements, long_run_seconds=long_run_seconds, scheduler=scheduler,
-            self_test=run_self_test if self_test else None, progress=progress,
+            self_test=run_self_test if self_test and not layout.IS_INSTALLED else None, progress=progress,
             proof_cpu_seconds=proof_cpu_seconds,
             observer=display, command=command_line(), log=_log, known_issues=known_issues,
             are_engines_required=options.are_engines_named(),

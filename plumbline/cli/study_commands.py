@@ -13,6 +13,7 @@ import click
 import pyarrow as pa
 
 import reports
+from plumbline import layout
 from plumbline.cli import options
 from plumbline.cli.help_texts import EXIT_CODES, examples
 from plumbline.cli.terminal_output import ProgressDisplay, count_noun, print_table
@@ -32,7 +33,7 @@ MAX_LISTED_CELLS = 10
 @click.command(epilog=EXIT_CODES)
 @click.argument("file", metavar="FILE", type=click.Path(path_type=Path))
 @options.jobs_option
-@options.out_option(Path("sweep"))
+@options.out_option(layout.output_folder("sweep"))
 @options.timeout_option(300.0)
 def sweep(file: Path, jobs: int, out: Path, timeout: float) -> None:
     """Vary a scenario's parameters over a grid or distributions, as a sweep file says (docs/sweeps.md).
@@ -103,7 +104,7 @@ def _print_sweep(table: pa.Table, cell_count: int) -> None:
     default=120.0,
     help="CPU seconds that one run may take; later times are left out where they would cost more.",
 )
-@options.out_option(options.DEFAULT_OUT)
+@options.out_option(layout.DEFAULT_OUT)
 def drift(names: tuple[str, ...], rtols: tuple[float, ...], max_cpu_seconds: float, out: Path) -> None:
     """Measure the drift of raw, Baumgarte and projected runs in 10, 100, 1000 s (default: two scenarios).
 
@@ -167,7 +168,7 @@ def drift(names: tuple[str, ...], rtols: tuple[float, ...], max_cpu_seconds: flo
     help="Instead: how many legal pairs of features the scenarios cover, and which are not covered.",
 )
 @options.jobs_option
-@options.out_option(options.DEFAULT_OUT)
+@options.out_option(layout.DEFAULT_OUT)
 @options.json_option
 @options.timeout_option(600.0)
 @options.memory_option

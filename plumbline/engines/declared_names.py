@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
-from plumbline.engines.environments import ROOT
+from plumbline.layout import ROOT
 from plumbline.processes.user_cache import content_key, recall, remember
 
 

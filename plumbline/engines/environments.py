@@ -26,6 +26,7 @@ from packaging.utils import InvalidWheelFilename, canonicalize_name, parse_wheel
 from packaging.version import Version
 
 from plumbline.engines.registry import ENGINES, IMPORTERS
+from plumbline.layout import IS_INSTALLED, PREFIX, ROOT
 from plumbline.processes.exceptions import PlumblineError
 from plumbline.processes.isolation import ScratchFolder
 from plumbline.processes.user_cache import (
@@ -35,7 +36,6 @@ from plumbline.processes.user_cache import (
     user_cache_folder,
 )
 
-ROOT = Path(__file__).resolve().parents[2]
 BASE_REQUIREMENTS = ("numpy", "scipy", "packaging", "pydantic")  # imported by adapters and core in workers
 INSTALL_TIMEOUT = 900  # s for uv to fetch and install
 
@@ -127,7 +127,7 @@ def _parse(source: Path) -> list[ast.stmt]:
 
 def _read_attribute(module: str, class_name: str, attribute: str) -> Any:
     """Read an attribute in the source of a class, or of the first of its bases that has it."""
-    source = ROOT / f"{module.replace('.', '/')}.py"
+    source = ROOT / f"{module.removeprefix(PREFIX).replace('.', '/')}.py"
     if not source.is_file():
         return None
     body = _parse(source)
@@ -215,7 +215,7 @@ def importer_interpreter(name: str) -> str:
     if version:
         return ensure_interpreter(name, declared_importer_attribute)
     folder = declared_importer_attribute(base, "environment")
-    if not folder:
+    if not folder or IS_INSTALLED:  # there it may be installed beside the project
         return ""
     python = _interpreter_path(ROOT / folder)
     if not python.exists():

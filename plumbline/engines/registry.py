@@ -7,6 +7,7 @@ from importlib import import_module
 from plumbline.engines.adapter import Adapter
 from plumbline.engines.answers import describe_value
 from plumbline.importers.importer import Importer
+from plumbline.layout import PREFIX
 from plumbline.model.datatypes import EngineFailure
 
 ENGINES = {
@@ -45,7 +46,7 @@ def load_adapter(name: str) -> Adapter:
 
     """
     module, _, class_name = ENGINES[name].partition(":")
-    found: type[Adapter] = getattr(import_module(module), class_name)
+    found: type[Adapter] = getattr(import_module(PREFIX + module), class_name)
     if not isinstance(found, type) or not issubclass(found, Adapter):
         raise EngineFailure(
             f"{ENGINES[name]} is {describe_value(found)}, must be a class derived from Adapter"
@@ -64,5 +65,5 @@ def load_importer(name: str) -> Importer:
 
     """
     module, _, class_name = IMPORTERS[name].partition(":")
-    found: type[Importer] = getattr(import_module(module), class_name)
+    found: type[Importer] = getattr(import_module(PREFIX + module), class_name)
     return found()

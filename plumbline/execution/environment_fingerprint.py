@@ -20,14 +20,16 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
+from plumbline.layout import IS_INSTALLED, ROOT
 from plumbline.processes.processor import processor_features
 from plumbline.processes.worker_environment import hashed_environment
 
-ROOT = Path(__file__).resolve().parents[2]
-_HASHED_PACKAGES = ("plumbline", "adapters", "reference_impl")
+_OWN_FOLDERS = (
+    [ROOT] if IS_INSTALLED else [ROOT / name for name in ("plumbline", "adapters", "reference_impl")]
+)
 # Tasks call functions of the packages below these; tests/architecture checks that those import none of them.
-_UNHASHED_PACKAGES = ("plumbline/cli", "plumbline/execution", "plumbline/storage", "plumbline/studies",
-                      "plumbline/judging/known_issues.yaml")  # fmt: skip
+_UNHASHED_PACKAGES = ("cli", "execution", "storage", "studies", "judging/known_issues.yaml",
+                      "reports", "scenarios", "bench")  # fmt: skip
 _UNIMPORTED_FOLDERS = {"tests", "reports", "bench", "tools"}  # of the checkout, by tasks
 # never read by an import; half of the files that are installed
 _SOURCES_OF_COMPILERS = (".hpp", ".hxx", ".ipp", ".h", ".c", ".cpp", ".f90", ".pxd", ".pyi", ".cmake")
@@ -64,9 +66,9 @@ def environment_fingerprint(python: str = "") -> str:
 
 
 def _project_files() -> Iterator[Path]:
-    for folder in _HASHED_PACKAGES:
-        for path in sorted((ROOT / folder).rglob("*")):
-            name = path.relative_to(ROOT).as_posix()
+    for folder in _OWN_FOLDERS:
+        for path in sorted(folder.rglob("*")):
+            name = path.relative_to(ROOT).as_posix().removeprefix("plumbline/")
             if "__pycache__" not in path.parts and not name.startswith(_UNHASHED_PACKAGES) and path.is_file():
                 yield path
 
@@ -115,8 +117,10 @@ def installed_files(folders: Iterable[Path]) -> set[_FileIdentity]:
 
 def _may_be_read(folder: str, entry: os.DirEntry[str]) -> bool:
     """Whether tasks may read a file or what is in a folder; this checkout has results besides its modules."""
+    if Path(entry.path) in _OWN_FOLDERS:  # hashed by content
+        return False
     if folder == str(ROOT):
-        if entry.name in (*_HASHED_PACKAGES, *_UNIMPORTED_FOLDERS):  # the former by content
+        if entry.name in _UNIMPORTED_FOLDERS:
             return False
         return Path(entry, "__init__.py").exists() or entry.name.endswith(tuple(all_suffixes()))
     return entry.name not in _UNREAD_FOLDERS and not entry.name.endswith(_SOURCES_OF_COMPILERS)

@@ -32,6 +32,7 @@ from plumbline.execution.scenario_verdicts import ScenarioRun, uncompared_kinds
 from plumbline.judging import known_issues
 from plumbline.judging.identity import RUN_SCENARIO, IdentityCheck
 from plumbline.judging.rows import RUN_FAMILY, Row, Verdict, is_declared
+from plumbline.layout import IS_INSTALLED
 from plumbline.processes.cpu_time import CpuTimes
 from plumbline.processes.processor import processor_name
 from plumbline.processes.worker_pool import (
@@ -407,9 +408,12 @@ def git_commit() -> str | None:
     """Find the commit of the checkout.
 
     Returns:
-        Its abbreviated hash or tag, with a + where files differ from it; None outside git.
+        Its abbreviated hash or tag, with a + where files differ from it; None outside git, and where the
+        project is installed: a repository around it is another one.
 
     """
+    if IS_INSTALLED:
+        return None
     try:
         done = subprocess.run(
             ["git", "describe", "--always", "--dirty=+", "--abbrev=12"],

@@ -41,7 +41,7 @@ from plumbline.model.sampling import compared_states
 from plumbline.processes.record_encoding import EncodedRecord
 from plumbline.processes.worker_pool import Outcome, Packed, Task
 from plumbline.scenario.loader import Scenario
-from plumbline.truth import ground_truth
+from plumbline.truth import ground_truth, has_independent_truth
 from plumbline.truth.closed_form import exact_samples
 from plumbline.truth.ground_truth import MotionTruth, StateTruth
 from plumbline.truth.proved_motion import find_proof
@@ -53,6 +53,7 @@ _LEVELS: dict[TaskKind, Level] = {
     TaskKind.TRAJECTORY: "trajectory",
     TaskKind.LONG_RUN: "invariants",
 }
+NO_INDEPENDENT_TRUTH = "no independent truth: python-flint is not installed, and the reference is no judge"
 NO_REGULAR_POSE = (
     "every pose that the loops allow is singular, as of a truss with its bars in one line: forces have no "
     "unique values"
@@ -223,7 +224,7 @@ class ScenarioRun:
         return found
 
     def judged_rows(self, found: JudgingResult, known: KnownIssues) -> list[Row]:
-        """Mark what is recorded, and where all engines stand against the truth.
+        """Mark what is recorded, where all engines stand against the truth, and what lacks a truth.
 
         Args:
             found: of `findings`.
@@ -236,9 +237,13 @@ class ScenarioRun:
         rows = known.mark_known(found.rows, model.n, inertia_ratio(model))
         families = {name: _family(name) for name in self._engines}
         is_certified = not isinstance(truth, StateTruth) or truth.is_certified
-        return outlier.doubt_truth(
+        rows = outlier.doubt_truth(
             rows, found.deviations, families, "" if is_certified else _family("reference")
         )
+        if is_certified and has_independent_truth():
+            return rows
+        doubt = {"verdict": Verdict.UNRESOLVED, "reason": NO_INDEPENDENT_TRUTH}
+        return [replace(row, **doubt) if row.verdict == Verdict.AGREES else row for row in rows]
 
     def on_outcome(self, outcome: Outcome) -> list[Task]:
         """Take the outcome of a task: keep a truth or what the judge found.

@@ -16,9 +16,9 @@ from glob import glob
 from pathlib import Path
 from typing import Any, NoReturn
 
+from plumbline.layout import ROOT
 from plumbline.processes.isolation import die_with_parent
 
-ROOT = Path(__file__).resolve().parents[2]
 TEST_FILE = "tests/execution/test_planted_defects.py"
 LISTS = ("tests/diagnosis/test_*.py", "tests/execution/test_planted_*.py")  # with the long forms
 NIGHTS = 7  # in so many nights every test of the lists has run

@@ -1,9 +1,8 @@
 """Calls made by a Python of another environment, for other versions of engines.
 
-A worker keeps one child process per environment, ``python -m plumbline.processes.remote_python``, and
-exchanges frames with it through its standard input and output: a length of 8 bytes, then a pickle. The child
-is killed when its worker exits and has the worker's limits; a crash of the child is reported as a crash of
-the worker.
+A worker keeps one child process per environment and exchanges frames with it through its standard input and
+output: a length of 8 bytes, then a pickle. The child is killed when its worker exits and has the worker's
+limits; a crash of the child is reported as a crash of the worker.
 """
 
 from __future__ import annotations
@@ -19,12 +18,23 @@ import time
 from collections.abc import Callable
 from functools import cache
 from importlib import import_module
-from pathlib import Path
 from typing import IO, Any
 
+from plumbline.layout import IS_INSTALLED, ROOT
 from plumbline.processes.exceptions import PlumblineError, describe_exception
 
-ROOT = Path(__file__).resolve().parents[2]
+# Starts the child. An installed `plumbline` is loaded by its path: the packages beside it, which are this
+# environment's, must not hide those of the other one.
+_START = """
+import importlib.util, sys
+folder, parent = sys.argv[1:]
+if folder:
+    spec = importlib.util.spec_from_file_location("plumbline", f"{folder}/__init__.py")
+    sys.modules["plumbline"] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(sys.modules["plumbline"])
+from plumbline.processes.remote_python import serve_parent
+serve_parent(int(parent))
+"""
 _FRAME_LENGTH = struct.Struct("<Q")
 
 
@@ -59,10 +69,12 @@ def _receive_frame(stream: IO[bytes]) -> Any:
 def _child_process(python: str) -> subprocess.Popen[bytes]:
     """The child of this process for an environment's interpreter, started at first use."""
     environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
+    folder = str(ROOT) if IS_INSTALLED else ""
+    if not IS_INSTALLED:
+        environment["PYTHONPATH"] = str(ROOT)
     process = subprocess.Popen(
-        [python, "-P", "-m", "plumbline.processes.remote_python", str(os.getpid())],
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
-        env={**environment, "PYTHONPATH": str(ROOT)},
+        [python, "-P", "-c", _START, folder, str(os.getpid())],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment,
     )  # fmt: skip
     atexit.register(process.kill)
     return process
@@ -135,8 +147,13 @@ def _accept_arrays_of_numpy_2() -> None:
         sys.modules["numpy._core.numeric"] = import_module("numpy.core.numeric")
 
 
-def _serve_calls(parent: int) -> None:
-    """Answer the calls of the parent.  Engines print: the pipe leaves descriptor 1 before any is loaded."""
+def serve_parent(parent: int) -> None:
+    """Answer the calls of the parent.  Engines print: the pipe leaves descriptor 1 before any is loaded.
+
+    Args:
+        parent: its process id; this process ends with it.
+
+    """
     from plumbline.processes.isolation import die_with_parent
 
     die_with_parent(parent)
@@ -158,7 +175,3 @@ def _serve_calls(parent: int) -> None:
         except BaseException as error:  # the engine's own failure
             answer = True, describe_exception(error)
         _send_frame(answers, answer)
-
-
-if __name__ == "__main__":
-    _serve_calls(int(sys.argv[1]))

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from plumbline.layout import ROOT
 from plumbline.model.datatypes import FREE, JOINT_ELEMENTS, KINDS, Array, Model, State
 from plumbline.model.kinematics import (
     own_rates,
@@ -65,7 +66,7 @@ __all__ = [
     "scenario_from_dict",
 ]
 
-CATALOGUE_FOLDER = Path(__file__).resolve().parents[2] / "scenarios"
+CATALOGUE_FOLDER = ROOT / "scenarios"
 LOOP_TOLERANCE = 1e-9  # of a loop's gap at t = 0 [m, rad], and of its rate over the largest speed
 MAX_MAGNITUDE = 1e30  # beyond it squares and products leave the range where engines can compute
 FAMILIES = ("single", "double", "chain", "joint", "tree", "loop", "classic")

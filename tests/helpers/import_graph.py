@@ -12,7 +12,7 @@ OUTSIDE = {  # packages beside the core, and what of the project each may import
     "reference_impl": ("reference_impl",),
     "adapters": (
         "adapters", "reference_impl", "plumbline.model", "plumbline.engines", "plumbline.processes",
-        "plumbline.importers.importer", "plumbline.importers.neutral_model",
+        "plumbline.importers.importer", "plumbline.importers.neutral_model", "plumbline.layout",
     ),
     "reports": (
         "reports", "plumbline.storage", "plumbline.judging.rows", "plumbline.model", "plumbline.processes",
