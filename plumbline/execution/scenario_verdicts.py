@@ -242,8 +242,12 @@ class ScenarioRun:
         )
         if is_certified and has_independent_truth():
             return rows
-        doubt = {"verdict": Verdict.UNRESOLVED, "reason": NO_INDEPENDENT_TRUTH}
-        return [replace(row, **doubt) if row.verdict == Verdict.AGREES else row for row in rows]
+        return [
+            replace(row, verdict=Verdict.UNRESOLVED, reason=NO_INDEPENDENT_TRUTH)
+            if row.verdict == Verdict.AGREES
+            else row
+            for row in rows
+        ]
 
     def on_outcome(self, outcome: Outcome) -> list[Task]:
         """Take the outcome of a task: keep a truth or what the judge found.

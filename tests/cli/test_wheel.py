@@ -110,7 +110,9 @@ def test_two_lines_in_an_empty_environment_lead_to_a_verdict(wheel, tmp_path):
     assert size <= MAX_INSTALLED_BYTES
     assert {path.name for path in folder.iterdir()} == {"plumbline-out"}
     words += ["--engine", "mujoco@3.13.0", "--json"]
-    done = subprocess.run(words, cwd=folder, capture_output=True, text=True, check=False)
+    beside = f"{os.environ['PATH']}{os.pathsep}{Path(sys.prefix).resolve().parent / '.uv/bin'}"
+    variables = os.environ | {"PATH": beside}  # uv, as make puts it
+    done = subprocess.run(words, cwd=folder, capture_output=True, text=True, env=variables, check=False)
     assert json.loads(done.stdout)["run"]["versions"] == {"mujoco@3.13.0": "3.13.0"}
 
 
