@@ -17,8 +17,7 @@ A URDF's root link is free in Drake; with a fixed base it is welded to the world
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -28,83 +27,27 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, MultibodyForces
 
 from adapters.importer_common import (
+    LayoutWithOwnVelocities,
     LoadingImporter,
     Refused,
-    free_joint_name,
+    depth_first,
     joint_from_screw,
+    make_body,
     make_joint,
     merge_made_up_bodies,
-    pose,
-    quaternion_of,
-    to_canonical,
 )
 from plumbline.importers.importer import ModelFile
-from plumbline.importers.neutral_model import (
-    CanonicalState,
-    ElementaryJoint,
-    ModelQuantities,
-    NeutralBody,
-    NeutralModel,
-)
+from plumbline.importers.neutral_model import ElementaryJoint, ModelQuantities, NeutralBody
 from plumbline.model.datatypes import Array
 from plumbline.model.kinematics import rotation_matrix
 
 
-class DrakeImporter(LoadingImporter):
-    """Drake's URDF and MJCF parsers."""
-
-    name = "drake"
-    title = "Drake"
-    package = "drake"
-    supported_versions = ">=1.32,<2"  # earlier ones need NumPy 1, and have other signatures
-    formats = ("urdf", "mjcf")
-    environment = ".importers"
-
-    def _load(self, file: ModelFile) -> Any:
-        try:
-            return _parsed(file)
-        except RuntimeError as error:
-            raise Refused(str(error)) from None
-
-    def _describe(self, loaded: Any, file: ModelFile) -> NeutralModel:
-        gravity = np.array(loaded.gravity_field().gravity_vector())
-        return NeutralModel("", _Layout(loaded, file).bodies, gravity)
-
-    def _evaluate(
-        self, loaded: Any, file: ModelFile, states: Sequence[CanonicalState]
-    ) -> list[ModelQuantities]:
-        layout = _Layout(loaded, file)
-        return [layout.quantities(state) for state in states]
-
-
-def _parsed(file: ModelFile) -> Any:
-    plant = MultibodyPlant(0.0)
-    Parser(plant).AddModels(file.path)
-    if file.format == "urdf" and file.base == "fixed":
-        children = {plant.get_joint(j).child_body().index() for j in plant.GetJointIndices()}
-        for index in range(1, plant.num_bodies()):
-            if BodyIndex(index) not in children:
-                plant.WeldFrames(plant.world_frame(), plant.get_body(BodyIndex(index)).body_frame())
-    plant.Finalize()
-    return plant
-
-
-@dataclass(frozen=True, eq=False)
-class _Place:
-    """Where a joint's coordinates are in Drake's vectors and in the canonical ones."""
-
-    joint: ElementaryJoint
-    drake: Any
-    R_M: Array  # (3, 3) body axes → axes of the frame M
-    q: slice
-    v: slice
-
-
-class _Layout:
-    """A plant with the order of its bodies and joints in the reading."""
+class _Layout(LayoutWithOwnVelocities):
+    """A plant; a joint's own: Drake's joint, R_M (body axes → axes of the frame M), and places in q."""
 
     def __init__(self, plant: Any, file: ModelFile) -> None:
-        self.plant, self.context, self.file = plant, plant.CreateDefaultContext(), file
+        self.plant, self.context = plant, plant.CreateDefaultContext()
+        self.q = plant.GetPositions(self.context)
         joints = [plant.get_joint(j) for j in plant.GetJointIndices()]
         self.parent_joint = {joint.child_body().index(): joint for joint in joints}
         self.rotor_inertia: dict[str, float] = {}
@@ -113,83 +56,84 @@ class _Layout:
             inertia = rotor.default_rotor_inertia() * rotor.default_gear_ratio() ** 2
             name = rotor.joint().name()
             self.rotor_inertia[name] = self.rotor_inertia.get(name, 0.0) + inertia
-        self.places: list[_Place] = []
-        self.order: list[Any] = []
-        self._collect(plant.world_body().index())
-        position = {index: k for k, index in enumerate(self.order)}
-        bodies = [self._body(index, position) for index in self.order]
-        self.bodies = tuple(merge_made_up_bodies(bodies, file))
+        world = plant.world_body().index()
+        self.order = list(depth_first(self._children(world), self._children))
+        super().__init__(plant, file)
 
-    def _collect(self, parent: Any) -> None:
-        """Order the bodies depth first, in Drake's order among siblings."""
-        for index, joint in sorted(self.parent_joint.items(), key=lambda item: int(item[0])):
-            if joint.parent_body().index() == parent:
-                self.order.append(index)
-                self._collect(index)
+    def _children(self, parent: Any) -> list[Any]:
+        """Return the bodies on a body, in Drake's order."""
+        joints = sorted(self.parent_joint.items(), key=lambda item: int(item[0]))
+        return [index for index, joint in joints if joint.parent_body().index() == parent]
+
+    def _gravity(self) -> Any:
+        return self.plant.gravity_field().gravity_vector()
+
+    def _bodies(self) -> list[NeutralBody]:
+        position = {index: k for k, index in enumerate(self.order)}
+        return merge_made_up_bodies([self._body(index, position) for index in self.order], self.file)
 
     def _body(self, index: Any, position: dict[Any, int]) -> NeutralBody:
         body, joint = self.plant.get_body(index), self.parent_joint[index]
         X_PF = joint.frame_on_parent().GetFixedPoseInBodyFrame()
         X_MB = joint.frame_on_child().GetFixedPoseInBodyFrame().inverse()
         X_FM = joint.X_FM() if joint.type_name() == "weld" else RigidTransform()
-        zero = X_PF.multiply(X_FM).multiply(X_MB)
+        zero = X_PF.multiply(X_FM).multiply(X_MB).GetAsMatrix34()
         spatial = body.default_spatial_inertia()
         center = np.array(spatial.get_com())
         about_center = spatial.Shift(center).CalcRotationalInertia().CopyToFullMatrix3()
-        return NeutralBody(
-            body.name(),
-            position.get(joint.parent_body().index(), -1),
-            np.array(zero.translation()),
-            quaternion_of(zero.rotation().matrix()),
-            self._joints(joint, body),
-            float(body.default_mass()),
-            center,
-            np.array(about_center),
-        )
+        parent = position.get(joint.parent_body().index(), -1)
+        joints = self._joints(joint, body)
+        return make_body(body.name(), parent, zero, joints, body.default_mass(), center, about_center)
 
-    def _joints(self, joint: Any, body: Any) -> tuple[ElementaryJoint, ...]:
+    def _joints(self, joint: Any, body: Any) -> Iterator[ElementaryJoint]:
         X_BM = joint.frame_on_child().GetFixedPoseInBodyFrame()
-        R, anchor, kind = X_BM.rotation().matrix(), np.array(X_BM.translation()), joint.type_name()
+        R, anchor = X_BM.rotation().matrix(), X_BM.translation()
+        name, kind = joint.name(), joint.type_name()
         if kind == "weld":
-            return ()
+            return
+        damping = joint.default_damping_vector()[0]
+        numbers = {"armature": self.rotor_inertia.get(name, 0.0), "damping": damping}
         if kind == "revolute":
-            found = make_joint(joint.name(), "hinge", R @ joint.revolute_axis(), anchor)
+            yield make_joint(name, "hinge", R @ joint.revolute_axis(), anchor, **numbers)
         elif kind == "prismatic":
-            found = joint_from_screw(joint.name(), np.zeros(3), R @ joint.translation_axis())
+            yield joint_from_screw(name, np.zeros(3), R @ joint.translation_axis(), **numbers)
         elif kind == "ball_rpy":
-            found = make_joint(joint.name(), "ball", anchor=anchor)
+            yield make_joint(name, "ball", anchor=anchor, **numbers)
         elif kind == "quaternion_floating" and joint.parent_body() is self.plant.world_body():
-            found = make_joint(free_joint_name(body.name(), self.file), "free")
+            yield self._free_joint(body.name(), **numbers)
         else:
             raise NotImplementedError(f"a joint of type {kind}")
-        armature = self.rotor_inertia.get(joint.name(), 0.0)
-        damping = float(joint.default_damping_vector()[0])
-        found = replace(found, armature=armature, damping=damping)
         q, v = joint.position_start(), joint.velocity_start()
-        slices = slice(q, q + joint.num_positions()), slice(v, v + joint.num_velocities())
-        self.places.append(_Place(found, joint, R.T, *slices))
-        return (found,)
+        own = joint, R.T, slice(q, q + joint.num_positions())
+        self.places.append((own, slice(v, v + joint.num_velocities())))
 
-    def quantities(self, state: CanonicalState) -> ModelQuantities:
-        """Evaluate Drake's routines at one state."""
+    def _move(self, joint: ElementaryJoint, own: Any, x: Array, v: Array) -> tuple[Any, Any]:
+        _, R_M, at = own
+        q, block = x, np.eye(len(v))
+        if joint.kind == "ball":
+            R_FM = R_M @ rotation_matrix(x) @ R_M.T
+            q, block = RollPitchYaw(RotationMatrix(R_FM)).vector(), R_FM @ R_M
+        elif joint.kind == "free":
+            q, block = np.concatenate([x[3:], x[:3]]), np.zeros((6, 6))
+            block[:3, 3:], block[3:, :3] = rotation_matrix(x[3:]), np.eye(3)
+        self.q[at] = q
+        return block, 0.0
+
+    def _engine_quantities(self, v: Array) -> ModelQuantities:
         plant, context = self.plant, self.context
-        v, T = self._set_state(state)
+        plant.SetPositions(context, self.q)
+        plant.SetVelocities(context, v)
         M = np.array(plant.CalcMassMatrix(context))
         gravity = np.array(plant.CalcGravityGeneralizedForces(context))
         coriolis = np.array(plant.CalcBiasTerm(context))
-        accelerations = self._accelerations()
-        poses = {}
-        for index in self.order:
-            body = plant.get_body(index)
-            X = plant.EvalBodyPoseInWorld(context, body)
-            poses[body.name()] = pose(X.rotation().matrix(), X.translation())
+        bodies = [plant.get_body(index) for index in self.order]
+        poses = {b.name(): plant.EvalBodyPoseInWorld(context, b).GetAsMatrix34() for b in bodies}
         has_springs = plant.num_force_elements() > 1  # besides gravity
-        engine = ModelQuantities(
+        return ModelQuantities(
             poses, M, coriolis - gravity, -gravity, self._passive_force(coriolis, gravity),
-            accelerations, float(plant.CalcKineticEnergy(context)),
+            self._accelerations(), float(plant.CalcKineticEnergy(context)),
             None if has_springs else float(plant.CalcPotentialEnergy(context)),
         )  # fmt: skip
-        return to_canonical(engine, T, np.zeros(len(v)))
 
     def _accelerations(self) -> Array | None:
         """Where the mass matrix is singular, Drake raises: there is no acceleration."""
@@ -213,33 +157,32 @@ class _Layout:
             elements = np.zeros(plant.num_velocities())
         damping = MultibodyForces(plant)
         damping.SetZero()
-        for place in self.places:
-            place.drake.AddInDamping(context, damping)
+        for (joint, _, _), _ in self.places:
+            joint.AddInDamping(context, damping)
         return np.asarray(elements + np.array(damping.generalized_forces()), float)
 
-    def _set_state(self, state: CanonicalState) -> tuple[Array, Array]:
-        """Set q and v by the equations of the module's docstring; return v and T."""
-        plant = self.plant
-        q, n = plant.GetPositions(self.context), plant.num_velocities()
-        T = np.zeros((n, n))
-        x = rate = 0
-        for place in self.places:
-            kind, width = place.joint.kind, place.q.stop - place.q.start
-            size = place.v.stop - place.v.start
-            own = state.coordinates[x : x + (4 if kind == "ball" else width)]
-            block = np.eye(size)
-            if kind == "ball":
-                R_FM = place.R_M @ rotation_matrix(own) @ place.R_M.T
-                q[place.q] = RollPitchYaw(RotationMatrix(R_FM)).vector()
-                block = R_FM @ place.R_M
-            elif kind == "free":
-                q[place.q] = np.concatenate([own[3:], own[:3]])
-                block = np.zeros((6, 6))
-                block[:3, 3:], block[3:, :3] = rotation_matrix(own[3:]), np.eye(3)
-            else:
-                q[place.q] = own
-            T[place.v, rate : rate + size] = block
-            x, rate = x + len(own), rate + size
-        plant.SetPositions(self.context, q)
-        plant.SetVelocities(self.context, T @ state.velocities)
-        return np.asarray(T @ state.velocities), T
+
+class DrakeImporter(LoadingImporter):
+    """Drake's URDF and MJCF parsers."""
+
+    name = "drake"
+    title = "Drake"
+    package = "drake"
+    supported_versions = ">=1.32,<2"  # earlier ones need NumPy 1, and have other signatures
+    formats = ("urdf", "mjcf")
+    environment = ".importers"
+    layout = _Layout
+
+    def _load(self, file: ModelFile) -> Any:
+        plant = MultibodyPlant(0.0)
+        try:
+            Parser(plant).AddModels(file.path)
+            if file.format == "urdf" and file.base == "fixed":
+                children = {plant.get_joint(j).child_body().index() for j in plant.GetJointIndices()}
+                for index in range(1, plant.num_bodies()):
+                    if BodyIndex(index) not in children:
+                        plant.WeldFrames(plant.world_frame(), plant.get_body(BodyIndex(index)).body_frame())
+            plant.Finalize()
+        except RuntimeError as error:
+            raise Refused(str(error)) from None
+        return plant

@@ -16,8 +16,8 @@ loader has an environment of its own.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterator
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -27,9 +27,9 @@ import exudyn.robotics.utilities as loader_module
 import numpy as np
 
 from adapters.exudyn_common import initialized_solver, mass_matrix_and_force
-from adapters.importer_common import LoadingImporter, Refused, joint_from_screw, pose, quaternion_of
+from adapters.importer_common import Layout, LoadingImporter, Refused, joint_from_screw, make_body, pose
 from plumbline.importers.importer import ModelFile
-from plumbline.importers.neutral_model import CanonicalState, ModelQuantities, NeutralBody, NeutralModel
+from plumbline.importers.neutral_model import CanonicalState, ModelQuantities, NeutralBody
 from plumbline.model.datatypes import Array
 
 exudyn: Any = exudyn_module  # the stubs of these modules lack types and attributes
@@ -37,6 +37,65 @@ robotics: Any = robotics_module
 loader: Any = loader_module
 GRAVITY = (0.0, 0.0, -9.81)  # m/s²: the caller of the loader sets it
 AXES = {"x": np.eye(3)[0], "y": np.eye(3)[1], "z": np.eye(3)[2]}
+
+
+class _Layout(Layout):
+    """A kinematic tree of the links, in the loader's order; T is 1."""
+
+    def _gravity(self) -> Any:
+        return GRAVITY
+
+    def _bodies(self) -> Iterator[NeutralBody]:
+        for link in self.loaded:
+            kind, axis = link["jointType"][0], AXES[link["jointType"][1]]
+            turning, shift = (axis, np.zeros(3)) if kind == "R" else (np.zeros(3), axis)
+            joint = joint_from_screw(link["joint"], turning, shift, damping=link["motorViscousFriction"])
+            yield make_body(
+                link["name"], link["parent"], np.array(link["preHT"], float), [joint],
+                link["mass"], link["com"], link["inertiaCOM"],
+            )  # fmt: skip
+
+    @cached_property
+    def robot(self) -> Any:
+        robot = robotics.Robot(gravity=list(GRAVITY), referenceConfiguration=[0.0] * len(self.loaded))
+        for link in self.loaded:
+            robot.AddLink(
+                robotics.RobotLink(
+                    mass=link["mass"], COM=link["com"], inertia=link["inertiaCOM"],
+                    preHT=link["preHT"], jointType=link["jointType"], parent=link["parent"],
+                )
+            )  # fmt: skip
+        return robot
+
+    @cached_property
+    def system(self) -> Any:
+        system = exudyn.SystemContainer().AddSystem()
+        self.robot.CreateKinematicTree(system)
+        system.Assemble()
+        return system
+
+    def _mass_and_bias(self, q: Array, v: Array) -> tuple[Array, Array]:
+        initial = exudyn.ConfigurationType.Initial
+        self.system.systemData.SetODE2Coordinates(q.tolist(), initial)
+        self.system.systemData.SetODE2Coordinates_t(v.tolist(), initial)
+        settings, solver = exudyn.SimulationSettings(), exudyn.MainSolverImplicitSecondOrder()
+        settings.timeIntegration.verboseMode = 0
+        settings.solutionSettings.writeSolutionToFile = False
+        settings.timeIntegration.generalizedAlpha.computeInitialAccelerations = False
+        with initialized_solver(solver, self.system, settings):
+            M, force = mass_matrix_and_force(solver, self.system)
+        return M, -force
+
+    def quantities(self, state: CanonicalState) -> ModelQuantities:
+        """Evaluate Exudyn's routines at one state."""
+        if not self.loaded:
+            return ModelQuantities({})
+        q, v = state.coordinates, state.velocities
+        M, bias = self._mass_and_bias(q, v)
+        gravity = self._mass_and_bias(q, np.zeros(len(v)))[1]
+        frames = zip(self.loaded, self.robot.JointHT(list(q)), strict=True)
+        poses = {link["name"]: pose(np.array(H.rotation), np.array(H.translation)) for link, H in frames}
+        return ModelQuantities(poses, M, bias, gravity)
 
 
 class ExudynImporter(LoadingImporter):
@@ -60,6 +119,7 @@ class ExudynImporter(LoadingImporter):
         "kinetic_energy": "a kinematic tree does not return its energies",
         "potential_energy": "a kinematic tree does not return its energies",
     }
+    layout = _Layout
 
     def _load(self, file: ModelFile) -> Any:
         if file.base == "free":
@@ -68,17 +128,6 @@ class ExudynImporter(LoadingImporter):
             return _loaded(file)
         except Exception as error:  # of the loader, the toolbox or the parser
             raise Refused(f"{type(error).__name__}: {error}") from None
-
-    def _describe(self, loaded: Any, file: ModelFile) -> NeutralModel:
-        return NeutralModel("", tuple(_body(link, loaded) for link in loaded), np.array(GRAVITY))
-
-    def _evaluate(
-        self, loaded: Any, file: ModelFile, states: Sequence[CanonicalState]
-    ) -> list[ModelQuantities]:
-        if not loaded:
-            return [ModelQuantities({}) for _ in states]
-        tree = _Tree(loaded)
-        return [tree.quantities(state) for state in states]
 
 
 def _loaded(file: ModelFile) -> list[dict[str, Any]]:
@@ -97,55 +146,3 @@ def _loaded(file: ModelFile) -> list[dict[str, Any]]:
 def _joint_name(urdf: Any, link: str) -> str:
     """The loader returns names of links only: a joint is named after its child in the toolbox's file."""
     return next((str(joint.name) for joint in urdf.joints if joint.child == link), link)
-
-
-def _body(link: dict[str, Any], links: list[dict[str, Any]]) -> NeutralBody:
-    kind, axis = link["jointType"][0], AXES[link["jointType"][1]]
-    turning, shift = (axis, np.zeros(3)) if kind == "R" else (np.zeros(3), axis)
-    placement = np.array(link["preHT"], float)
-    joint = joint_from_screw(link["joint"], turning, shift)
-    return NeutralBody(
-        link["name"], link["parent"], placement[:3, 3].copy(), quaternion_of(placement[:3, :3]),
-        (replace(joint, damping=float(link["motorViscousFriction"])),), float(link["mass"]),
-        np.array(link["com"], float), np.array(link["inertiaCOM"], float),
-    )  # fmt: skip
-
-
-class _Tree:
-    """A kinematic tree of the links, in the loader's order."""
-
-    def __init__(self, links: list[dict[str, Any]]) -> None:
-        self.names = [link["name"] for link in links]
-        self.robot = robotics.Robot(gravity=list(GRAVITY), referenceConfiguration=[0.0] * len(links))
-        for link in links:
-            self.robot.AddLink(
-                robotics.RobotLink(
-                    mass=link["mass"], COM=link["com"], inertia=link["inertiaCOM"],
-                    preHT=link["preHT"], jointType=link["jointType"], parent=link["parent"],
-                )
-            )  # fmt: skip
-        self.system = exudyn.SystemContainer().AddSystem()
-        self.robot.CreateKinematicTree(self.system)
-        self.system.Assemble()
-        self.settings = exudyn.SimulationSettings()
-        self.settings.timeIntegration.verboseMode = 0
-        self.settings.solutionSettings.writeSolutionToFile = False
-        self.settings.timeIntegration.generalizedAlpha.computeInitialAccelerations = False
-
-    def _mass_and_bias(self, q: Array, v: Array) -> tuple[Array, Array]:
-        initial = exudyn.ConfigurationType.Initial
-        self.system.systemData.SetODE2Coordinates(q.tolist(), initial)
-        self.system.systemData.SetODE2Coordinates_t(v.tolist(), initial)
-        solver = exudyn.MainSolverImplicitSecondOrder()
-        with initialized_solver(solver, self.system, self.settings):
-            M, force = mass_matrix_and_force(solver, self.system)
-        return M, -force
-
-    def quantities(self, state: CanonicalState) -> ModelQuantities:
-        """Evaluate Exudyn's routines at one state."""
-        q, v = state.coordinates, state.velocities
-        M, bias = self._mass_and_bias(q, v)
-        gravity = self._mass_and_bias(q, np.zeros(len(v)))[1]
-        frames = zip(self.names, self.robot.JointHT(list(q)), strict=True)
-        poses = {name: pose(np.array(H.rotation), np.array(H.translation)) for name, H in frames}
-        return ModelQuantities(poses, M, bias, gravity)

@@ -6,12 +6,12 @@ import os
 import re
 import tempfile
 import xml.etree.ElementTree as ElementTree
-from abc import abstractmethod
-from collections.abc import Iterator, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from importlib import metadata
-from typing import Any
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from plumbline.model.datatypes import Array
 from plumbline.model.kinematics import quaternion_product, rotation_matrix
 
 MAX_WARNINGS = 20
+Node = TypeVar("Node")
 _COLOURS = re.compile(r"\x1b\[[0-9;]*m")
 _ROTATION_EPSILON = 1e-12  # |ω| of a unit screw below which the motion is a displacement
 
@@ -62,12 +63,13 @@ def to_canonical(quantities: ModelQuantities, T: Array, Tdot_v: Array) -> ModelQ
     )
 
 
-def joint_from_screw(name: str, angular: Array, linear: Array) -> ElementaryJoint:
+def joint_from_screw(name: str, angular: Array, linear: Array, **numbers: float) -> ElementaryJoint:
     """Describe a joint of one degree of freedom by its motion at the reference.
 
     Args:
         angular: angular velocity (3,) of the body at unit rate, body axes.
         linear: velocity (3,) of the body frame's origin at unit rate, body axes [m].
+        **numbers: armature, damping and the like.
 
     Returns:
         A hinge through the point of its axis that is next to the body frame's origin, or a slide.
@@ -75,25 +77,47 @@ def joint_from_screw(name: str, angular: Array, linear: Array) -> ElementaryJoin
     """
     size = float(np.linalg.norm(angular))
     if size > _ROTATION_EPSILON:
-        return make_joint(name, "hinge", angular / size, np.cross(angular, linear) / size**2)
-    return make_joint(name, "slide", linear / np.linalg.norm(linear))
+        return make_joint(name, "hinge", angular / size, np.cross(angular, linear) / size**2, **numbers)
+    return make_joint(name, "slide", linear / np.linalg.norm(linear), **numbers)
 
 
 def make_joint(
-    name: str, kind: JointKind, axis: Array | None = None, anchor: Array | None = None
+    name: str, kind: JointKind, axis: Any = (0, 0, 0), anchor: Any = (0, 0, 0), **numbers: float
 ) -> ElementaryJoint:
-    """Make a joint without passive forces.
+    """Make a joint with arrays of its own.
 
     Args:
-        axis: unit vector (3,), body frame; zero where None.
-        anchor: point (3,) [m], body frame; zero where None.
-
-    Returns:
-        The joint, with arrays of its own.
+        axis: unit vector (3,), body frame.
+        anchor: point (3,) [m], body frame.
+        **numbers: armature, damping and the like.
 
     """
-    along, point = (np.zeros(3) if x is None else np.array(x, float) for x in (axis, anchor))
-    return ElementaryJoint(name, kind, along, point)
+    given: dict[str, Any] = {field: float(value) for field, value in numbers.items()}
+    return ElementaryJoint(name, kind, np.array(axis, float), np.array(anchor, float), **given)
+
+
+def make_body(
+    name: str, parent: int, X: Array, joints: Iterable[ElementaryJoint], mass: Any, center: Any, inertia: Any
+) -> NeutralBody:
+    """Make a body with arrays of its own.
+
+    Args:
+        X: pose (3, 4) or (4, 4) in the parent, where the joints are at their reference.
+        center: centre of mass (3,) [m], body frame.
+        inertia: about the centre of mass (3, 3) [kg m²], body axes.
+
+    """
+    position, center, inertia = (np.array(x, float) for x in (X[:3, 3], center, inertia))
+    attitude = quaternion_of(X[:3, :3])
+    return NeutralBody(name, parent, position, attitude, tuple(joints), float(mass), center, inertia)
+
+
+def depth_first(roots: Iterable[Node], children: Callable[[Node], Iterable[Node]]) -> Iterator[Node]:
+    """Go through trees: a parent first, then each of its children with all that is below it."""
+    pending = list(roots)[::-1]
+    while pending:
+        yield (node := pending.pop())
+        pending += list(children(node))[::-1]
 
 
 def pose(rotation: Array, origin: Array) -> Array:
@@ -224,25 +248,68 @@ class Refused(Exception):
     """An engine does not load a file; the message has its words, or is empty where it only printed them."""
 
 
+class Layout(ABC):
+    """What an engine made of a file, in the order of the reading: its bodies, and its routines at a state."""
+
+    name = ""  # of the model, where the engine keeps it
+
+    def __init__(self, loaded: Any, file: ModelFile) -> None:
+        """Describe the engine's object; raises NotImplementedError with what the column does not know."""
+        self.loaded, self.file = loaded, file
+        self.model = NeutralModel(self.name, tuple(self._bodies()), np.array(self._gravity(), float))
+
+    @abstractmethod
+    def _bodies(self) -> Iterable[NeutralBody]:
+        """Describe the bodies, depth first."""
+
+    @abstractmethod
+    def _gravity(self) -> Any:
+        """Return the gravity (3,) [m/s²]."""
+
+    @abstractmethod
+    def quantities(self, state: CanonicalState) -> ModelQuantities:
+        """Compute the quantities with the engine's own routines."""
+
+    def _free_joint(self, body: str, **numbers: float) -> ElementaryJoint:
+        return make_joint(free_joint_name(body, self.file), "free", **numbers)
+
+
+class LayoutWithOwnVelocities(Layout):
+    """A layout of an engine whose velocities are others than the canonical ones: v_e = T v."""
+
+    def __init__(self, loaded: Any, file: ModelFile) -> None:
+        """Describe the engine's object and note where its joints are."""
+        self.places: list[tuple[Any, Any]] = []  # of each joint: the engine's own, and indices of velocities
+        super().__init__(loaded, file)
+
+    def quantities(self, state: CanonicalState) -> ModelQuantities:
+        """Move the joints, compute in the engine's velocities and transform to canonical ones."""
+        n = len(state.velocities)
+        T, Tdot_v = np.zeros((n, n)), np.zeros(n)
+        for (own, rows), (joint, x, v) in zip(self.places, self.model.joint_slices(), strict=True):
+            T[rows, v], Tdot_v[rows] = self._move(joint, own, state.coordinates[x], state.velocities[v])
+        return to_canonical(self._engine_quantities(T @ state.velocities), T, Tdot_v)
+
+    @abstractmethod
+    def _move(self, joint: ElementaryJoint, own: Any, x: Array, v: Array) -> tuple[Any, Any]:
+        """Set a joint's coordinates in the engine; return its block of T and its part of Ṫv."""
+
+    @abstractmethod
+    def _engine_quantities(self, v: Array) -> ModelQuantities:
+        """Compute the quantities at the engine's velocities, in these velocities."""
+
+
 class LoadingImporter(Importer):
-    """An importer whose engine loads a file into an object, which is described and evaluated."""
+    """An importer whose engine loads a file into an object, which a layout describes and evaluates."""
+
+    layout: ClassVar[type[Layout]]
 
     def version(self) -> str:
-        """Return the version of the engine.
-
-        Returns:
-            As the metadata of its wheel have it.
-
-        """
+        """Return the version of the engine, as the metadata of its wheel have it."""
         return metadata.version(self.package)
 
     def read(self, file: ModelFile) -> Reading:
-        """Load a file and describe what the engine made of it.
-
-        Returns:
-            The description, or the engine's refusal.
-
-        """
+        """Load a file; return the description of what the engine made of it, or the engine's refusal."""
         refusal = None
         with captured_output() as printed:
             try:
@@ -252,38 +319,20 @@ class LoadingImporter(Importer):
         if refusal is not None:
             return Reading(self.version(), refusal=self._refusal_words(refusal, printed))
         try:
-            model = self._describe(loaded, file)
+            model = self.layout(loaded, file).model
         except NotImplementedError as kind:
             return Reading(self.version(), refusal=f"this column does not describe {kind}")
         return Reading(self.version(), model, warnings=tuple(printed))
 
     def evaluate(self, file: ModelFile, states: Sequence[CanonicalState]) -> list[ModelQuantities]:
-        """Compute the quantities with the engine's own routines.
-
-        Args:
-            file: a file that `read` accepts.
-            states: canonical states of the model that `read` returned.
-
-        Returns:
-            One record per state.
-
-        """
+        """Compute the quantities with the engine's own routines, at states of what `read` returned."""
         with captured_output():
-            return self._evaluate(self._load(file), file, states)
+            layout = self.layout(self._load(file), file)
+            return [layout.quantities(state) for state in states]
 
     @abstractmethod
     def _load(self, file: ModelFile) -> Any:
         """Load a file; raise `Refused` with the engine's words."""
-
-    @abstractmethod
-    def _describe(self, loaded: Any, file: ModelFile) -> NeutralModel:
-        """Describe the engine's object; raise NotImplementedError with what the column does not know."""
-
-    @abstractmethod
-    def _evaluate(
-        self, loaded: Any, file: ModelFile, states: Sequence[CanonicalState]
-    ) -> list[ModelQuantities]:
-        """Compute the quantities at each state."""
 
     def _refusal_words(self, refusal: str, printed: Sequence[str]) -> str:
         return refusal or " ".join(printed)

@@ -18,12 +18,13 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import cached_property
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from adapters.importer_common import LoadingImporter, Refused, free_joint_name, pose
+from adapters.importer_common import Layout, LoadingImporter, Refused, free_joint_name, make_joint, pose
 from plumbline.importers.importer import ModelFile
 from plumbline.importers.neutral_model import (
     CanonicalState,
@@ -31,7 +32,6 @@ from plumbline.importers.neutral_model import (
     JointKind,
     ModelQuantities,
     NeutralBody,
-    NeutralModel,
 )
 from plumbline.model.datatypes import Array
 from plumbline.model.kinematics import rotation_matrix
@@ -47,6 +47,48 @@ NOT_COMPARED = (  # arrays of a compiled model whose features are not compared
 )  # fmt: skip
 
 
+class _Layout(Layout):
+    """A compiled model; T is 1."""
+
+    def __init__(self, model: Any, file: ModelFile) -> None:
+        self.m, self.name = model, bytes(model.names).split(b"\0", 1)[0].decode(errors="replace")
+        super().__init__(model, file)
+
+    @cached_property
+    def d(self) -> Any:
+        _switch_off(self.m)
+        return mujoco.MjData(self.m)
+
+    def _gravity(self) -> Any:
+        is_weightless = self.m.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY
+        return np.zeros(3) if is_weightless else self.m.opt.gravity
+
+    def _bodies(self) -> Iterator[NeutralBody]:
+        return (_body(self.m, i) for i in range(1, self.m.nbody))
+
+    def quantities(self, state: CanonicalState) -> ModelQuantities:
+        m, d = self.m, self.d
+        mujoco.mj_resetData(m, d)
+        d.qpos[:] = state.coordinates
+        mujoco.mj_forward(m, d)
+        gravity_force = np.array(d.qfrc_bias)
+        d.qvel[:] = state.velocities
+        mujoco.mj_forward(m, d)
+        bodies = enumerate(self.model.bodies, start=1)
+        poses = {body.name: pose(d.xmat[i].reshape(3, 3), d.xpos[i]) for i, body in bodies}
+        mujoco.mj_energyVel(m, d)
+        return ModelQuantities(
+            poses=poses,
+            mass_matrix=_full_mass_matrix(m, d),
+            bias_force=np.array(d.qfrc_bias),
+            gravity_force=gravity_force,
+            passive_force=np.array(d.qfrc_passive),
+            acceleration=np.array(d.qacc_smooth),
+            kinetic_energy=float(d.energy[1]),
+            potential_energy=_gravity_potential(m, d),
+        )
+
+
 class MujocoImporter(LoadingImporter):
     """MuJoCo's URDF and MJCF compiler."""
 
@@ -55,6 +97,7 @@ class MujocoImporter(LoadingImporter):
     package = "mujoco"
     formats = ("urdf", "mjcf")
     supported_versions = ">=3.2,<5"
+    layout = _Layout
 
     def _load(self, file: ModelFile) -> Any:
         with _printed_warnings():
@@ -63,19 +106,10 @@ class MujocoImporter(LoadingImporter):
             except ValueError as error:
                 raise Refused(str(error)) from None
 
-    def _describe(self, loaded: Any, file: ModelFile) -> NeutralModel:
-        bodies = tuple(_body(loaded, i) for i in range(1, loaded.nbody))
-        is_weightless = loaded.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY
-        gravity = np.zeros(3) if is_weightless else np.array(loaded.opt.gravity)
-        return NeutralModel(_model_name(loaded), bodies, gravity)
-
-    def _evaluate(
-        self, loaded: Any, file: ModelFile, states: Sequence[CanonicalState]
-    ) -> list[ModelQuantities]:
+    def evaluate(self, file: ModelFile, states: Sequence[CanonicalState]) -> list[ModelQuantities]:
+        """Compute the quantities, with MuJoCo's warnings printed."""
         with _printed_warnings():
-            _switch_off(loaded)
-            d = mujoco.MjData(loaded)
-            return [_quantities(loaded, d, state) for state in states]
+            return super().evaluate(file, states)
 
 
 @contextmanager
@@ -112,10 +146,6 @@ def _switch_off(m: Any) -> None:
     m.opt.disableflags |= disabled.mjDSBL_ACTUATION | disabled.mjDSBL_CONTACT | disabled.mjDSBL_CONSTRAINT
 
 
-def _model_name(m: Any) -> str:
-    return bytes(m.names).split(b"\0", 1)[0].decode(errors="replace")
-
-
 def _body(m: Any, i: int) -> NeutralBody:
     start = m.body_jntadr[i]
     name = m.body(i).name or f"body{i}"
@@ -135,40 +165,17 @@ def _body(m: Any, i: int) -> NeutralBody:
 def _joint(m: Any, j: int, body: str) -> ElementaryJoint:
     kind, dof, q = KINDS[int(m.jnt_type[j])], m.jnt_dofadr[j], m.jnt_qposadr[j]
     is_scalar = kind in ("hinge", "slide")
-    return ElementaryJoint(
+    return make_joint(
         name=m.joint(j).name or (f"{body}/free" if kind == "free" else f"{body}/joint{j}"),
         kind=kind,
-        axis=np.array(m.jnt_axis[j]) if is_scalar else np.zeros(3),
-        anchor=np.array(m.jnt_pos[j]) if kind in ("hinge", "ball") else np.zeros(3),
-        reference=float(m.qpos0[q]) if is_scalar else 0.0,
-        armature=float(m.dof_armature[dof]),
-        damping=float(m.dof_damping[dof]),
-        stiffness=float(m.jnt_stiffness[j]),
-        spring_reference=float(m.qpos_spring[q]) if is_scalar else 0.0,
-        friction_loss=float(m.dof_frictionloss[dof]),
-    )
-
-
-def _quantities(m: Any, d: Any, state: CanonicalState) -> ModelQuantities:
-    mujoco.mj_resetData(m, d)
-    d.qpos[:] = state.coordinates
-    mujoco.mj_forward(m, d)
-    gravity_force = np.array(d.qfrc_bias)
-    d.qvel[:] = state.velocities
-    mujoco.mj_forward(m, d)
-    poses = {
-        m.body(i).name or f"body{i}": pose(d.xmat[i].reshape(3, 3), d.xpos[i]) for i in range(1, m.nbody)
-    }
-    mujoco.mj_energyVel(m, d)
-    return ModelQuantities(
-        poses=poses,
-        mass_matrix=_full_mass_matrix(m, d),
-        bias_force=np.array(d.qfrc_bias),
-        gravity_force=gravity_force,
-        passive_force=np.array(d.qfrc_passive),
-        acceleration=np.array(d.qacc_smooth),
-        kinetic_energy=float(d.energy[1]),
-        potential_energy=_gravity_potential(m, d),
+        axis=m.jnt_axis[j] if is_scalar else (0, 0, 0),
+        anchor=m.jnt_pos[j] if kind in ("hinge", "ball") else (0, 0, 0),
+        reference=m.qpos0[q] if is_scalar else 0.0,
+        armature=m.dof_armature[dof],
+        damping=m.dof_damping[dof],
+        stiffness=m.jnt_stiffness[j],
+        spring_reference=m.qpos_spring[q] if is_scalar else 0.0,
+        friction_loss=m.dof_frictionloss[dof],
     )
 
 

@@ -16,118 +16,48 @@ Damping is in the model, and no routine of Pinocchio applies it; `aba` is called
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
 from typing import Any, ClassVar
 
 import numpy as np
 import pinocchio as pin
 
 from adapters.importer_common import (
+    LayoutWithOwnVelocities,
     LoadingImporter,
     Refused,
-    free_joint_name,
     joint_from_screw,
     joint_names,
+    make_body,
     make_joint,
     pose,
     pose_of_coordinates,
     quaternion_of,
-    to_canonical,
 )
 from plumbline.importers.importer import ModelFile
-from plumbline.importers.neutral_model import (
-    CanonicalState,
-    ElementaryJoint,
-    ModelQuantities,
-    NeutralBody,
-    NeutralModel,
-)
+from plumbline.importers.neutral_model import ElementaryJoint, ModelQuantities, NeutralBody
 from plumbline.model.datatypes import Array
 from plumbline.model.kinematics import rotation_matrix
 
 
-class PinocchioImporter(LoadingImporter):
-    """Pinocchio's URDF and MJCF parsers."""
-
-    name = "pinocchio"
-    title = "Pinocchio"
-    package = "pin"
-    formats = ("urdf", "mjcf")
-    supported_versions = ">=3.3.1,<5"
-    extra_requirements = (("<4", "cmeel-urdfdom<5"), ("<4", "cmeel-tinyxml2<11"))
-    unsupported: ClassVar[dict[str, str]] = {
-        "passive_force": "no routine of Pinocchio applies the damping that its models hold",
-    }
-
-    def _load(self, file: ModelFile) -> Any:
-        try:
-            return _parsed(file)
-        except Exception as error:  # ValueError, RuntimeError and exceptions of Boost
-            raise Refused(str(error) or type(error).__name__) from None
-
-    def _describe(self, loaded: Any, file: ModelFile) -> NeutralModel:
-        return NeutralModel(loaded.name, _Layout(loaded, file).bodies(), np.array(loaded.gravity.linear))
-
-    def _evaluate(
-        self, loaded: Any, file: ModelFile, states: Sequence[CanonicalState]
-    ) -> list[ModelQuantities]:
-        layout = _Layout(loaded, file)
-        return [layout.quantities(state) for state in states]
-
-
-def _parsed(file: ModelFile) -> Any:
-    if file.format == "mjcf":
-        return pin.buildModelFromMJCF(file.path)
-    if file.base == "fixed":
-        return pin.buildModelFromUrdf(file.path)
-    return pin.buildModelFromUrdf(file.path, pin.JointModelFreeFlyer())
-
-
-@dataclass(frozen=True, eq=False)
-class _Place:
-    """Where a joint's coordinates are in Pinocchio's vectors and in the canonical ones."""
-
-    kind: str  # scalars, continuous, ball or free
-    body: NeutralBody
-    placement: Any  # of the body's frame in the joint's frame
-    origin: Any  # from which a free joint's coordinates count, as the format says
-    q: slice
-    v: slice
-    x: slice
-    rate: slice
-
-
-class _Layout:
-    """A parsed model with the order of its joints in the reading."""
+class _Layout(LayoutWithOwnVelocities):
+    """A parsed model; a joint's own: P, O, whether it is continuous, and its places in q."""
 
     def __init__(self, model: Any, file: ModelFile) -> None:
-        self.m = model
+        self.m, self.name = model, model.name
         self.data = model.createData()
-        self.q_neutral = pin.neutral(model)
-        pin.computeJointJacobians(model, self.data, self.q_neutral)
+        self.q = pin.neutral(model)
+        pin.computeJointJacobians(model, self.data, self.q)
         self.body_frames = [f for f in model.frames if f.type == pin.FrameType.BODY]
-        self.file = file
-        names = joint_names(file) if file.format == "mjcf" else {}
-        self.places: list[_Place] = []
-        x = rate = 0
-        for j in range(1, model.njoints):  # Pinocchio's order is depth first
-            frame = self._frame(j)
-            body = self._body(j, frame, names)
-            nq, nv, iq, iv = model.nqs[j], model.nvs[j], model.idx_qs[j], model.idx_vs[j]
-            kind = self._kind(j)
-            nx = nv if kind == "continuous" else nq
-            origin = model.jointPlacements[j] if file.format == "urdf" else pin.SE3.Identity()
-            self.places.append(
-                _Place(
-                    kind, body, frame.placement, origin,
-                    slice(iq, iq + nq), slice(iv, iv + nv), slice(x, x + nx), slice(rate, rate + nv),
-                )
-            )  # fmt: skip
-            x, rate = x + nx, rate + nv
+        super().__init__(model, file)
 
-    def bodies(self) -> tuple[NeutralBody, ...]:
-        return tuple(place.body for place in self.places)
+    def _gravity(self) -> Any:
+        return self.m.gravity.linear
+
+    def _bodies(self) -> Iterator[NeutralBody]:
+        names = joint_names(self.file) if self.file.format == "mjcf" else {}
+        for j in range(1, self.m.njoints):  # Pinocchio's order is depth first
+            yield self._body(j, self._frame(j), names)
 
     def _kind(self, j: int) -> str:
         short, nq, nv = self.m.joints[j].shortname(), self.m.nqs[j], self.m.nvs[j]
@@ -151,58 +81,64 @@ class _Layout:
         return frame
 
     def _body(self, j: int, frame: Any, names: dict[str, list[str]]) -> NeutralBody:
-        m, P = self.m, frame.placement
-        parent = m.parents[j]
+        m, P, parent = self.m, frame.placement, self.m.parents[j]
         above = self._frame(parent).placement.inverse() if parent else pin.SE3.Identity()
-        zero = above * m.jointPlacements[j] * P
-        kind = self._kind(j)
-        if kind == "free":
-            joints: tuple[ElementaryJoint, ...] = (
-                make_joint(free_joint_name(frame.name, self.file), "free"),
-            )
-        elif kind == "ball":
-            joints = (make_joint(m.names[j], "ball", anchor=P.inverse().translation),)
-        else:
-            joints = self._elementary_joints(j, P, names.get(frame.name, []))
-        joints = tuple(
-            self._with_passive_fields(joint, int(m.idx_vs[j]) + k) for k, joint in enumerate(joints)
-        )
-        inertia = P.actInv(m.inertias[j])
-        return NeutralBody(
-            frame.name, parent - 1, np.array(zero.translation), quaternion_of(zero.rotation), joints,
-            float(inertia.mass), np.array(inertia.lever), np.array(inertia.inertia),
+        zero, inertia = above * m.jointPlacements[j] * P, P.actInv(m.inertias[j])
+        return make_body(
+            frame.name, parent - 1, zero.homogeneous, self._joints(j, frame, names.get(frame.name, [])),
+            inertia.mass, inertia.lever, inertia.inertia,
         )  # fmt: skip
 
-    def _elementary_joints(self, j: int, P: Any, names: list[str]) -> tuple[ElementaryJoint, ...]:
+    def _joints(self, j: int, frame: Any, names: list[str]) -> Iterator[ElementaryJoint]:
         """Hinges and slides by the columns of the motion subspace at q = 0."""
-        S, own = np.array(self.data.joints[j].S).reshape(6, -1), self.m.names[j]
-        if S.shape[1] == 1:
+        m, P, kind, own = self.m, frame.placement, self._kind(j), self.m.names[j]
+        S = np.array(self.data.joints[j].S).reshape(6, -1)
+        anchor, q, v = P.inverse().translation, m.idx_qs[j], m.idx_vs[j]
+        origin = m.jointPlacements[j] if self.file.format == "urdf" else pin.SE3.Identity()
+        if kind in ("free", "ball"):
+            place = P, origin, False, slice(q, q + m.nqs[j])
+            self.places.append((place, slice(v, v + m.nvs[j])))
+            numbers = self._numbers(v)
+            if kind == "free":
+                yield self._free_joint(frame.name, **numbers)
+            else:
+                yield make_joint(own, "ball", anchor=anchor, **numbers)
+            return
+        if m.nvs[j] == 1:
             names = [own]
-        elif len(names) != S.shape[1]:
-            names = [f"{own}/{k}" for k in range(S.shape[1])]
-        joints = []
-        for name, column in zip(names, S.T, strict=True):
-            screw = P.actInv(pin.Motion(column))
-            joint = joint_from_screw(name, np.array(screw.angular), np.array(screw.linear))
-            if joint.kind == "hinge" and len(names) == 1:
-                joint = replace(joint, anchor=np.array(P.inverse().translation))
-            joints.append(joint)
-        return tuple(joints)
+        elif len(names) != m.nvs[j]:
+            names = [f"{own}/{k}" for k in range(m.nvs[j])]
+        for k, (name, column) in enumerate(zip(names, S.T, strict=True)):
+            at = slice(q, q + 2) if kind == "continuous" else slice(q + k, q + k + 1)
+            self.places.append(((P, origin, kind == "continuous", at), slice(v + k, v + k + 1)))
+            screw, numbers = P.actInv(pin.Motion(column)), self._numbers(v + k)
+            joint = joint_from_screw(name, screw.angular, screw.linear, **numbers)
+            is_alone = joint.kind == "hinge" and len(names) == 1
+            yield make_joint(name, "hinge", joint.axis, anchor, **numbers) if is_alone else joint
 
-    def _with_passive_fields(self, joint: ElementaryJoint, v: int) -> ElementaryJoint:
+    def _numbers(self, v: int) -> dict[str, float]:
         m = self.m
         friction = m.upperDryFrictionLimit if hasattr(m, "upperDryFrictionLimit") else m.friction
-        return replace(
-            joint,
-            armature=float(m.armature[v]),
-            damping=float(m.damping[v]),
-            friction_loss=float(friction[v]),
-        )
+        return {"armature": m.armature[v], "damping": m.damping[v], "friction_loss": friction[v]}
 
-    def quantities(self, state: CanonicalState) -> ModelQuantities:
-        """Evaluate Pinocchio's routines at one state."""
-        m, d = self.m, self.data
-        q, v, T, Tdot_v = self._engine_state(state)
+    def _move(self, joint: ElementaryJoint, own: Any, x: Array, v: Array) -> tuple[Any, Any]:
+        P, origin, is_continuous, at = own
+        if joint.kind == "ball":
+            block = np.array(P.rotation)
+            self.q[at] = _scalar_last(block @ rotation_matrix(x) @ block.T)
+            return block, 0.0
+        if joint.kind == "free":
+            X = origin.inverse() * pin.SE3(pose_of_coordinates(x)) * P.inverse()
+            self.q[at] = [*X.translation, *_scalar_last(X.rotation)]
+            block, R_T = np.eye(6), rotation_matrix(x[3:]).T
+            block[:3, :3] = R_T
+            turned = np.concatenate([-np.cross(v[3:], R_T @ v[:3]), np.zeros(3)])
+            return P.action @ block, P.action @ turned
+        self.q[at] = (np.cos(x[0]), np.sin(x[0])) if is_continuous else x
+        return 1.0, 0.0
+
+    def _engine_quantities(self, v: Array) -> ModelQuantities:
+        m, d, q = self.m, self.data, self.q
         M = np.triu(pin.crba(m, d, q))  # the lower triangle is not filled before version 3.6
         M = M + np.triu(M, 1).T
         bias = np.array(pin.nonLinearEffects(m, d, q, v))
@@ -213,35 +149,31 @@ class _Layout:
         pin.framesForwardKinematics(m, d, q)
         placements = ((f.name, d.oMi[f.parentJoint] * f.placement) for f in self.body_frames if f.parentJoint)
         poses = {name: pose(placement.rotation, placement.translation) for name, placement in placements}
-        engine = ModelQuantities(poses, M, bias, gravity, None, acceleration, kinetic, potential)
-        return to_canonical(engine, T, Tdot_v)
+        return ModelQuantities(poses, M, bias, gravity, None, acceleration, kinetic, potential)
 
-    def _engine_state(self, state: CanonicalState) -> tuple[Array, Array, Array, Array]:
-        """The engine's q and v, T and Ṫv, by the equations of the module's docstring."""
-        q = np.array(self.q_neutral)
-        n = self.m.nv
-        T, Tdot_v = np.zeros((n, n)), np.zeros(n)
-        for place in self.places:
-            x, rate = state.coordinates[place.x], state.velocities[place.rate]
-            block, turned = np.eye(len(rate)), np.zeros(len(rate))
-            P = place.placement
-            if place.kind == "scalars":
-                q[place.q] = x
-            elif place.kind == "continuous":
-                q[place.q] = np.cos(x[0]), np.sin(x[0])
-            elif place.kind == "ball":
-                block = np.array(P.rotation)
-                q[place.q] = _scalar_last(block @ rotation_matrix(x) @ block.T)
-            else:
-                X = place.origin.inverse() * pin.SE3(pose_of_coordinates(x)) * P.inverse()
-                q[place.q] = [*X.translation, *_scalar_last(X.rotation)]
-                R_T = rotation_matrix(x[3:]).T
-                turned = P.action @ np.concatenate([-np.cross(rate[3:], R_T @ rate[:3]), np.zeros(3)])
-                block[:3, :3] = R_T
-                block = P.action @ block
-            T[place.v, place.rate] = block
-            Tdot_v[place.v] = turned
-        return q, T @ state.velocities, T, Tdot_v
+
+class PinocchioImporter(LoadingImporter):
+    """Pinocchio's URDF and MJCF parsers."""
+
+    name = "pinocchio"
+    title = "Pinocchio"
+    package = "pin"
+    formats = ("urdf", "mjcf")
+    supported_versions = ">=3.3.1,<5"
+    extra_requirements = (("<4", "cmeel-urdfdom<5"), ("<4", "cmeel-tinyxml2<11"))
+    unsupported: ClassVar[dict[str, str]] = {
+        "passive_force": "no routine of Pinocchio applies the damping that its models hold",
+    }
+    layout = _Layout
+
+    def _load(self, file: ModelFile) -> Any:
+        try:
+            if file.format == "mjcf":
+                return pin.buildModelFromMJCF(file.path)
+            root = () if file.base == "fixed" else (pin.JointModelFreeFlyer(),)
+            return pin.buildModelFromUrdf(file.path, *root)
+        except Exception as error:  # ValueError, RuntimeError and exceptions of Boost
+            raise Refused(str(error) or type(error).__name__) from None
 
 
 def _scalar_last(rotation: Array) -> Array:
