@@ -9,7 +9,7 @@ dropped.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any
@@ -17,14 +17,7 @@ from typing import Any
 import numpy as np
 
 from plumbline.importers.lumping import fixed_parts, lump_fixed_bodies, merge_bodies
-from plumbline.importers.neutral_model import (
-    CanonicalState,
-    ElementaryJoint,
-    ModelQuantities,
-    NeutralBody,
-    NeutralModel,
-    Source,
-)
+from plumbline.importers.neutral_model import CanonicalState, ModelQuantities, NeutralBody, NeutralModel
 from plumbline.model.datatypes import Array
 from plumbline.model.kinematics import rotation_matrix
 from plumbline.model_files.certified_model import CertifiedModelQuantities, pose_tolerances, rough_quantities
@@ -36,50 +29,37 @@ from plumbline.model_files.model_comparison import (
     mismatches,
     permuted,
 )
+from plumbline.model_files.parameter_changes import (
+    ARMATURE_ENERGY,
+    ASSUMED_INERTIAL,
+    DEFAULT_INERTIAL,
+    FRAME,
+    MISSING,
+    ORIGIN,
+    RELATIVE_CHANGE,
+    SLIDE_SCALE,
+    Change,
+    apply_changes,
+    change_of,
+    describe_changes,
+    differences,
+    differs,
+    energy_omissions,
+    grouped,
+    joint_kinds,
+    omissions,
+)
 
-RELATIVE_CHANGE = 1e-11  # differences of descriptions below this are rounding
-JOINT_FIELDS = ("axis", "anchor", "reference", "armature", "damping", "stiffness", "spring_reference")
-BODY_FIELDS = ("position", "attitude", "mass", "center", "inertia")
-DEFAULT_INERTIAL = "default inertial"  # 1 kg and 1 kg m² for each body without mass
-ASSUMED_INERTIAL = "assumed inertial"  # other values for bodies without <inertial>, as from geometry
-FRAME = "frame"
-SLIDE_SCALE = "displacement"  # of a slide, in the poses alone: its coordinate times a number
-ORIGIN = "origin"  # from which a free body's coordinates count
-MISSING = "missing body"
 FRAME_FIELDS = ("position", "attitude", "anchor", "reference")  # which may describe one pose in several ways
+INERTIAL_FIELDS = ("mass", "center", "inertia")
+POSES = {"position", "attitude"}  # quantities
 MAX_OMISSIONS = 4
-ARMATURE_ENERGY = "armature in the kinetic energy"
-OMITTED_FIELDS = ("damping", "stiffness", "armature", "spring_reference")  # may be held and not applied
-FIELD_WORDS = {
-    "center": "centre of mass", "spring_reference": "spring reference", "position": "position in its parent",
-    "attitude": "attitude in its parent", "reference": "reference coordinate", "joints": "joints",
-}  # fmt: skip
 FAR = 1e4  # times the bound of rounding: changes that leave so much are not worth a certificate
 MAX_SINGLE_TRIALS = 40  # changes of one field that are tried one by one
 PRUNING_STATES = 3
+OTHER_JOINTS = {"joints": Mismatch(np.inf, 0.0, np.inf, 0, "")}
 States = Callable[[NeutralModel], Sequence[CanonicalState]]
-
-
-@dataclass(frozen=True, eq=False)
-class Change:
-    """One parameter that differs."""
-
-    field: str
-    body: str  # empty: the whole model
-    joint: str  # empty: the body
-    own: Any  # as the file says
-    theirs: Any  # as the importer reads it
-    source: Source
-    also: Mapping[str, Any] | None = None  # what changes with it in the body that carries it
-    carrier: str = ""  # the body that this one is fixed to, where it is not the body itself
-    is_omitted: bool = False  # the importer's description has the file's value, its dynamics leave it out
-
-    @property
-    def owner(self) -> str:
-        """What the parameter belongs to, in words."""
-        if self.joint:
-            return f"joint {self.joint}"
-        return f"body {self.body}" if self.body else "the model"
+Part = tuple[NeutralBody, Array, Array]  # a fixed body, its position and rotation matrix in its carrier
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +138,7 @@ def _explain(
         read = {body.name for body in reading.bodies}
         left_out = [body for body in model.bodies if body.joints and body.name not in read]
         structure = [c for c in structure if c.body in read]
-        structure += [Change(MISSING, body.name, "", body, None, body.source) for body in left_out]
+        structure += [change_of(MISSING, body, None, body, None) for body in left_out]
     own, theirs = lump_fixed_bodies(moved), lump_fixed_bodies(reading)
     trial = _Trial(own, theirs, reading, answers, states, moved, bool(structure))
     changes = _single_parts(differences(own, theirs), moved, theirs)
@@ -211,14 +191,14 @@ def damping_cause(title: str, model: NeutralModel, reading: NeutralModel) -> Cau
     """
     read = {joint.name: joint.damping for joint in reading.joints}
     changes = [
-        Change("damping", body.name, j.name, j.damping, read[j.name], j.fields.get("damping", j.source))
+        change_of("damping", body, joint, joint.damping, read[joint.name])
         for body in model.bodies
-        for j in body.joints
-        if j.name in read and _differs(j.damping, read[j.name], 0.0)
+        for joint in body.joints
+        if joint.name in read and differs(joint.damping, read[joint.name])
     ]
     if not changes:
         return None
-    phrase = _describe(changes)
+    phrase = describe_changes(changes)
     return Cause("damping", tuple(changes), phrase, f"{title} {phrase}; its equations do not use it.")
 
 
@@ -228,7 +208,9 @@ def _with_joints_of(model: NeutralModel, reading: NeutralModel) -> tuple[list[Ch
     changes, bodies = [], []
     for body in model.bodies:
         theirs = read.get(body.name, ())
-        if _kinds(body.joints) != _kinds(theirs) and not _are_free(body.joints, theirs):
+        kinds = [joint_kinds(joints) for joints in (body.joints, theirs)]
+        are_free = all([kind for _, kind in one] == ["free"] for one in kinds)
+        if kinds[0] != kinds[1] and not are_free:
             source = body.joints[0].source if body.joints else body.source
             changes.append(Change("joints", body.name, "", body.joints, theirs, source))
             body = replace(body, joints=theirs)
@@ -241,88 +223,69 @@ def _single_parts(changes: Sequence[Change], model: NeutralModel, theirs: Neutra
     named = {body.name: body for body in theirs.bodies}
     found = list(changes)
     for name, parts in fixed_parts(model).items():
-        inertial = [c for c in found if c.body == name and c.field in ("mass", "center", "inertia")]
-        if not inertial:
-            continue
-        single = _single_part(parts, named[name])
+        inertial = [c for c in found if c.body == name and c.field in INERTIAL_FIELDS]
+        single = _single_part(parts, named[name]) if inertial else None
         if single is not None:
             found = [single, *(c for c in found if c not in inertial)]
     return found
 
 
-def _single_part(parts: Sequence[tuple[NeutralBody, Array, Array]], read: NeutralBody) -> Change | None:
-    """The one part whose mass, centre or whole inertial explains a lumped body; None where there is none."""
-    lumped = _merge(parts)
-    also = {name: getattr(read, name) for name in ("mass", "center", "inertia")}
-    if len(parts) > 2 and lumped.mass > parts[0][0].mass and _is_same_inertial(parts[0][0], read):
-        fixed = [part for part, _, _ in parts[1:] if part.mass]
-        names, carrier, mass = ", ".join(p.name for p in fixed), parts[0][0].name, sum(p.mass for p in fixed)
-        return Change("inertial", names, "", mass, 0.0, fixed[0].source, also=also, carrier=carrier)
-    for place, (part, _, A) in enumerate(parts):
-        mass = part.mass + read.mass - lumped.mass
-        trials: list[tuple[str, dict[str, Any]]] = [("mass", {"mass": mass})] if mass > 0 else []
-        if part.mass:
-            moment = read.mass * read.center - lumped.mass * lumped.center
-            trials.append(("center", {"center": part.center + A.T @ moment / part.mass}))
-        trials.append(("inertial", {"mass": 0.0, "center": np.zeros(3), "inertia": np.zeros((3, 3))}))
-        for name, values in trials:
-            changed = [*parts[:place], (replace(part, **values), *parts[place][1:]), *parts[place + 1 :]]
-            if _is_same_inertial(_merge(changed), read):
-                own, new = (part.mass, 0.0) if name == "inertial" else (getattr(part, name), values[name])
-                source = part.fields.get(name, part.source)
-                carrier = parts[0][0].name
-                return Change(name, part.name, "", own, new, source, also=also, carrier=carrier)
-    empty = [part for part, _, _ in parts if part.mass == 0 and not np.any(part.inertia)]
-    unsaid = [part for part in empty if "mass" not in part.fields]  # without <inertial>
-    for chosen in (empty, unsaid):
-        given = [
-            (replace(part, mass=1.0, inertia=np.eye(3)) if part in chosen else part, position, A)
-            for part, position, A in parts
-        ]
-        if chosen and _is_same_inertial(_merge(given), read):
-            return _default_inertial(DEFAULT_INERTIAL, chosen, 1.0, also, parts[0][0].name)
-    if unsaid and read.mass > lumped.mass and _differs(read.mass, lumped.mass, 0.0):
-        added = read.mass - lumped.mass
-        return _default_inertial(ASSUMED_INERTIAL, unsaid, added, also, parts[0][0].name)
-    massless = [part for part, _, _ in parts[1:] if part.mass == 0 and np.any(part.inertia)]
-    kept = [entry for entry in parts if entry[0] not in massless]
-    if massless and not _differs(_merge(kept).inertia, read.inertia, 0.0):
-        names = ", ".join(part.name for part in massless)
-        source, carrier = massless[0].fields.get("inertia", massless[0].source), parts[0][0].name
-        return Change("inertial", names, "", 0.0, 0.0, source, also=also, carrier=carrier)
+def _single_part(parts: Sequence[Part], read: NeutralBody) -> Change | None:
+    """The parts whose mass, centre or whole inertial explains a lumped body; None: there are none."""
+    also = {name: getattr(read, name) for name in INERTIAL_FIELDS}
+    for field, changed, own, theirs, bodies in _part_changes(parts, read):
+        if bodies is None or _is_same_inertial(_merge(bodies), read):
+            source = changed[0].fields.get(field, changed[0].source)
+            names, carrier = ", ".join(part.name for part in changed), parts[0][0].name
+            return Change(field, names, "", own, theirs, source, also=also, carrier=carrier)
     return None
 
 
-def _default_inertial(
-    field: str, parts: Sequence[NeutralBody], mass: float, also: Mapping[str, Any], carrier: str
-) -> Change:
-    names = ", ".join(part.name for part in parts)
-    return Change(field, names, "", 0.0, mass, parts[0].source, also=also, carrier=carrier)
+def _part_changes(
+    parts: Sequence[Part], read: NeutralBody
+) -> Iterator[tuple[str, list[NeutralBody], Any, Any, Sequence[Part] | None]]:
+    """What may have been read of the parts: field, parts, both values, and the parts then (None: any)."""
+    lumped, bodies = _merge(parts), [part for part, _, _ in parts]
+
+    def with_values(chosen: Sequence[NeutralBody], **values: Any) -> list[Part]:
+        return [(replace(p, **values) if p in chosen else p, *place) for p, *place in parts]
+
+    empty = {"mass": 0.0, "center": np.zeros(3), "inertia": np.zeros((3, 3))}
+    fixed = [part for part in bodies[1:] if part.mass]
+    if len(parts) > 2 and fixed and lumped.mass > bodies[0].mass:
+        yield "inertial", fixed, sum(part.mass for part in fixed), 0.0, parts[:1]
+    for part, _, A in parts:
+        mass = part.mass + read.mass - lumped.mass
+        if mass > 0:
+            yield "mass", [part], part.mass, mass, with_values([part], mass=mass)
+        if part.mass:
+            moment = read.mass * read.center - lumped.mass * lumped.center
+            center = part.center + A.T @ moment / part.mass
+            yield "center", [part], part.center, center, with_values([part], center=center)
+        yield "inertial", [part], part.mass, 0.0, with_values([part], **empty)
+    massless = [part for part in bodies if part.mass == 0 and not np.any(part.inertia)]
+    unsaid = [part for part in massless if "mass" not in part.fields]  # without <inertial>
+    for chosen in (massless, unsaid):
+        if chosen:
+            yield DEFAULT_INERTIAL, chosen, 0.0, 1.0, with_values(chosen, mass=1.0, inertia=np.eye(3))
+    if unsaid and read.mass > lumped.mass and differs(read.mass, lumped.mass):
+        yield ASSUMED_INERTIAL, unsaid, 0.0, read.mass - lumped.mass, None
+    turning = [part for part in bodies[1:] if part.mass == 0 and np.any(part.inertia)]
+    if turning:
+        yield "inertial", turning, 0.0, 0.0, [place for place in parts if place[0] not in turning]
 
 
 def _is_same_inertial(one: NeutralBody, read: NeutralBody) -> bool:
     """Whether mass, centre of mass and inertia of two bodies are the same, but for rounding."""
-    size = float(np.linalg.norm(one.center))
-    return not (
-        _differs(one.mass, read.mass, 0.0)
-        or _differs(one.center, read.center, size)
-        or _differs(one.inertia, read.inertia, 0.0)
-    )
+    scales = zip(INERTIAL_FIELDS, (0.0, float(np.linalg.norm(one.center)), 0.0), strict=True)
+    return not any(differs(getattr(one, field), getattr(read, field), scale) for field, scale in scales)
 
 
-def _merge(parts: Sequence[tuple[NeutralBody, Array, Array]]) -> NeutralBody:
+def _merge(parts: Sequence[Part]) -> NeutralBody:
     body = parts[0][0]
     for added in parts[1:]:
         body = merge_bodies(body, *added)
     return body
-
-
-def _are_free(*joints: Sequence[ElementaryJoint]) -> bool:
-    return all([joint.kind for joint in one] == ["free"] for one in joints)
-
-
-def _kinds(joints: Sequence[ElementaryJoint]) -> list[tuple[str, str]]:
-    return [(joint.name, joint.kind) for joint in joints]
 
 
 class _Trial:
@@ -347,18 +310,7 @@ class _Trial:
             tuple[int, ...], tuple[NeutralModel, list[CertifiedModelQuantities], Sequence[Change]]
         ] = {}
         self.tolerance: Mapping[str, Any] = {}  # at the first state, of the first changes that were certified
-
-    def worst(self, changes: Sequence[Change], count: int) -> Mapping[str, Mismatch] | None:
-        """Worst entries with the changes made; None where the joints still differ."""
-        changed, truths = self.certified(changes, count)
-        order = joint_permutation(changed, self.reading)
-        if order is None:
-            return None
-        states = self.states(changed)[:count]
-        still = {change.joint for change in changes if change.field == ARMATURE_ENERGY}
-        truths = [_without_armature(changed, still, *pair) for pair in zip(states, truths, strict=True)]
-        truths = [_with_placing(changed, changes, *pair) for pair in zip(states, truths, strict=True)]
-        return mismatches(changed, truths, [permuted(one, order) for one in self.answers[:count]])
+        self.few = min(PRUNING_STATES, len(answers))
 
     def certified(
         self, changes: Sequence[Change], count: int
@@ -376,6 +328,26 @@ class _Trial:
                 self.tolerance = truths[0].tolerance
         return changed, truths[:count]
 
+    def worst(
+        self, changes: Sequence[Change], count: int, truths: Sequence[CertifiedModelQuantities] | None = None
+    ) -> Mapping[str, Mismatch]:
+        """Worst entries with the changes made, by default against certified values."""
+        changed, certified = self.certified(changes, 0 if truths else count)
+        order = joint_permutation(changed, self.reading)
+        if order is None:
+            return OTHER_JOINTS
+        pairs = list(zip(self.states(changed)[:count], truths or certified, strict=True))
+        shown = [_as_shown(changed, changes, state, truth) for state, truth in pairs]
+        return mismatches(changed, shown, [permuted(one, order) for one in self.answers[:count]])
+
+    def remaining(self, changes: Sequence[Change], count: int) -> float:
+        """Largest ratio of error and tolerance with the changes made."""
+        return max((m.ratio for m in self.worst(changes, count).values()), default=0.0)
+
+    def wrong(self, changes: Sequence[Change], count: int) -> set[str]:
+        """Quantities that are not reproduced with the changes made."""
+        return {name for name, m in self.worst(changes, count).items() if m.ratio > 1}
+
     def is_far(self, changes: Sequence[Change], with_poses: bool = True) -> bool:
         """Whether M, or a pose, at the first state is so far off that no certificate is needed."""
         if not self.tolerance:
@@ -386,23 +358,13 @@ class _Trial:
         order = joint_permutation(changed, self.reading)
         if order is None or len(order) != len(self.tolerance["mass_matrix"]):
             return False
-        state = self.states(changed)[0]
-        truth = CertifiedModelQuantities(rough_quantities(changed, state), self.tolerance)
-        truth = _with_placing(changed, changes, state, truth)
-        found = mismatches(changed, [truth], [permuted(self.answers[0], order)])
+        rough = rough_quantities(changed, self.states(changed)[0])
+        found = self.worst(changes, 1, [CertifiedModelQuantities(rough, self.tolerance)])
         return any(m.ratio > FAR for name, m in found.items() if with_poses or name == "mass_matrix")
 
-    def smallest_with_omissions(self, changes: Sequence[Change]) -> list[Change] | None:
-        """Try the changes alone, then with terms that the dynamics may leave out."""
-        (changed, _), wrong = self.certified(changes, 0), self.wrong(changes)
-        is_energy_only = "kinetic_energy" in wrong and wrong <= {"kinetic_energy", "position", "attitude"}
-        omitted = energy_omissions(changed) if is_energy_only else omissions(changed)
-        for size in range(MAX_OMISSIONS + 1):
-            for chosen in combinations(omitted, size):
-                found = self.smallest([*changes, *(change for group in chosen for change in group)])
-                if found is not None:
-                    return found
-        return None
+    def fits(self, changes: Sequence[Change], count: int) -> bool:
+        """Whether the changes reproduce everything; roughly at the first state alone first: most do not."""
+        return not self.is_far(changes) and all(self.remaining(changes, n) <= 1 for n in {1, count})
 
     def first_that_explains(self, changes: Sequence[Change]) -> list[Change] | None:
         """Try all changes, then without those of frames, then with the frames that are needed."""
@@ -411,6 +373,15 @@ class _Trial:
         if len(without_frames) < len(changes):
             bases += [without_frames, self.with_needed_frames(changes)]
         return next((f for f in map(self.smallest_with_omissions, bases) if f is not None), None)
+
+    def with_needed_frames(self, changes: Sequence[Change]) -> list[Change]:
+        """Keep the changes of frames that put a body where the importer has it."""
+        kept = [change for change in changes if change.field not in FRAME_FIELDS]
+        count = self.misplaced(kept)
+        for frames in _by_body(changes):
+            if (fewer := self.misplaced([*kept, *frames])) < count:
+                kept, count = [*kept, *frames], fewer
+        return kept
 
     def misplaced(self, changes: Sequence[Change]) -> float:
         """How many bodies are elsewhere at the first state, with the changes made."""
@@ -424,140 +395,118 @@ class _Trial:
         }
         return sum(bool(np.any(np.abs(own[b] - theirs[b]) > bounds[b])) for b in own if b in theirs)
 
-    def with_needed_frames(self, changes: Sequence[Change]) -> list[Change]:
-        """Keep the changes of frames that put a body where the importer has it."""
-        kept = [change for change in changes if change.field not in FRAME_FIELDS]
-        count = self.misplaced(kept)
-        for body in dict.fromkeys(c.body for c in changes if c.field in FRAME_FIELDS):
-            more = [*kept, *(c for c in changes if c.body == body and c.field in FRAME_FIELDS)]
-            if (fewer := self.misplaced(more)) < count:
-                kept, count = more, fewer
-        return kept
-
-    def wrong_at_first(self, changes: Sequence[Change]) -> bool:
-        """Whether more than poses is wrong at the first state, which is cheap to find out."""
-        if self.is_far(changes, with_poses=False):
-            return True
-        found = self.worst(changes, 1)
-        return found is None or any(
-            m.ratio > 1 for name, m in found.items() if name not in ("position", "attitude")
-        )
-
-    def wrong(self, changes: Sequence[Change]) -> set[str]:
-        """Quantities that are not reproduced with the changes made."""
-        found = self.worst(changes, min(PRUNING_STATES, len(self.answers)))
-        return {name for name, m in (found or {}).items() if m.ratio > 1}
-
-    def has_wrong_poses_only(self, changes: Sequence[Change], count: int) -> bool:
-        """Whether poses are wrong with the changes made, and nothing else."""
-        found = self.worst(changes, count)
-        wrong = {name for name, m in (found or {}).items() if m.ratio > 1}
-        return bool(wrong) and wrong <= {"position", "attitude"}
-
-    def slide_changes(self, changes: Sequence[Change], count: int) -> list[Change]:
-        """Slides that put bodies at a multiple of their coordinates, as with an axis not of length one."""
-        if not self.has_wrong_poses_only(changes, count):
-            return []
-        changed, truths = self.certified(changes, count)
-        states, found = self.states(changed)[:count], []
-        slices = {joint.name: x for joint, x, _ in changed.joint_slices()}
-        for body in changed.bodies:
-            if [joint.kind for joint in body.joints] != ["slide"]:
-                continue
-            (joint,) = body.joints
-            axis = rotation_matrix(body.attitude) @ joint.axis
-            moved = [float(state.coordinates[slices[joint.name]][0]) - joint.reference for state in states]
-            places = [
-                [_in_parent(changed, body, poses) for poses in (answer.poses, truth.quantities.poses)]
-                for answer, truth in zip(self.answers, truths, strict=False)
-            ]
-            shifts = [float(axis @ (theirs - own)) for theirs, own in places]
-            scale = 1 + float(np.dot(shifts, moved)) / max(float(np.dot(moved, moved)), TINY)
-            if abs(scale - 1) > RELATIVE_CHANGE:
-                source = joint.fields.get("axis", joint.source)
-                found.append(Change(SLIDE_SCALE, body.name, joint.name, 1.0, scale, source))
-        return found
-
-    def origin_changes(self, changes: Sequence[Change], count: int) -> list[Change]:
-        """Free bodies that are displaced by the same vector at every state, with all that they carry."""
-        if not self.has_wrong_poses_only(changes, count):
-            return []
-        changed, truths = self.certified(changes, 1)
-        own, theirs = truths[0].quantities.poses, self.answers[0].poses
-        found = []
-        for body in changed.bodies:
-            if [joint.kind for joint in body.joints] == ["free"] and body.name in theirs:
-                shift = theirs[body.name][:, 3] - own[body.name][:, 3]
-                source, name = body.fields.get("position", body.source), body.joints[0].name
-                found.append(Change(ORIGIN, body.name, name, np.zeros(3), shift, source))
-        return found
-
-    def frame_changes(self, changes: Sequence[Change], count: int) -> list[Change]:
-        """Frames that lie elsewhere in their bodies, where nothing but poses is wrong."""
-        if not self.has_wrong_poses_only(changes, count):
-            return []
-        changed, truths = self.certified(changes, count)
-        frames = []
-        for body in changed.bodies:
-            pairs = [
-                (truth.quantities.poses[body.name], answer.poses[body.name])
-                for truth, answer in zip(truths, self.answers, strict=False)
-                if body.name in answer.poses
-            ]
-            offsets = [
-                _composed(np.column_stack([own[:, :3].T, -own[:, :3].T @ own[:, 3]]), theirs)
-                for own, theirs in pairs
-            ]
-            if offsets and np.max(np.abs(offsets[0] - np.eye(3, 4))) > RELATIVE_CHANGE:
-                source = body.fields.get("position", body.source)
-                frames.append(Change(FRAME, body.name, "", np.eye(3, 4), offsets[0], source))
-        return frames
-
-    def remaining(self, changes: Sequence[Change], count: int) -> float:
-        """Largest ratio of error and tolerance with the changes made."""
-        found = self.worst(changes, count)
-        return np.inf if found is None else max((m.ratio for m in found.values()), default=0.0)
-
-    def fits(self, changes: Sequence[Change], count: int) -> bool:
-        """Whether the changes reproduce everything; roughly at the first state alone first: most do not."""
-        if self.is_far(changes):
-            return False
-        return self.remaining(changes, 1) <= 1 and (count == 1 or self.remaining(changes, count) <= 1)
+    def smallest_with_omissions(self, changes: Sequence[Change]) -> list[Change] | None:
+        """Try the changes alone, then with terms that the dynamics may leave out."""
+        (changed, _), wrong = self.certified(changes, 0), self.wrong(changes, self.few)
+        is_energy_only = "kinetic_energy" in wrong and wrong <= {"kinetic_energy", *POSES}
+        omitted = energy_omissions(changed) if is_energy_only else omissions(changed)
+        for size in range(MAX_OMISSIONS + 1):
+            for chosen in combinations(omitted, size):
+                found = self.smallest([*changes, *(change for group in chosen for change in group)])
+                if found is not None:
+                    return found
+        return None
 
     def smallest(self, changes: Sequence[Change]) -> list[Change] | None:
         """Drop the changes that are not needed; None where all together do not reproduce the quantities."""
-        if self.wrong_at_first(changes):
+        if self.is_far(changes, with_poses=False) or self.wrong(changes, 1) - POSES:
             return None
-        counts = dict.fromkeys((min(PRUNING_STATES, len(self.answers)), len(self.answers)))
+        counts = dict.fromkeys((self.few, len(self.answers)))
         found = (self._pruned(changes, count) for count in counts)  # what few states do not need, others may
         return next((one for one in found if one is not None), None)
 
     def _pruned(self, changes: Sequence[Change], count: int) -> list[Change] | None:
         """Drop the changes that ``count`` states do not need; None where the rest does not fit all states."""
         needed = list(changes)
-        if self.remaining(needed, count) > 1:
-            placed = ([*needed, *find(needed, count)] for find in (self.slide_changes, self.origin_changes))
-            fitting = (p for p in placed if len(p) > len(needed) and self.remaining(p, count) <= 1)
-            needed = next(fitting, []) or [*needed, *self.frame_changes(needed, count)]
-        if not (needed or self.has_structure) or not self.fits(needed, count):
+        wrong = self.wrong(needed, count)
+        if wrong and wrong <= POSES:
+            needed = self.with_placings(needed, count)
+        if not self.is_enough(needed, count):
             return None
-        for body in dict.fromkeys(change.body for change in changes if change.field in FRAME_FIELDS):
-            rest = [c for c in needed if not (c.body == body and c.field in FRAME_FIELDS)]
-            if self.fits(rest, count):
-                needed = rest
-        for field in dict.fromkeys(change.field for change in changes):
-            rest = [change for change in needed if change.field != field]
-            if self.fits(rest, count):
-                needed = rest
-        for field in dict.fromkeys(change.field for change in needed):
-            members = [change for change in needed if change.field == field]
-            if 1 < len(members) <= MAX_SINGLE_TRIALS:
-                for member in members:
-                    rest = [change for change in needed if change is not member]
-                    if self.fits(rest, count):
-                        needed = rest
-        is_some = bool(needed) or self.has_structure
-        return needed if is_some and self.fits(needed, len(self.answers)) else None
+        for groups in (_by_body(changes), grouped(changes, _field).values()):
+            needed = self.without_unneeded(needed, groups, count)
+        several = [g for g in grouped(needed, _field).values() if 1 < len(g) <= MAX_SINGLE_TRIALS]
+        needed = self.without_unneeded(needed, ([change] for group in several for change in group), count)
+        return needed if self.is_enough(needed, len(self.answers)) else None
+
+    def is_enough(self, changes: Sequence[Change], count: int) -> bool:
+        """Whether there is a change, of structure or another one, and everything is reproduced."""
+        return (bool(changes) or self.has_structure) and self.fits(changes, count)
+
+    def without_unneeded(
+        self, changes: list[Change], groups: Iterable[Sequence[Change]], count: int
+    ) -> list[Change]:
+        """Drop each group of changes without which everything is still reproduced."""
+        for group in groups:
+            rest = [change for change in changes if change not in group]
+            if len(rest) < len(changes) and self.fits(rest, count):
+                changes = rest
+        return changes
+
+    def with_placings(self, changes: list[Change], count: int) -> list[Change]:
+        """Add what changes poses alone: scaled slides or displaced free bodies, else frames elsewhere."""
+        changed, truths = self.certified(changes, count)
+        pairs = [(t.quantities.poses, a.poses) for t, a in zip(truths, self.answers, strict=False)]
+        for found in (self._slides(changed, pairs), _origins(changed, pairs)):
+            if found and self.remaining([*changes, *found], count) <= 1:
+                return [*changes, *found]
+        return [*changes, *_frames(changed, pairs)]
+
+    def _slides(self, model: NeutralModel, pairs: Sequence[_Poses]) -> list[Change]:
+        """Slides that put bodies at a multiple of their coordinates, as with an axis not of length one."""
+        states, found = self.states(model)[: len(pairs)], []
+        slices = {joint.name: x for joint, x, _ in model.joint_slices()}
+        for body in model.bodies:
+            if [joint.kind for joint in body.joints] != ["slide"]:
+                continue
+            (joint,) = body.joints
+            axis = rotation_matrix(body.attitude) @ joint.axis
+            moved = [float(state.coordinates[slices[joint.name]][0]) - joint.reference for state in states]
+            places = [[_in_parent(model, body, poses) for poses in pair] for pair in pairs]
+            shifts = [float(axis @ (theirs - own)) for own, theirs in places]
+            scale = 1 + float(np.dot(shifts, moved)) / max(float(np.dot(moved, moved)), TINY)
+            if abs(scale - 1) > RELATIVE_CHANGE:
+                found.append(change_of(SLIDE_SCALE, body, joint, 1.0, scale, "axis"))
+        return found
+
+
+_Poses = tuple[Mapping[str, Array], Mapping[str, Array]]  # at one state: as changed, and the importer's
+
+
+def _origins(model: NeutralModel, pairs: Sequence[_Poses]) -> list[Change]:
+    """Free bodies that are displaced by the same vector at every state, with all that they carry."""
+    own, theirs = pairs[0]
+    found = []
+    for body in model.bodies:
+        if [joint.kind for joint in body.joints] == ["free"] and body.name in theirs:
+            shift, name = theirs[body.name][:, 3] - own[body.name][:, 3], body.joints[0].name
+            change = change_of(ORIGIN, body, None, np.zeros(3), shift, "position")
+            found.append(replace(change, joint=name))
+    return found
+
+
+def _frames(model: NeutralModel, pairs: Sequence[_Poses]) -> list[Change]:
+    """Frames that lie elsewhere in their bodies."""
+    found = []
+    for body in model.bodies:
+        both = [(own[body.name], theirs[body.name]) for own, theirs in pairs if body.name in theirs]
+        if not both:
+            continue
+        R, p = both[0][0][:, :3], both[0][0][:, 3]
+        offset = _composed(np.column_stack([R.T, -R.T @ p]), both[0][1])
+        if np.max(np.abs(offset - np.eye(3, 4))) > RELATIVE_CHANGE:
+            found.append(change_of(FRAME, body, None, np.eye(3, 4), offset, "position"))
+    return found
+
+
+def _field(change: Change) -> str:
+    return change.field
+
+
+def _by_body(changes: Sequence[Change]) -> list[list[Change]]:
+    """Changes of frames, by body."""
+    frames = [change for change in changes if change.field in FRAME_FIELDS]
+    return list(grouped(frames, lambda change: change.body).values())
 
 
 def _widened(truth: CertifiedModelQuantities, placed: Mapping[str, Array]) -> CertifiedModelQuantities:
@@ -568,16 +517,25 @@ def _widened(truth: CertifiedModelQuantities, placed: Mapping[str, Array]) -> Ce
     return replace(truth, tolerance={**truth.tolerance, "poses": poses})
 
 
-def _with_placing(
+def _as_shown(
     model: NeutralModel, changes: Sequence[Change], state: CanonicalState, truth: CertifiedModelQuantities
 ) -> CertifiedModelQuantities:
-    """Poses with slides scaled, free bodies displaced, and frames elsewhere in their bodies: X → X Y."""
-    offsets = {change.body: change.theirs for change in changes if change.field == FRAME}
-    scales = {change.joint: change.theirs for change in changes if change.field == SLIDE_SCALE}
-    shifts = {change.body: change.theirs for change in changes if change.field == ORIGIN}
-    if not offsets and not scales and not shifts:
+    """Quantities with the changes that are not in the model.
+
+    Armatures left out of the kinetic energy, slides scaled, free bodies displaced, and frames elsewhere in
+    their bodies: X → X Y.
+    """
+    kinds = grouped(changes, _field)
+    offsets = {change.body: change.theirs for change in kinds.get(FRAME, ())}
+    scales = {change.joint: change.theirs for change in kinds.get(SLIDE_SCALE, ())}
+    shifts = {change.body: change.theirs for change in kinds.get(ORIGIN, ())}
+    still = {change.joint for change in kinds.get(ARMATURE_ENERGY, ())}
+    if not (offsets or scales or shifts or still):
         return truth
-    poses = truth.quantities.poses
+    poses, energy = truth.quantities.poses, truth.quantities.kinetic_energy
+    for joint, _, v in model.joint_slices():
+        if joint.name in still and energy is not None:
+            energy -= joint.armature * float(state.velocities[v] @ state.velocities[v]) / 2
     if scales:
         x = state.coordinates.copy()
         for joint, places, _ in model.joint_slices():
@@ -589,7 +547,7 @@ def _with_placing(
         by[body.name] = shifts.get(body.name, above)
     poses = {name: np.column_stack([X[:, :3], X[:, 3] + by[name]]) for name, X in poses.items()}
     poses = {body: _composed(X, offsets[body]) if body in offsets else X for body, X in poses.items()}
-    return replace(truth, quantities=replace(truth.quantities, poses=poses))
+    return replace(truth, quantities=replace(truth.quantities, poses=poses, kinetic_energy=energy))
 
 
 def _in_parent(model: NeutralModel, body: NeutralBody, poses: Mapping[str, Array]) -> Array:
@@ -605,344 +563,14 @@ def _composed(pose: Array, offset: Array) -> Array:
     return np.column_stack([R @ offset[:, :3], p + R @ offset[:, 3]])
 
 
-def _without_armature(
-    model: NeutralModel, names: set[str], state: CanonicalState, truth: CertifiedModelQuantities
-) -> CertifiedModelQuantities:
-    """The kinetic energy without the armature of the named joints."""
-    energy = truth.quantities.kinetic_energy
-    assert energy is not None
-    for joint, _, v in model.joint_slices():
-        if joint.name in names:
-            energy -= joint.armature * float(state.velocities[v] @ state.velocities[v]) / 2
-    return replace(truth, quantities=replace(truth.quantities, kinetic_energy=energy))
-
-
-def differences(
-    own: NeutralModel, theirs: NeutralModel, least: float = RELATIVE_CHANGE, has_rest_poses: bool = False
-) -> list[Change]:
-    """List the parameters in which two descriptions differ by more than rounding.
-
-    Args:
-        own: the neutral model, fixed bodies lumped.
-        theirs: an importer's description, fixed bodies lumped.
-        least: relative difference from which on two numbers differ.
-        has_rest_poses: whether poses of free bodies count, which are coordinates of their joints.
-
-    Returns:
-        The changes that turn the first into the second; the structure of bodies and joints first.
-
-    """
-    found: list[Change] = []
-    if _differs(own.gravity, theirs.gravity, 0.0, least):
-        found.append(Change("gravity", "", "", own.gravity, theirs.gravity, own.gravity_source))
-    named = {body.name: body for body in theirs.bodies}
-    size = max((float(np.linalg.norm(body.position)) for body in own.bodies), default=0.0)
-    parents = [_parent_names(model) for model in (own, theirs)]
-    for body in own.bodies:
-        other = named.get(body.name)
-        if other is None:
-            continue
-        if parents[0][body.name] != parents[1][body.name]:
-            names = parents[0][body.name], parents[1][body.name]
-            found.append(Change("parent", body.name, "", *names, body.source))
-        found += _joint_changes(body, other, size, least)
-        for field in BODY_FIELDS:
-            values = getattr(body, field), getattr(other, field)
-            scale = size if field in ("position", "center") else 0.0
-            is_free = bool(body.joints) and body.joints[0].kind == "free"
-            if field in ("position", "attitude") and is_free and not has_rest_poses:
-                is_different = False  # a free joint's coordinates are those of the body frame
-            elif field == "attitude":
-                is_different = _differs(rotation_matrix(values[0]), rotation_matrix(values[1]), 0.0, least)
-            else:
-                is_different = _differs(*values, scale, least)
-            if is_different and not (field == "center" and body.mass == 0 == other.mass):
-                found.append(Change(field, body.name, "", *values, body.fields.get(field, body.source)))
-    own_names = {body.name for body in own.bodies}
-    extra = [body for body in theirs.bodies if body.name not in own_names]
-    return [Change("additional body", b.name, "", None, b, Source("", 0)) for b in extra] + found
-
-
-def describe_difference(own: NeutralModel, theirs: NeutralModel) -> str:
-    """Describe the first parameter in which two readings of equivalent files differ.
-
-    Args:
-        theirs: of the rewritten file, with the names of the first.
-
-    Returns:
-        A clause; empty where they differ by rounding only.
-
-    """
-    named = {body.name: body for body in theirs.bodies}
-    for body in own.bodies:
-        if body.name not in named:
-            return f"there is no body {body.name}"
-        kinds = [_joint_words(b.joints) for b in (named[body.name], body)]
-        if kinds[0] != kinds[1]:
-            return f"the joints of body {body.name} are {kinds[0]}, as written {kinds[1]}"
-    changes = differences(own, theirs, has_rest_poses=True)
-    if not changes:
-        return ""
-    first, word = changes[0], FIELD_WORDS.get(changes[0].field, changes[0].field)
-    if first.field == "additional body":
-        return f"there is another body, {first.body}"
-    values = format_value(first.theirs, first.own), format_value(first.own, first.theirs)
-    more = f" ({len(changes)} parameters differ)" if len(changes) > 1 else ""
-    return f"the {word} of {first.owner} is {values[0]}, as written {values[1]}{more}"
-
-
-def _parent_names(model: NeutralModel) -> dict[str, str]:
-    return {b.name: model.bodies[b.parent].name if b.parent >= 0 else "world" for b in model.bodies}
-
-
-def _differs(own: Any, theirs: Any, scale: float, least: float = RELATIVE_CHANGE) -> bool:
-    a, b = np.asarray(own, float), np.asarray(theirs, float)
-    size = max(float(np.max(np.abs(a))), float(np.max(np.abs(b))), scale)
-    return bool(np.max(np.abs(a - b)) > least * size)
-
-
-def _joint_changes(body: NeutralBody, other: NeutralBody, size: float, least: float) -> list[Change]:
-    """Differences of the joints of one body."""
-    found = []
-    for joint, read in zip(body.joints, other.joints, strict=True):
-        for field in JOINT_FIELDS:
-            values = getattr(joint, field), getattr(read, field)
-            if field == "spring_reference" and joint.stiffness == 0 == read.stiffness:
-                continue
-            if field == "anchor":
-                is_different = _differs(_across(joint), _across(read), size, least)
-            else:
-                is_different = _differs(*values, 0.0, least)
-            if is_different:
-                source = joint.fields.get(field, joint.source)
-                found.append(Change(field, body.name, joint.name, *values, source))
-    return found
-
-
-def _across(joint: ElementaryJoint) -> Array:
-    """The anchor without its part along a hinge's axis, which moves nothing."""
-    if joint.kind != "hinge":
-        return np.asarray(joint.anchor, float)
-    return np.asarray(joint.anchor - joint.axis * float(joint.axis @ joint.anchor), float)
-
-
-def omissions(model: NeutralModel) -> list[list[Change]]:
-    """List terms of a model that an engine's dynamics may leave out, per field all joints together.
-
-    Args:
-        model: a model, fixed bodies lumped.
-
-    Returns:
-        Groups of changes that set the field to zero.
-
-    """
-    groups = []
-    for field in OMITTED_FIELDS:
-        group = [
-            Change(
-                field,
-                body.name,
-                joint.name,
-                value,
-                0.0,
-                joint.fields.get(field, joint.source),
-                is_omitted=True,
-            )
-            for body in model.bodies
-            for joint in body.joints
-            if (value := getattr(joint, field))
-        ]
-        groups += [group] if group else []
-    if np.any(model.gravity):
-        groups.append(
-            [Change("gravity", "", "", model.gravity, np.zeros(3), model.gravity_source, is_omitted=True)]
-        )
-    return groups
-
-
-def energy_omissions(model: NeutralModel) -> list[list[Change]]:
-    """List armatures that a kinetic energy may leave out, by joints along coordinate axes and alone or not.
-
-    Args:
-        model: a model, fixed bodies lumped.
-
-    Returns:
-        Groups of changes, a change per joint with an armature.
-
-    """
-    groups: dict[tuple[bool, bool], list[Change]] = {}
-    for body in model.bodies:
-        for joint in body.joints:
-            if joint.armature:
-                source = joint.fields.get("armature", joint.source)
-                change = Change(
-                    ARMATURE_ENERGY, body.name, joint.name, joint.armature, 0.0, source, is_omitted=True
-                )
-                is_aligned = bool(np.max(joint.axis) == 1)  # engines have own joint types for these
-                groups.setdefault((is_aligned, len(body.joints) > 1), []).append(change)
-    return list(groups.values())
-
-
-def apply_changes(own: NeutralModel, theirs: NeutralModel, changes: Sequence[Change]) -> NeutralModel:
-    """Make changes in a model.
-
-    Args:
-        own: the neutral model, fixed bodies lumped.
-        theirs: the importer's description, from which additional bodies are taken.
-        changes: of `differences` and `omissions`.
-
-    """
-    bodies = {body.name: body for body in own.bodies}
-    parents = _parent_names(own) | {
-        c.body: _parent_names(theirs)[c.body] for c in changes if c.field == "additional body"
-    }
-    gravity = own.gravity
-    for change in changes:
-        if change.field in (ARMATURE_ENERGY, FRAME, SLIDE_SCALE, ORIGIN):
-            continue
-        if change.field == "gravity":
-            gravity = change.theirs
-        elif change.field == "additional body":
-            bodies[change.body] = change.theirs
-        elif change.field == "parent":
-            parents[change.body] = change.theirs
-        elif change.joint:
-            body = bodies[change.body]
-            joints = tuple(
-                replace(joint, **{change.field: change.theirs}) if joint.name == change.joint else joint
-                for joint in body.joints
-            )
-            bodies[change.body] = replace(body, joints=joints)
-        else:
-            name = change.carrier or change.body
-            bodies[name] = replace(bodies[name], **(change.also or {change.field: change.theirs}))
-    return replace(own, bodies=_ordered(bodies, parents), gravity=gravity)
-
-
-def _ordered(bodies: Mapping[str, NeutralBody], parents: Mapping[str, str]) -> tuple[NeutralBody, ...]:
-    """Bodies with the indices of their parents, parents first; without a parent: on the world."""
-    placed: dict[str, int] = {}
-    found: list[NeutralBody] = []
-    waiting = list(bodies.values())
-    while waiting:
-        ready = [b for b in waiting if parents[b.name] in placed or parents[b.name] not in bodies]
-        for body in ready or waiting[:1]:
-            placed[body.name] = len(found)
-            found.append(replace(body, parent=placed.get(parents[body.name], -1)))
-        done = {body.name for body in found}
-        waiting = [body for body in waiting if body.name not in done]
-    return tuple(found)
-
-
 def _causes(title: str, changes: Sequence[Change], remaining: float) -> tuple[Cause, ...]:
     """Group the changes by field and write a sentence about each group."""
-    groups: dict[tuple[str, bool], list[Change]] = {}
-    for change in changes:
-        groups.setdefault((change.field, change.is_omitted), []).append(change)
+    groups = grouped(changes, lambda change: (change.field, change.is_omitted))
     alone = len(groups) == 1
     found = []
     for (field, _), members in groups.items():
         proof = "this alone explains" if alone else f"with the other {len(groups) - 1} it explains"
-        phrase = _describe(members)
+        phrase = describe_changes(members)
         sentence = f"{title} {phrase}; {proof} every quantity (worst {remaining:.2g} of the rounding)."
         found.append(Cause(field, tuple(members), phrase, sentence))
     return tuple(found)
-
-
-def _describe(members: Sequence[Change]) -> str:
-    """What an importer does to one field, as a verb phrase."""
-    first, word = members[0], FIELD_WORDS.get(members[0].field, members[0].field)
-    if first.field == FRAME:
-        shift = format_value(first.theirs[:, 3], np.zeros(3))
-        return (
-            f"puts the frame of {len(members)} bodies ({_names(members)}) elsewhere in the body, that of "
-            f"{first.body} at {shift} ({first.source}), which moves no mass"
-        )
-    if first.field == ORIGIN:
-        shift = format_value(first.theirs, np.zeros(3))
-        return (
-            f"counts the coordinates of the free joint of body {first.body} from {shift} and not from the "
-            f"world's origin ({first.source}), so that all its bodies are displaced"
-        )
-    if first.field == SLIDE_SCALE:
-        slides = f"slide {first.joint}" if len(members) == 1 else f"{len(members)} slides ({_names(members)})"
-        return (
-            f"multiplies the coordinate of {slides} by the length of its axis where it places bodies, "
-            f"that of {first.joint} by {format_value(first.theirs, 1.0)} ({first.source}), but not in its "
-            "equations"
-        )
-    if first.field == DEFAULT_INERTIAL:
-        names = "; ".join(f"{change.body} ({change.source})" for change in members[:6])
-        return f"gives 1 kg and an inertia of 1 kg m² to bodies without mass: {names}"
-    if first.field == ASSUMED_INERTIAL:
-        names = "; ".join(f"{change.body} ({change.source})" for change in members[:6])
-        mass = sum(change.theirs for change in members)
-        return f"gives {mass:.6g} kg in all to bodies without <inertial>: {names}"
-    if first.field == MISSING:
-        names = ", ".join(f"{change.body} ({change.source})" for change in members[:6])
-        more = " …" if len(members) > 6 else ""
-        what = "the body" if len(members) == 1 else f"{len(members)} bodies with their joints and masses:"
-        return f"leaves out {what} {names}{more}"
-    if first.field == "additional body":
-        names = ", ".join(change.body for change in members[:6])
-        return f"adds {'body' if len(members) == 1 else 'bodies'} {names}"
-    if first.field == "inertial":
-        names = ", ".join(f"{change.body} ({change.own:.4g} kg, {change.source})" for change in members[:6])
-        what = "mass and inertia" if first.own else "inertia"
-        where = "" if first.body == first.carrier else f", fixed to body {first.carrier}"
-        return f"leaves out the {what} of {names}{where}"
-    if first.field == "joints":
-        return "; ".join(
-            f"reads the joints of body {c.body} as {_joint_words(c.theirs)}; "
-            f"the file says {_joint_words(c.own)} ({c.source})"
-            for c in members[:3]
-        )
-    if first.field == ARMATURE_ENERGY:
-        owners = first.owner if len(members) == 1 else f"{len(members)} joints ({_names(members)})"
-        return f"leaves the armature of {owners} out of its kinetic energy ({first.source})"
-    if first.is_omitted:
-        owners = first.owner if len(members) == 1 else f"{len(members)} joints ({_names(members)})"
-        return f"holds the {word} of {owners} but leaves it out of its equations ({first.source})"
-    if len(members) == 1:
-        own, theirs = format_value(first.own, first.theirs), format_value(first.theirs, first.own)
-        return f"reads the {word} of {first.owner} as {theirs}; the file says {own} ({first.source})"
-    values = {format_value(change.theirs, change.own) for change in members}
-    as_ = f"as {values.pop()}" if len(values) == 1 else "otherwise"
-    kind = "joints" if first.joint else "bodies"
-    own, theirs = format_value(first.own, first.theirs), format_value(first.theirs, first.own)
-    return (
-        f"reads the {word} of {len(members)} {kind} {as_} ({_names(members)}); "
-        f"of {first.owner} the file says {own} ({first.source}), it reads {theirs}"
-    )
-
-
-def _names(members: Sequence[Change]) -> str:
-    names = [change.joint or change.body for change in members]
-    return ", ".join(names[:4]) + (" …" if len(names) > 4 else "")
-
-
-def _joint_words(joints: Sequence[ElementaryJoint]) -> str:
-    return ", ".join(f"{joint.kind} {joint.name}" for joint in joints) or "none (fixed)"
-
-
-def format_value(value: Any, other: Any) -> str:
-    """Write a value with as many digits as it needs to differ from another one.
-
-    Args:
-        value: a number, an array or a text.
-        other: the value that it is compared with.
-
-    """
-    if isinstance(value, str):
-        return value
-    a, b = np.asarray(value, float), np.asarray(other, float)
-    for digits in (4, 7, 10, 13, 17):
-        if a.shape != b.shape or _text(a, digits) != _text(b, digits):
-            break
-    return _text(a, digits)
-
-
-def _text(a: Array, digits: int) -> str:
-    if a.ndim == 0:
-        return f"{float(a) + 0.0:.{digits}g}"  # no negative zero
-    return "(" + ", ".join(_text(part, digits) for part in a) + ")"

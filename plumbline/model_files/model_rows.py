@@ -30,7 +30,6 @@ from plumbline.model_files.importer_cause import (
     Cause,
     Explanation,
     damping_cause,
-    describe_difference,
     explain_importer,
 )
 from plumbline.model_files.model_comparison import (
@@ -43,6 +42,7 @@ from plumbline.model_files.model_comparison import (
     model_states,
     permuted,
 )
+from plumbline.model_files.parameter_changes import describe_difference
 from plumbline.scenario.line_and_column_errors import shorten
 
 MODEL_FAMILY = "model file"  # of the rows, in place of a scenario's family
