@@ -3,6 +3,7 @@
 import ctypes
 import operator
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -323,3 +324,11 @@ def test_importers_of_the_main_environment_and_of_their_own(monkeypatch, tmp_pat
     monkeypatch.setattr(environments, "_read_attribute", lambda module, name, attribute: ".importers")
     with pytest.raises(environments.EnvironmentUnavailable, match="make importers"):
         environments.importer_interpreter("drake")
+
+
+def test_environments_of_importers_have_what_the_core_imports_in_their_workers():
+    """`make importers` installs these locks; without one of the packages every call of an importer fails."""
+    for group in ("importers", "exudyn-importer"):
+        lock = (environments.ROOT / "locks" / f"{group}.lock").read_text(encoding="utf-8")
+        locked = set(re.findall(r"^([\w-]+)==", lock, re.M))
+        assert locked.issuperset(environments.BASE_REQUIREMENTS), group
