@@ -15,6 +15,7 @@ from plumbline.model_files.certified_model import CertifiedModelQuantities, cert
 
 TINY = float(np.finfo(float).tiny)  # replaces a tolerance of zero, so that an error of zero has the ratio 0
 _SPREAD = 0.5  # m: random displacements are up to this
+VECTORS = ("gravity_force", "bias_force", "passive_force", "acceleration")  # one number per velocity
 MAX_JOINTS = 1000  # whose values are kept
 
 
@@ -27,6 +28,9 @@ class Mismatch:
     ratio: float
     state: int
     where: str  # body or joints
+    place: tuple[int, ...] = ()  # of the entry in the array
+    value: float = 0.0  # the importer's
+    expected: float = 0.0
 
 
 def model_states(
@@ -145,9 +149,7 @@ def permuted(answer: ModelQuantities, order: Sequence[int]) -> ModelQuantities:
     """
     index = np.array(order, int)
     changed: dict[str, Any] = {
-        name: getattr(answer, name)[index]
-        for name in ("bias_force", "gravity_force", "passive_force", "acceleration")
-        if getattr(answer, name) is not None
+        name: getattr(answer, name)[index] for name in VECTORS if getattr(answer, name) is not None
     }
     if answer.mass_matrix is not None:
         changed["mass_matrix"] = answer.mass_matrix[np.ix_(index, index)]
@@ -171,39 +173,69 @@ def mismatches(
     names = [j.name for j, _, v in model.joint_slices() for _ in range(v.start, v.stop)]
     found: dict[str, Mismatch] = {}
 
-    def note(quantity: str, error: Any, tolerance: Any, state: int, labels: Sequence[str]) -> None:
-        errors = np.atleast_1d(np.asarray(error, float))
-        if not errors.size:
+    def note(quantity: str, theirs: Any, own: Any, tolerance: Any, state: int, labels: Sequence[str]) -> None:
+        values, expected = np.atleast_1d(theirs), np.atleast_1d(own)
+        if not values.size:
             return
-        tolerances = np.broadcast_to(tolerance, errors.shape)
+        errors, tolerances = np.abs(values - expected), np.broadcast_to(tolerance, values.shape)
         with np.errstate(over="ignore"):  # an error where there are no terms at all
             ratios = errors / np.maximum(tolerances, TINY)
-        at = np.unravel_index(int(np.argmax(ratios)), ratios.shape)
+        at = tuple(map(int, np.unravel_index(int(np.argmax(ratios)), ratios.shape)))
         if quantity not in found or ratios[at] > found[quantity].ratio:
-            where = " and ".join(dict.fromkeys(labels[int(i)] for i in at)) if labels else ""
-            found[quantity] = Mismatch(
-                float(errors[at]), float(tolerances[at]), float(ratios[at]), state, where
-            )
+            where = " and ".join(dict.fromkeys(labels[i] for i in at)) if labels else ""
+            numbers = [float(x[at]) for x in (errors, tolerances, ratios, values, expected)]
+            found[quantity] = Mismatch(*numbers[:3], state, where, at, *numbers[3:])
 
     first = truths[0].quantities.potential_energy, answers[0].potential_energy
     for state, (truth, answer) in enumerate(zip(truths, answers, strict=True)):
-        for body, pose in truth.quantities.poses.items():
-            if body in answer.poses:
-                error, limit = np.abs(answer.poses[body] - pose), truth.tolerance["poses"][body]
-                note("position", error[:, 3], limit[:, 3], state, [f"body {body}"] * 3)
-                note("attitude", np.max(error[:, :3]), limit[0, 0], state, [f"body {body}"])
-        for quantity in ("mass_matrix", "gravity_force", "bias_force", "passive_force", "acceleration"):
-            own, other = getattr(truth.quantities, quantity), getattr(answer, quantity)
-            if own is not None and other is not None:
-                note(quantity, np.abs(other - own), truth.tolerance[quantity], state, names)
-        if answer.kinetic_energy is not None and truth.quantities.kinetic_energy is not None:
-            gap = abs(answer.kinetic_energy - truth.quantities.kinetic_energy)
-            note("kinetic_energy", gap, truth.tolerance["kinetic_energy"], state, ())
+        own, tolerance = truth.quantities, truth.tolerance
+        for body, pose in own.poses.items():
+            if (other := answer.poses.get(body)) is not None:
+                limit, labels = tolerance["poses"][body], [f"body {body}"] * 3
+                note("position", other[:, 3], pose[:, 3], limit[:, 3], state, labels)
+                note("attitude", other[:, :3], pose[:, :3], limit[0, 0], state, labels)
+        for quantity in (*VECTORS, "mass_matrix", "kinetic_energy"):
+            pair = getattr(answer, quantity), getattr(own, quantity)
+            if pair[0] is not None and pair[1] is not None:
+                labels = names if np.ndim(pair[0]) else []
+                note(quantity, *pair, tolerance[quantity], state, labels)
         if state and None not in (*first, answer.potential_energy):
-            change = answer.potential_energy - first[1]  # type: ignore[operator]
-            own = truth.quantities.potential_energy - first[0]  # type: ignore[operator]
-            note("potential_energy", abs(change - own), truth.tolerance["potential_energy"], state, ())
+            change = [one.potential_energy - start for one, start in ((answer, first[1]), (own, first[0]))]  # type: ignore[operator]
+            note("potential_energy", *change, tolerance["potential_energy"], state, ())
     return found
+
+
+def mismatches_as_read(
+    reading: NeutralModel,
+    truth: CertifiedModelQuantities,
+    read: CertifiedModelQuantities,
+    answer: ModelQuantities,
+    order: Sequence[int],
+) -> dict[str, Mismatch]:
+    """Find the worst entries of one state in the importer's own order.
+
+    The tolerance is the larger one of what the file says and of what the importer reads, so that the engine's
+    rounding of large terms beside an expected zero is no evidence.
+
+    Args:
+        truth: of the file, in the model's order.
+        read: of the reading.
+        answer: of the importer.
+        order: of `joint_permutation`.
+
+    """
+    back = np.argsort(np.array(order, int))
+
+    def widened(name: str, limit: Any) -> Any:
+        other = read.tolerance.get(name)
+        if name == "poses":
+            return {body: np.maximum(x, other.get(body, 0.0)) for body, x in limit.items()}
+        limit = np.asarray(limit)[np.ix_(*[back] * np.ndim(limit))]
+        return limit if other is None or getattr(read.quantities, name) is None else np.maximum(limit, other)
+
+    tolerance = {name: widened(name, limit) for name, limit in truth.tolerance.items()}
+    own = CertifiedModelQuantities(permuted(truth.quantities, back.tolist()), tolerance)
+    return mismatches(reading, [own], [answer])
 
 
 def certify_states(model: NeutralModel, states: Sequence[CanonicalState]) -> list[CertifiedModelQuantities]:

@@ -90,6 +90,10 @@ def moving_mass(model: NeutralModel) -> float:
     return float(sum(body.mass for body, moves in zip(model.bodies, moving, strict=True) if moves))
 
 
+def _row(context: RowContext, quantity: str, *arguments: Any, **more: Any) -> Row:
+    return context.make_row("model", "-", quantity, *arguments, **more)
+
+
 def judge_answer(
     context: RowContext,
     model: NeutralModel,
@@ -107,11 +111,9 @@ def judge_answer(
 
     """
     if answer.reading is not None and answer.reading.model is None:
-        return [
-            context.make_row("model", "-", "all", Verdict.UNSUPPORTED, f"{REFUSED}{answer.reading.refusal}")
-        ]
+        return [_row(context, "all", Verdict.UNSUPPORTED, f"{REFUSED}{answer.reading.refusal}")]
     if answer.failure or answer.reading is None or answer.reading.model is None:
-        return [context.make_row("model", "-", "all", Verdict.FAILED, answer.failure or "no answer")]
+        return [_row(context, "all", Verdict.FAILED, answer.failure or "no answer")]
     reading = answer.reading.model
     order = joint_permutation(model, reading)
     rows = [_joints_row(context, model, reading, order), _mass_row(context, model, reading)]
@@ -122,18 +124,18 @@ def judge_answer(
     for quantity, unit in MODEL_UNITS.items():
         if quantity in unsupported:
             reason = unsupported[quantity]
-            rows.append(context.make_row("model", "-", quantity, Verdict.INFORMATION, reason, unit))
+            rows.append(_row(context, quantity, Verdict.INFORMATION, reason, unit))
         elif quantity in worst:
             rows.append(_quantity_row(context, quantity, unit, worst[quantity], len(truths)))
         elif quantity == "acceleration" and is_singular:
             reason = (
-                "no acceleration is determined: the mass matrix is singular in double precision, as where "
+                "no acceleration is determined: the mass matrix is singular in double precision, as where a "
+                "joint moves no mass, or where masses or lengths differ by many orders of magnitude"
             )
-            reason += "a joint moves no mass, or where masses or lengths differ by many orders of magnitude"
-            rows.append(context.make_row("model", "-", quantity, Verdict.INFORMATION, reason, unit))
+            rows.append(_row(context, quantity, Verdict.INFORMATION, reason, unit))
         elif any(getattr(one, quantity, 0.0) is None for one in answer.quantities):
             reason = "the importer's engine computes it of other files, not of this one"
-            rows.append(context.make_row("model", "-", quantity, Verdict.INFORMATION, reason, unit))
+            rows.append(_row(context, quantity, Verdict.INFORMATION, reason, unit))
     return rows
 
 
@@ -143,7 +145,7 @@ def _joints_row(
     count = len(model.joints)
     if order is not None:
         reason = f"the same {count} joints with {model.velocity_count} degrees of freedom"
-        return context.make_row("model", "-", "joints", Verdict.AGREES, reason, value=0.0, tolerance=0.0)
+        return _row(context, "joints", Verdict.AGREES, reason, value=0.0, tolerance=0.0)
     own, theirs = (set(joint_keys(m)) for m in (model, reading))
     parts = [
         f"{what} {', '.join(f'{name} ({kind})' for name, kind in sorted(joints)[:6])}"
@@ -153,7 +155,7 @@ def _joints_row(
     ]
     reason = f"other joints than the file: {'; '.join(parts)}; the other quantities are not comparable"
     number = float(len(own ^ theirs))
-    return context.make_row("model", "-", "joints", Verdict.DISAGREES, reason, value=number, tolerance=0.0)
+    return _row(context, "joints", Verdict.DISAGREES, reason, value=number, tolerance=0.0)
 
 
 def _mass_row(context: RowContext, model: NeutralModel, reading: NeutralModel) -> Row:
@@ -166,9 +168,7 @@ def _mass_row(context: RowContext, model: NeutralModel, reading: NeutralModel) -
         else f"the moving bodies have {theirs:.9g} kg, in the file {own:.9g} kg"
     )
     verdict = Verdict.AGREES if agrees else Verdict.DISAGREES
-    return context.make_row(
-        "model", "-", "total_mass", verdict, reason, "kg", value=error, tolerance=tolerance
-    )
+    return _row(context, "total_mass", verdict, reason, "kg", value=error, tolerance=tolerance)
 
 
 def _damping_row(context: RowContext, cause: Cause | None) -> Row:
@@ -178,8 +178,8 @@ def _damping_row(context: RowContext, cause: Cause | None) -> Row:
     else:
         reason, error = cause.sentence, max(abs(change.theirs - change.own) for change in cause.changes)
     verdict = Verdict.DISAGREES if cause else Verdict.AGREES
-    return context.make_row(
-        "model", "-", "damping", verdict, reason, "SI", value=error, tolerance=0.0,
+    return _row(
+        context, "damping", verdict, reason, "SI", value=error, tolerance=0.0,
         diagnosis=reason if cause else None,
     )  # fmt: skip
 
@@ -210,9 +210,7 @@ def rewriting_row(context: RowContext, model: NeutralModel, rewritten: Mapping[s
         reason = f"{context.title} {context.version} compiles equivalent files to different models: {reason}"
     if len(refused) == len(rewritten):
         verdict = Verdict.INFORMATION
-    return context.make_row(
-        "model", "-", "rewritings", verdict, reason, "1", value=float(len(wrong)), tolerance=0.0
-    )
+    return _row(context, "rewritings", verdict, reason, "1", value=float(len(wrong)), tolerance=0.0)
 
 
 def _quantity_row(context: RowContext, quantity: str, unit: str, worst: Mismatch, count: int) -> Row:
@@ -226,8 +224,8 @@ def _quantity_row(context: RowContext, quantity: str, unit: str, worst: Mismatch
         else f"{name} off by {worst.error:.3g}{where}, state {worst.state}; "
         f"rounding explains {worst.tolerance:.1g}"
     )
-    return context.make_row(
-        "model", "-", quantity, Verdict.AGREES if agrees else Verdict.DISAGREES, reason, unit,
+    return _row(
+        context, quantity, Verdict.AGREES if agrees else Verdict.DISAGREES, reason, unit,
         value=worst.error, tolerance=worst.tolerance, ratio=worst.ratio,
         derivation="magnitudes of the terms × rounding (plumbline/model_files/certified_model.py)",
     )  # fmt: skip
@@ -285,10 +283,10 @@ def judge_importer(
     if answer.reading is None and not answer.failure:
         formats = declared_importer_attribute(split_version(name)[0], "formats")
         reason = f"{info.title} reads {' and '.join(formats).upper()} files only"
-        return [context.make_row("model", "-", "all", Verdict.INFORMATION, reason)], None
+        return [_row(context, "all", Verdict.INFORMATION, reason)], None
     if info.missing is not None:
         verdict = Verdict.FAILED if info.has_failed else Verdict.NOT_INSTALLED
-        return [context.make_row("model", "-", "all", verdict, info.missing)], None
+        return [_row(context, "all", verdict, info.missing)], None
     unsupported = declared_importer_attribute(split_version(name)[0], "unsupported") or {}
     applies = "passive_force" not in unsupported
     judged = (model, truth.states) if applies else (without_passive_forces(model), truth.without_passive)

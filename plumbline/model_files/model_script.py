@@ -8,27 +8,25 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from plumbline.engines.environments import split_version
 from plumbline.engines.importer_calls import evaluate_model_file, run_script
-from plumbline.importers.neutral_model import (
-    CanonicalState,
-    ModelQuantities,
-    NeutralModel,
-    without_passive_forces,
-)
+from plumbline.importers.neutral_model import CanonicalState, NeutralModel, without_passive_forces
 from plumbline.importers.xml_tree import Element, write_xml
 from plumbline.judging.rows import Verdict
-from plumbline.model_files.certified_model import CertifiedModelQuantities
 from plumbline.model_files.importer_cause import Explanation
-from plumbline.model_files.model_comparison import TINY, certify_states, joint_keys, joint_permutation
+from plumbline.model_files.model_comparison import (
+    certify_states,
+    joint_keys,
+    joint_permutation,
+    mismatches_as_read,
+)
 from plumbline.model_files.model_rows import FileResult
 from plumbline.model_files.model_run import FileRun, ModelPlan, describe_importers, run_files
 from plumbline.model_files.prepared_file import BaseChoice
@@ -36,6 +34,7 @@ from plumbline.model_files.xml_shrink import shrink_tree
 from plumbline.processes.exceptions import PlumblineError
 from plumbline.processes.isolation import ScratchFolder
 from plumbline.processes.worker_pool import Limits, Task, WorkerPool
+from plumbline.reproduce.render import template_environment
 
 FORMS = ("mujoco", "pinocchio", "exudyn", "drake", "dart")
 SHRINKING_SECONDS = 60.0
@@ -88,6 +87,7 @@ class ModelScript:
     file: str  # the shrunk model file
     engine_value: float
     expected: float
+    allowed: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +100,7 @@ class _Shown:
     state: CanonicalState  # of the engine's reading
     engine_value: float
     expected: float
+    allowed: float
 
 
 def write_model_script(
@@ -234,13 +235,6 @@ class _Bench:
         explanation = result.explanations.get(self.importer)
         return next(_shown_numbers(self, result.model, self.reading, explanation), None)
 
-    def evaluate(self, states: Sequence[CanonicalState]) -> list[ModelQuantities]:
-        """The importer's quantities of the file that was judged last."""
-        found: list[ModelQuantities] = self.call(
-            evaluate_model_file, self.name, self.run.prepared.file, tuple(states)
-        )
-        return found
-
 
 def _write(bench: _Bench, form: str, result: FileResult, text: str, since: str) -> ModelScript:
     """Write the script about the first quantity that differs at a simple state and that it prints."""
@@ -249,7 +243,7 @@ def _write(bench: _Bench, form: str, result: FileResult, text: str, since: str) 
         script = _render(bench, form, result, text, since, number)
         value = _printed_number(bench.call(run_script, script) or "")
         if math.isclose(value, number.engine_value, rel_tol=PRINTED_PRECISION):
-            return ModelScript(script, text, number.engine_value, number.expected)
+            return ModelScript(script, text, number.engine_value, number.expected, number.allowed)
     raise NoModelScript("the difference does not show at a state with round numbers")
 
 
@@ -267,45 +261,33 @@ def _render(bench: _Bench, form: str, result: FileResult, text: str, since: str,
     title = f"{bench.info.title} {bench.info.version}"
     phrases = [cause.phrase for cause in explanation.causes] if explanation else []
     phrases = phrases or ["reads another robot than the file says"]
-    why = " ".join([*(f"{title} {phrase}." for phrase in phrases), EXPECTED, since])
+    file = bench.run.prepared.file
+    template = template_environment().get_template("model-file.py.j2")
     moves = bool(np.any(number.state.velocities))
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
-        undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
-    )  # fmt: skip
-    return environment.get_template("model_script.py.j2").render(
+    script = template.render(
         form=form,
-        format=bench.run.prepared.file.format,
-        is_fixed=bench.run.prepared.file.base == "fixed",
+        format=file.format,
+        is_fixed=file.base == "fixed",
         root_body=result.model.bodies[0].name,
-        title=title,
-        why=_wrapped(why),
+        title=bench.info.title,
+        why=" ".join([*(f"{title} {phrase}." for phrase in phrases), EXPECTED, since]),
         xml=text.rstrip(),
         number=number,
-        x=_coordinates(form, bench, number.state),
+        x=_coordinates(form, bench.reading, number.state),
         v=_literal(number.state.velocities) if moves else None,
     )
+    return f"{script}\n"
 
 
-def _coordinates(form: str, bench: _Bench, state: CanonicalState) -> str | None:
+def _coordinates(form: str, reading: NeutralModel, state: CanonicalState) -> str | None:
     """The coordinates as an engine's calls take them; None where nothing is moved."""
     values: list[float] = []
     is_moved = False
-    for joint, x, _ in bench.reading.joint_slices():
+    for joint, x, _ in reading.joint_slices():
         count = {"ball": 3, "free": 6}.get(joint.kind)
-        own = NEUTRAL.get(form, {}).get(joint.kind, (0,) * (count or 1)) if count else state.coordinates[x]
-        values.extend(own)
+        values.extend(NEUTRAL.get(form, {}).get(joint.kind, (0,) * count) if count else state.coordinates[x])
         is_moved |= count is None and bool(np.any(state.coordinates[x]))
     return _literal(values) if is_moved else None
-
-
-def _wrapped(text: str, width: int = 108) -> str:
-    lines = [""]
-    for word in text.split():
-        if len(lines[-1]) + len(word) + 1 > width:
-            lines.append("")
-        lines[-1] = f"{lines[-1]} {word}".strip()
-    return "\n".join(lines)
 
 
 def _literal(values: Any) -> str:
@@ -334,68 +316,24 @@ def _shown_numbers(
         count = float(reading.velocity_count)
         if count != model.velocity_count:
             state = CanonicalState(np.zeros(0), np.zeros(0))
-            yield _Shown("freedom", (), "degrees of freedom", state, count, float(model.velocity_count))
+            yield _Shown("freedom", (), "degrees of freedom", state, count, float(model.velocity_count), 0.0)
         return
     states = _simple_states(reading)
-    answers = bench.evaluate(states)
+    answers = bench.call(evaluate_model_file, bench.name, bench.run.prepared.file, tuple(states))
     applied = all(answer.passive_force is not None for answer in answers)
     judged, theirs = (m if applied else without_passive_forces(m) for m in (model, reading))
-    truths = [certify_states(judged, [_reordered(state, reading, model)])[0] for state in states]
-    read = certify_states(theirs, states)
+    truths = certify_states(judged, [_reordered(state, reading, model) for state in states])
+    pairs = zip(truths, certify_states(theirs, states), answers, strict=True)
+    worst = [mismatches_as_read(reading, *pair, order) for pair in pairs]
     for quantity in SHOWN_QUANTITIES:
-        if quantity == "passive_force" and bench.name != "mujoco":
-            continue
-        for state, answer, truth, other in zip(states, answers, truths, read, strict=True):
-            found = _worst_entry(quantity, answer, truth, other, order)
-            if found is not None:
-                yield _Shown(quantity, found[1], found[0], state, *found[2:])
+        for state, found in zip(states, worst, strict=True):
+            is_shown = quantity != "passive_force" or bench.name == "mujoco"
+            if is_shown and (number := found.get(quantity)) and number.ratio > 1:
+                body = f" of {number.where}" if quantity == "position" else ""
+                label, numbers = f"{quantity.replace('_', ' ')}{body}", (number.value, number.expected)
+                yield _Shown(quantity, tuple(sorted(number.place)), label, state, *numbers, number.tolerance)
     if bench.name == "exudyn":
         yield from _shown_damping(explanation, reading)
-
-
-def _worst_entry(
-    quantity: str,
-    answer: ModelQuantities,
-    truth: CertifiedModelQuantities,
-    read: CertifiedModelQuantities,
-    order: Sequence[int],
-) -> tuple[str, tuple[int, ...], float, float] | None:
-    """The entry that differs most beyond rounding: label, index, the engine's number, the expected one.
-
-    The bound is the larger one of what the file says and of what the importer reads, so that the engine's
-    rounding of large terms beside an expected zero is no evidence.
-    """
-    if quantity == "position":
-        triples = {
-            f"position of body {body}": (
-                answer.poses[body][:, 3],
-                pose[:, 3],
-                np.maximum(truth.tolerance["poses"][body], read.tolerance["poses"].get(body, 0.0))[:, 3],
-            )
-            for body, pose in truth.quantities.poses.items()
-            if body in answer.poses
-        }
-    else:
-        values, own = getattr(answer, quantity), getattr(truth.quantities, quantity)
-        if values is None or own is None:
-            return None
-        index = np.ix_(*[np.argsort(order)] * own.ndim)
-        limit = truth.tolerance[quantity][index]
-        if getattr(read.quantities, quantity) is not None:
-            limit = np.maximum(limit, read.tolerance[quantity])
-        triples = {quantity.replace("_", " "): (values, own[index], limit)}
-    worst = 1.0
-    found = None
-    for label, (values, expected, limit) in triples.items():
-        if not np.size(values):
-            continue
-        with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
-            ratios = np.nan_to_num(np.abs(values - expected) / np.maximum(limit, TINY), nan=0.0)
-        place = tuple(sorted(int(i) for i in np.unravel_index(int(np.argmax(ratios)), ratios.shape)))
-        if ratios[place] > worst:
-            worst = ratios[place]
-            found = label, place, float(values[place]), float(expected[place])
-    return found
 
 
 def _shown_damping(explanation: Explanation | None, reading: NeutralModel) -> Iterator[_Shown]:
@@ -405,7 +343,7 @@ def _shown_damping(explanation: Explanation | None, reading: NeutralModel) -> It
     for change in changes:
         if change.field == "damping" and change.joint in names:
             index, label = (names.index(change.joint),), f"damping of joint {change.joint}"
-            yield _Shown("damping", index, label, _simple_states(reading)[0], change.theirs, change.own)
+            yield _Shown("damping", index, label, _simple_states(reading)[0], change.theirs, change.own, 0.0)
 
 
 def _reordered(state: CanonicalState, reading: NeutralModel, model: NeutralModel) -> CanonicalState:

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 
@@ -23,13 +23,13 @@ from plumbline.judging.rows import Row, RowContext, Verdict
 from plumbline.judging.trajectory_level import FINEST_RUN_SHOWN, LIMIT_QUANTITIES, trajectory_rows
 from plumbline.measurements.relation_result import OTHER_FORMULATION_PREFIX
 from plumbline.measurements.state_relations import (
+    QUANTITIES,
     STATE_RELATIONS,
+    TIME_REVERSED,
     WELDED_HALVES,
-    Relation,
-    quantity_values,
-    unchanged,
+    scale_fields,
 )
-from plumbline.model.datatypes import Array, Integrator, StateQuantities
+from plumbline.model.datatypes import Array, Integrator
 from plumbline.model.invariants import MOTION_UNITS, motion_samples
 from plumbline.model.step_methods import JointSpaceMethod, describe_method
 from plumbline.model.welding import split_bodies
@@ -42,66 +42,52 @@ from plumbline.truth.rounding_bound import state_rounding_bound
 from plumbline.truth.step_comparison import FormulaSteps
 
 LIMITS = (*LIMIT_QUANTITIES, *FINEST_RUN_SHOWN)
+TRANSFORMS = {relation.name: relation.transform for relation in STATE_RELATIONS}
 WORK_SAMPLES = 64  # of a run where the work of moments and drag is integrated
 TINY = 1e-300
 
 
 @dataclass(frozen=True, eq=False)
-class StateEvidence:
-    """A state at which the engine's answers differ from the expected ones."""
+class Evidence:
+    """A case in which an engine is wrong, and what is right there: the search and the script share it."""
 
     case: ReproductionCase
     ratio: float  # largest error over its bound
-    truth: dict[str, Array]  # expected value of each quantity
-    bound: dict[str, Array]  # (N,) or a number: of the norm of the error, per body; of each entry of a matrix
+    engine: str  # that is wrong, without a version
+    expected: dict[str, Array]  # value of each quantity, at a state or at the end of a run
+    # (N,) or a number: of the norm of the error, per body (of attitudes as quaternions), or of each entry
+    bound: dict[str, Array]
+
+
+@dataclass(frozen=True, eq=False)
+class StateEvidence(Evidence):
+    """A state at which the engine's answers differ from the expected ones."""
+
     certified: bool  # whether the truth is certified; else the notes' equations in double precision
+    variant: str = ""  # how the engine computes ("by …", "two welded halves"); empty as usual
+    relation: str = ""  # of this state, by which it was found
 
 
 @dataclass(frozen=True, eq=False)
-class RelationEvidence:
-    """A state for which the engine's two answers differ."""
+class StepEvidence(Evidence):
+    """A few steps that are not those of the declared formula."""
 
-    case: ReproductionCase
-    ratio: float  # largest difference over its bound
-    name: str  # of the relation
-    variant: str  # how the engine computes the second answer ("by …", "two welded halves"); empty as usual
-    other: ReproductionCase  # the second description of the state
-    other_engine: str  # the engine that evaluates it
-    back: dict[str, Array]  # (3, 3) or a number per quantity: takes the second answer back to the first
-    bound: dict[str, Array]  # of both answers
+    integrator: Integrator
+    times: Array  # (2,) s, start and end
+    count: int  # of steps
+    formula: str  # in words
 
 
 @dataclass(frozen=True, eq=False)
-class MotionEvidence:
+class MotionEvidence(Evidence):
     """A refinement study whose order, limit or drift is off."""
 
-    case: ReproductionCase
-    ratio: float
-    times: Array  # (T,) s
     integrator: Integrator
+    times: Array  # (T,) s
     ordered: bool  # whether the observed order is in dispute
     drifts: tuple[str, ...]  # invariants that are in dispute
     sizes: tuple[float, float]  # m and m/s: scales of r and v where orders are observed
-    expected: dict[str, Array]  # at the end, of each quantity whose limit is in dispute
-    uncertain: dict[str, float]  # what each of them may be off by, per body; attitudes as quaternions
     eliminated: dict[str, int]  # how many powers of the step Romberg's scheme eliminates, per quantity
-
-
-@dataclass(frozen=True, eq=False)
-class StepEvidence:
-    """A few steps that are not those of the declared formula."""
-
-    case: ReproductionCase
-    ratio: float
-    times: Array  # (2,) s, start and end
-    count: int  # of steps
-    integrator: Integrator
-    formula: str  # in words
-    expected: dict[str, Array]  # at the end
-    bound: dict[str, Array]  # (N,)
-
-
-Evidence = StateEvidence | RelationEvidence | MotionEvidence | StepEvidence
 
 
 @dataclass(frozen=True)
@@ -179,14 +165,16 @@ class StateMeasure:
     """Error of an engine's answers at a state, over the bounds of rounding."""
 
     engine: EngineClient
-    quantities: tuple[str, ...]
+    quantities: tuple[str, ...] = QUANTITIES
+    variant: str = ""
 
     def __call__(self, case: ReproductionCase) -> StateEvidence | None:
         """Measure a case; None where the engine, the truth or the bound refuses it."""
         model, state, certified = case.model, case.state, True
         try:
-            answers = self.engine.evaluate(model, state)
-            allowed = state_rounding_bound(model, state)
+            answers = self.engine.evaluate(model, state, self.variant)
+            parts = [split_bodies(model)] if self.variant == WELDED_HALVES else []
+            allowed = state_rounding_bound(model, state, *parts)
             try:
                 truth = certify_state(model, state, mass_matrix="mass_matrix" in self.quantities).quantities
             except TruthUnavailable:
@@ -196,79 +184,40 @@ class StateMeasure:
         offered = [q for q in self.quantities if getattr(answers, q) is not None]
         found, right = ({q: np.asarray(getattr(x, q), float) for q in offered} for x in (answers, truth))
         bound = {q: np.asarray(allowed.tolerance(q), float) for q in offered}
-        return StateEvidence(case, _largest_ratio(found, right, bound), right, bound, certified)
+        ratio = _largest_ratio(found, right, bound)
+        return StateEvidence(case, ratio, self.engine.name, right, bound, certified, self.variant)
 
 
 @dataclass(frozen=True)
 class RelationMeasure:
-    """Difference of an engine's two answers for one state, over the bounds of rounding of both."""
+    """Errors of the two answers that a relation compares.
+
+    Where they differ by more than the bounds of both, one of them is off by more than its own.
+    """
 
     engine: EngineClient
     name: str  # of the relation
-    back: dict[str, Array] = field(default_factory=dict)  # see `inverse_transforms`: the same for every case
 
-    def __call__(self, case: ReproductionCase) -> RelationEvidence | None:
-        """Measure a case; None where the two answers cannot be compared."""
-        model, state, engine = case.model, case.state, self.engine
-        relation = next((r for r in STATE_RELATIONS if r.name == self.name), None)
-        variant = "" if relation or self.name.startswith(OTHER_FORMULATION_PREFIX) else self.name
-        relation = relation or Relation(self.name, unchanged, quantity_values)
+    def __call__(self, case: ReproductionCase) -> StateEvidence | None:
+        """Measure a case by the answer that is farther off; None where the two cannot be compared."""
+        first, other = self.answers(case)
+        if first is None or other is None:
+            return None
+        return replace(max(first, other, key=lambda found: found.ratio), relation=self.name)
+
+    def answers(self, case: ReproductionCase) -> tuple[StateEvidence | None, StateEvidence | None]:
+        """Measure the engine's usual answer, and the other one."""
+        usual, transform = StateMeasure(self.engine), TRANSFORMS.get(self.name)
+        if self.name == TIME_REVERSED.name:
+            case = replace(case, model=scale_fields(case.model, drag_force=0.0, drag_moment=0.0))
         if self.name.startswith(OTHER_FORMULATION_PREFIX):
-            engine = replace(engine, name=self.name.removeprefix(OTHER_FORMULATION_PREFIX))
-        if model.has_drag and self.name == "time reversed":
-            return None
-        try:
-            other = ReproductionCase(*relation.transform(model, state))
-            first = quantity_values(self.engine.evaluate(model, state))
-            answers = engine.evaluate(other.model, other.state, variant)
-            bounds = [state_rounding_bound(model, state)] * 2
-            if variant == WELDED_HALVES:
-                bounds[1] = state_rounding_bound(model, state, split_bodies(model))
-        except Exception:
-            return None
-        second = relation.transform_back(answers)
-        if not self.back:
-            self.back.update(inverse_transforms(relation, answers))
-        both = [q for q in first if q in second]
-        bound = {q: np.sum([np.asarray(b.tolerance(q), float) for b in bounds], axis=0) for q in both}
-        back = {q: self.back[q] for q in both}
-        ratio = _largest_ratio(first, second, bound)
-        return RelationEvidence(case, ratio, self.name, variant, other, engine.name, back, bound)
-
-
-def inverse_transforms(relation: Relation, answers: StateQuantities) -> dict[str, Array]:
-    """Find how a relation takes each quantity back, by applying it to unit vectors.
-
-    Args:
-        relation: how the second description of a state is made and its answers are taken back.
-        answers: the engine's answers for the second description of a state.
-
-    Returns:
-        Per quantity a factor, or a matrix (3, 3) that acts on the last axis.
-
-    Raises:
-        NotImplementedError: the relation does something else, which a script could not express in numbers.
-
-    """
-    found: dict[str, Array] = {}
-    for q, value in relation.transform_back(answers).items():
-        given = np.asarray(getattr(answers, q), float)
-
-        def back(y: Any, q: str = q) -> Array:
-            return np.asarray(relation.transform_back(replace(answers, **{q: y}))[q], float)
-
-        if given.ndim == 0:
-            way = back(1.0)
+            name = self.name.removeprefix(OTHER_FORMULATION_PREFIX)
+            other = replace(usual, engine=replace(self.engine, name=name))(case)
+        elif transform is not None:
+            other = usual(ReproductionCase(*transform(case.model, case.state)))
         else:
-            units = [back(np.broadcast_to(e, given.shape)).reshape(-1, 3)[0] for e in np.eye(3)]
-            way = np.stack(units, axis=1)
-            way = way[0, 0] if np.all(way == way[0, 0] * np.eye(3)) else way
-        again = given @ way.T if np.ndim(way) else way * given
-        limit = 1e-9 * np.max(np.abs(value))
-        if np.shape(again) != np.shape(value) or not np.allclose(again, value, rtol=0, atol=limit):
-            raise NotImplementedError(f"relation {relation.name!r} does not act on each body by a matrix")
-        found[q] = way
-    return found
+            other = replace(usual, variant=self.name)(case)
+        return usual(case), other
 
 
 @dataclass(frozen=True)
@@ -298,10 +247,10 @@ class StepMeasure:
         true = steps.true[0][count]
         names = {"step_position": "r", "step_attitude": "p", "step_velocity": "v", "step_rate": "omega"}
         return StepEvidence(
-            case, ratio, np.array([0.0, case.until]), count, integrator, describe_method(method),
+            case, ratio, self.engine.name,
             {quantity: np.asarray(getattr(true, name), float) for quantity, name in names.items()},
-            # attitudes are compared as quaternions
             {quantity: limits[quantity] / (2 if name == "p" else 1) for quantity, name in names.items()},
+            integrator, np.array([0.0, case.until]), count, describe_method(method),
         )  # fmt: skip
 
 
@@ -383,19 +332,18 @@ class ConvergenceMeasure:
         ratios = [max((_excess(rows[q]) for q in group if q in rows), default=0.0) for group in groups]
         series, limits = self._disputed_series(analysis, rows)
         expected = {q: samples[-1] for q, samples in motion_samples(truth.trajectory).items()}
-        uncertain = {
-            q: float(row.tolerance or 0.0) / (2 if q == "attitude" else 1) for q, row in limits.items()
-        }
+        uncertain = {q: (row.tolerance or 0.0) / (2 if q == "attitude" else 1) for q, row in limits.items()}
         return MotionEvidence(
             case,
             min(ratios, default=0.0),
-            times,
+            self.engine.name,
+            {q: expected[q] if q in expected else _zeros(case, q) for q in series},
+            {q: np.asarray(x, float) for q, x in uncertain.items()},
             self.integrator,
+            times,
             ordered="order" in wanted and "order" in rows,
             drifts=tuple(series) if of_invariants else (),
             sizes=(truth.length, analysis.invariant_scales["gap_rate"]),
-            expected={q: expected[q] if q in expected else _zeros(case, q) for q in series},
-            uncertain=uncertain,
             eliminated={q: analysis.extrapolated_limit(ys).eliminated_powers for q, ys in series.items()},
         )
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 import textwrap
-from functools import cache
+from functools import cache, partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -18,10 +18,10 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from packaging.version import InvalidVersion, Version
 
-from plumbline.engines.environments import declared_attribute, split_version
+from plumbline.engines.environments import declared_attribute
 from plumbline.measurements.order_and_limit import ORDER_MARGIN
 from plumbline.measurements.relation_result import OPTION_PREFIX, OTHER_FORMULATION_PREFIX
-from plumbline.measurements.state_relations import STATE_RELATIONS, WELDED_HALVES
+from plumbline.measurements.state_relations import WELDED_HALVES
 from plumbline.model.datatypes import Array, Model, State
 from plumbline.model.kinematics import (
     quaternion_conjugate,
@@ -33,9 +33,9 @@ from plumbline.model.kinematics import (
 )
 from plumbline.model.welding import split_bodies
 from plumbline.reproduce.measure import (
+    TRANSFORMS,
     Evidence,
     MotionEvidence,
-    RelationEvidence,
     StateEvidence,
     StepEvidence,
 )
@@ -82,43 +82,30 @@ def render_script(row: dict[str, Any], evidence: Evidence) -> str:
         evidence: the shrunk case, with what is expected there.
 
     """
-    engine, shows = split_version(row["engine"])[0], _KINDS[type(evidence)]
     try:
         version = Version(str(row["engine_version"]))
     except InvalidVersion:
         version = Version("9999")
-    model, way, other, option = evidence.case.model, "", "", ""
-    if isinstance(evidence, RelationEvidence):
-        option = evidence.variant.removeprefix(OPTION_PREFIX)
-        way = {"": "described", WELDED_HALVES: "welded"}.get(evidence.variant, "option")
-        other = evidence.other_engine if evidence.other_engine != engine else ""
-        way = "engine" if other else way
+    model, shows, variant = evidence.case.model, _KINDS[type(evidence)], getattr(evidence, "variant", "")
     context = {
         "row": row,
         "evidence": evidence,
-        "kind": "motion" if shows == "step" else shows,  # how the engine is called
         "shows": shows,  # the template of what is compared
-        "engine": engine,
-        "way": way,
-        "again": False,
-        "option": option,
-        "ties": option == "tendon equalities",
+        "evaluates": shows == "state",  # how the engine is called; else it runs
+        "engine": evidence.engine,
+        "welded": variant == WELDED_HALVES,
+        "option": "" if variant == WELDED_HALVES else variant.removeprefix(OPTION_PREFIX),
+        "ties": variant == f"{OPTION_PREFIX}tendon equalities",
         "rods": bool(np.any(model.rods)),
         "loads": model.has_loads or model.has_drag,
         "powered": model.has_drag or bool(np.any(model.moment)),
-        "mass_matrix": "mass_matrix" in getattr(evidence, "bound", ()),
+        "mass_matrix": "mass_matrix" in evidence.bound,
         "steps": list(evidence.case.steps),
         "integrator": getattr(evidence, "integrator", None),
         "margin": ORDER_MARGIN,
         "older": lambda than: version < Version(than),
     }
-    if other:
-        template = _template(other)
-        second = template.new_context(context | {"engine": other, "again": True})
-        code = "".join(template.blocks["engine"](second))
-        names = "|".join(re.findall(r"^def (\w+)", code, re.M))
-        context["second_engine"] = re.sub(rf"\b({names})\(", r"other_\1(", code)
-    return _space_functions(_template(engine).render(context))
+    return _space_functions(_template(evidence.engine).render(context))
 
 
 def no_script_reason(engine: str, row: dict[str, Any]) -> str:
@@ -142,34 +129,31 @@ def no_script_reason(engine: str, row: dict[str, Any]) -> str:
         return ""
     if row["integrator"] != "-":
         return "relations of runs have no script"
-    if relation.startswith(OTHER_FORMULATION_PREFIX) or relation in (r.name for r in STATE_RELATIONS):
+    if relation in TRANSFORMS or relation.startswith(OTHER_FORMULATION_PREFIX):
         return ""
     block = {relation: "option"} if relation.startswith(OPTION_PREFIX) else {WELDED_HALVES: "welded"}
     is_known = block.get(relation) in _template(engine).blocks
     return "" if is_known else f"scripts of {engine} cannot show {relation!r}"
 
 
-_KINDS: dict[type, str] = {
-    StateEvidence: "state",
-    RelationEvidence: "relation",
-    MotionEvidence: "motion",
-    StepEvidence: "step",
-}
+_KINDS: dict[type, str] = {StateEvidence: "state", MotionEvidence: "motion", StepEvidence: "step"}
 
 
 def _template(engine: str) -> Template:
     """The template that the engine's adapter names."""
-    return _environment().get_template(f"{declared_attribute(engine, 'reproduction_template')}.py.j2")
+    return template_environment().get_template(f"{declared_attribute(engine, 'reproduction_template')}.py.j2")
 
 
 @cache
-def _environment() -> Environment:
+def template_environment() -> Environment:
+    """Return the templates of all scripts, of mechanisms and of model files."""
     environment = Environment(
         loader=FileSystemLoader(TEMPLATES), trim_blocks=True, lstrip_blocks=True, undefined=StrictUndefined
     )  # no escaping of HTML: the result is Python, and every text in it passes `ascii`
     environment.filters |= {
         "ascii": ascii,
         "comment": _comment,
+        "wrap": partial(textwrap.fill, width=LINE, break_long_words=False, break_on_hyphens=False),
         "chain": _chain,
         "table": _table,
         "halves": _halves,
@@ -216,7 +200,7 @@ def _table(values: dict[str, Array], name: str) -> str:
 
 def _halves(model: Model) -> str:
     """Write the two parts of every body: mass, centre of mass from the body's, inertia about its own."""
-    lines = ["halves = ["]
+    lines = ["c.pieces = ["]
     for parts in split_bodies(model):
         each = ((f"{part.mass!r}", _literal(part.centre), _literal(part.inertia, "    ")) for part in parts)
         lines += [

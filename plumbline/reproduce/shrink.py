@@ -1,7 +1,7 @@
-"""Search for the smallest case that shows a disagreement: fewest bodies, shortest run, simplest numbers.
+"""Search for the smallest case that still shows a disagreement: greedy deletion of parts (delta debugging).
 
-The search knows nothing of engines: a measure returns by how much a case shows the disagreement, and every
-candidate is measured again.
+The search knows nothing of engines: a predicate says whether a case shows the disagreement.  Cases are
+mechanisms, whose parts are bodies, time and numbers, and model files (`plumbline.model_files.xml_shrink`).
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial, reduce
+from itertools import islice
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
@@ -20,6 +21,33 @@ from plumbline.processes.exceptions import PlumblineError
 
 CLEAR_RATIO = 10.0  # a shrunk case exceeds its tolerance this many times, or half as often as the original
 MIN_RUNS = 3  # of a refinement study: an extrapolation and its uncertainty need three
+Case = TypeVar("Case")
+
+
+def shrink(
+    best: Case,
+    passes: Iterable[Callable[[Case], Iterator[Case]]],
+    shows: Callable[[Case], bool],
+    is_over: Callable[[], bool],
+) -> Case:
+    """Take smaller cases as long as they show what the first one shows.
+
+    Args:
+        best: a case that shows it.
+        passes: each lists smaller cases of a case. After one that shows it, the pass goes on at the same
+            place of the new list: what was tried before stays as it was.
+        shows: whether a case shows it.
+        is_over: whether the best case so far has to do.
+
+    """
+    for smaller_cases in passes:
+        place = 0
+        while not is_over() and (case := next(islice(smaller_cases(best), place, None), None)) is not None:
+            if shows(case):
+                best = case
+            else:
+                place += 1
+    return best
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,11 +68,7 @@ class ReproductionCase:
 
 
 class Measurement(Protocol):
-    """A case, and by how much it shows the disagreement."""
-
-    @property
-    def case(self) -> ReproductionCase:
-        """The measured case."""
+    """By how much a case shows the disagreement."""
 
     @property
     def ratio(self) -> float:
@@ -60,12 +84,13 @@ M = TypeVar("M", bound=Measurement)
 
 @dataclass
 class _Search(Generic[M]):
-    """The best case so far."""
+    """The best case so far, and every measurement."""
 
     measure: Callable[[ReproductionCase], M | None]
     clock: Callable[[], float]
     deadline: float
     required_ratio: float = 1.0
+    case: ReproductionCase | None = None
     best: M | None = None
     is_late: bool = False  # whether a candidate was skipped for want of time; the first state never is
     measured: dict[tuple[object, ...], M | None] = field(default_factory=dict)
@@ -81,18 +106,8 @@ class _Search(Generic[M]):
         found = self.measured[content]
         if found is None or found.ratio <= 1 or found.ratio < self.required_ratio:
             return False
-        self.best = found
+        self.case, self.best = case, found
         return True
-
-    def accepts_any(self, cases: Iterable[ReproductionCase]) -> bool:
-        """Take the first case that shows enough."""
-        return any(self.accepts(case) for case in cases)
-
-    @property
-    def case(self) -> ReproductionCase:
-        """The best case so far."""
-        assert self.best is not None
-        return self.best.case
 
 
 def smallest_case(
@@ -121,14 +136,12 @@ def smallest_case(
     # in two rounds: each simplification may cost some of what is shown
     for clear in (100 * CLEAR_RATIO, CLEAR_RATIO):
         search.required_ratio = max(min(ratio / 2, clear), 1.0)
-        if search.best is None and not search.accepts_any(starting_cases(case)):
+        if search.case is None and not any(map(search.accepts, starting_cases(case))):
             continue
-        _reduce_bodies(search)
-        for _ in range(2 if search.case.steps else 0):
-            _shorten_run(search)
-            _reduce_steps(search)
-        for change in _simplifications(search.case.model):
-            search.accepts(change(search.case))
+        assert search.case is not None
+        runs = 2 * [_shorter_run, _fewer_steps] if case.steps else []
+        numbers = [partial(_changed_once, change) for change in _simplifications(search.case.model)]
+        shrink(search.case, [_fewer_bodies, *runs, *numbers], search.accepts, lambda: False)
     if search.best is None:
         search.required_ratio = 1.0
         search.accepts(case)
@@ -154,54 +167,41 @@ def starting_cases(case: ReproductionCase) -> Iterator[ReproductionCase]:
         yield from _parts(replace(case, until=span), count)
 
 
-def _parts(
-    case: ReproductionCase, count: int, ends: Iterable[bool] = (False, True)
-) -> Iterator[ReproductionCase]:
+def _parts(case: ReproductionCase, count: int) -> Iterator[ReproductionCase]:
     """Yield the first bodies, and the last ones hung from the pivot."""
     model, state, n = case.model, case.state, case.model.n
-    for is_last in ends if count < n else (False,):
-        part = slice(n - count, n) if is_last else slice(0, count)
+    for part in (slice(0, count), slice(n - count, n)) if count < n else (slice(0, n),):
         few = Model.chain(**{k: v if k == "gravity" else v[part] for k, v in model.fields.items()})
         at = {name: getattr(state, name)[part] for name in ("p", "omega", "u", "udot")}
         yield _changed(case, few, **at)
 
 
-def _reduce_bodies(search: _Search[M]) -> None:
-    """Double the number of bodies until they show it, then bisect, at the end of the chain that showed it."""
-    ends, low, count = [False, True], 0, 1
-
-    def shows(count: int) -> bool:
-        for is_last in ends:
-            if search.accepts_any(_parts(search.case, count, [is_last])):
-                ends[:] = [is_last]
-                return True
-        return False
-
-    while count < search.case.model.n and not shows(count):
-        low, count = count, 2 * count
-    while search.case.model.n - low > 1:
-        middle = (low + search.case.model.n) // 2
-        if not shows(middle):
-            low = middle
+def _fewer_bodies(case: ReproductionCase) -> Iterator[ReproductionCase]:
+    """One body, two, four …, then all but … four, two, one: a quick way to few, and between them."""
+    n = case.model.n
+    powers = [2**k for k in range(n.bit_length()) if 2**k < n]
+    for count in sorted({*powers, *(n - power for power in powers)}):
+        yield from _parts(case, count)
 
 
-def _shorten_run(search: _Search[M]) -> None:
-    """Halve the time, down to one of the coarsest steps."""
-    while search.case.until / 2 >= search.case.steps[0]:
-        if not search.accepts(replace(search.case, until=search.case.until / 2)):
-            return
+def _shorter_run(case: ReproductionCase) -> Iterator[ReproductionCase]:
+    """Half the time, down to one of the coarsest steps."""
+    if case.until / 2 >= case.steps[0]:
+        yield replace(case, until=case.until / 2)
 
 
-def _reduce_steps(search: _Search[M]) -> None:
-    """Leave out the finest steps, then the coarsest."""
-    for part in (slice(None, -1), slice(1, None)):
-        while len(search.case.steps) > MIN_RUNS and search.accepts(
-            replace(search.case, steps=search.case.steps[part])
-        ):
-            pass
+def _fewer_steps(case: ReproductionCase) -> Iterator[ReproductionCase]:
+    """Without the finest steps, or the coarsest."""
+    if len(case.steps) > MIN_RUNS:
+        yield from (replace(case, steps=part) for part in (case.steps[:-1], case.steps[1:]))
 
 
 _Change = Callable[[ReproductionCase], ReproductionCase]
+
+
+def _changed_once(change: _Change, case: ReproductionCase) -> Iterator[ReproductionCase]:
+    if (changed := change(case)).content != case.content:
+        yield changed
 
 
 def _changed(case: ReproductionCase, model: Model | None = None, **coordinates: Array) -> ReproductionCase:

@@ -52,6 +52,14 @@ def relation_evidence(engine: str, relation: str, case: ReproductionCase):
     return found
 
 
+def other_answer(engine: str, relation: str, case: ReproductionCase):
+    """Evidence about the second answer of a relation, right or wrong."""
+    measure = RelationMeasure(EngineClient(engine), relation)
+    _, found = measure.answers(case)
+    assert found is not None
+    return replace(found, relation=relation)
+
+
 def motion_measure(engine: str, integrator: str, level: str, joints: str, loaded: bool, until: float):
     """A measure of a slow tumble at three steps, and its case."""
     case = state_case(joints, loaded, loaded, rate=1.0)
@@ -91,6 +99,7 @@ def every_evidence(engine: str, joints: str, loaded: bool):
     of_joints = [OPTION_PREFIX + way for way in hooks.options_for(case.model) if way in hooks.joint_options]
     for relation in (STATE_RELATIONS[0].name, *second_ways(engine), *of_joints):
         yield relation_evidence(engine, relation, case)
+        yield other_answer(engine, relation, case)
     for integrator in step_methods(engine):
         yield step_evidence(engine, integrator, case)
     for integrator in step_integrators(engine):

@@ -11,11 +11,12 @@ from click.testing import CliRunner
 
 from plumbline.cli.main import main
 from plumbline.engines.environments import EnvironmentUnavailable, importer_interpreter
-from plumbline.importers.neutral_model import ModelQuantities
+from plumbline.importers.neutral_model import ElementaryJoint, ModelQuantities, NeutralBody, NeutralModel
 from plumbline.importers.xml_tree import parse_xml, write_xml
 from plumbline.model_files import model_script
 from plumbline.model_files.certified_model import CertifiedModelQuantities
-from plumbline.model_files.model_script import MAX_LINES, NoModelScript, _worst_entry, write_model_script
+from plumbline.model_files.model_comparison import mismatches_as_read
+from plumbline.model_files.model_script import MAX_LINES, NoModelScript, write_model_script
 from plumbline.model_files.xml_shrink import shrink_tree
 from tests.helpers.random_robots import random_urdf
 
@@ -51,6 +52,8 @@ def test_a_script_shows_the_difference_of_the_smallest_file(tmp_path):
     assert value == pytest.approx(script.engine_value, rel=1e-12)
     assert expected == script.expected
     assert abs(value - expected) > 1e-6
+    difference, allowed = map(float, re.search(r"difference: (\S+) allowed: (\S+)", ran.stdout).groups())
+    assert difference == value - expected and allowed == script.allowed < 1e-12
 
 
 ARM = """<robot name="r"><link name="base"/>
@@ -127,10 +130,14 @@ def test_rounding_beside_an_expected_zero_is_no_evidence():
         CertifiedModelQuantities(ModelQuantities({}, gravity_force=np.zeros(2)), {"gravity_force": limits})
         for limits in (np.zeros(2), np.array([4e-14, 1e-3]))
     )
-    answer = ModelQuantities({}, gravity_force=np.array([2.3e-14, 0.0]))
-    assert _worst_entry("gravity_force", answer, truth, read, [0, 1]) is None
-    answer = ModelQuantities({}, gravity_force=np.array([2.3e-14, 2e-3]))
-    assert _worst_entry("gravity_force", answer, truth, read, [0, 1]) == ("gravity force", (1,), 2e-3, 0.0)
+    joints = tuple(ElementaryJoint(name, "slide", np.eye(3)[0], np.zeros(3)) for name in "ab")
+    body = NeutralBody("m", -1, np.zeros(3), np.array([1.0, 0, 0, 0]), joints, 1.0, np.zeros(3), np.eye(3))
+    reading = NeutralModel("", (body,), np.zeros(3))
+    for force, ratio in ((0.0, 0.575), (2e-3, 2.0)):
+        answer = ModelQuantities({}, gravity_force=np.array([2.3e-14, force]))
+        found = mismatches_as_read(reading, truth, read, answer, [0, 1])["gravity_force"]
+        assert found.ratio == pytest.approx(ratio)
+    assert (found.place, found.value, found.expected, found.tolerance) == ((1,), 2e-3, 0.0, 1e-3)
 
 
 def test_a_script_that_prints_another_number_is_not_handed_out(tmp_path, monkeypatch):
