@@ -174,8 +174,8 @@ class FileRun:
         except ModelFileError as error:
             self.problems += error.problems
         except Exception as error:
-            words = shorten(" ".join(f"{type(error).__name__}: {error}".split()), 400)
-            words = f"internal error: {words}"
+            text = " ".join(f"{type(error).__name__}: {error}".split())
+            words = f"internal error: {shorten(text, 400)}"
             self.problems.append(Problem(self.shown, 0, 0, "", words, hint="please report it"))
             self.has_internal_error = True
         self.model = None
@@ -247,12 +247,9 @@ class FileRun:
         return [FileResult(self.shown, self.model, tuple(rows), explanations, poses, self.answers)]
 
     def _task(self, kind: str, name: str, function: Any, *arguments: Any) -> Task:
-        key, base, python = (
-            FileTask(kind, self.shown, name),
-            split_version(name)[0],
-            self.engines[name].python,
-        )
-        return Task(key, function, (base, *arguments), self.plan.limits, python=python, engine=name)
+        key, arguments = FileTask(kind, self.shown, name), (split_version(name)[0], *arguments)
+        python = self.engines[name].python
+        return Task(key, function, arguments, self.plan.limits, python=python, engine=name)
 
     def _know(self, model: NeutralModel) -> list[Task]:
         """Take what the file says, and certify it."""
@@ -296,10 +293,8 @@ class FileRun:
         while self.complete and (self.truth or self.doubt):
             name = self.complete.pop(0)
             if self.truth is not None and self.answers[name].quantities:
-                key, arguments = (
-                    FileTask("judge", self.shown, name),
-                    (*self._judge_arguments(name), self.truth),
-                )
+                arguments = (*self._judge_arguments(name), self.truth)
+                key = FileTask("judge", self.shown, name)
                 tasks.append(Task(key, judge_importer, arguments, self.plan.limits))
             else:
                 self._judge_at_once(name)

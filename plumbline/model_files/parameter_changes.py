@@ -140,7 +140,7 @@ def differences(
             found += _field_changes(JOINT_FIELDS, body, joint, read, size, least, unsprung)
         is_free = bool(body.joints) and body.joints[0].kind == "free"
         # a free joint's coordinates are those of the body frame
-        skipped = ("position", "attitude") if is_free and not has_rest_poses else ()
+        skipped: tuple[str, ...] = ("position", "attitude") if is_free and not has_rest_poses else ()
         skipped += ("center",) if body.mass == 0 == other.mass else ()
         found += _field_changes(BODY_FIELDS, body, None, other, size, least, skipped)
     return found
