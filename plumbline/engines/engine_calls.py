@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass, replace
 from importlib import metadata
+from io import StringIO
 
 from plumbline.engines.adapter import EngineInfo
 from plumbline.engines.environments import BASE_REQUIREMENTS, declared_attribute
@@ -229,3 +231,10 @@ def run_steps(
                     attempt = replace(attempt, failure=attempt.failure or describe_exception(error))
             attempts.append(attempt)
     return StepEvaluation(attempts, time.process_time() - begin)
+
+
+def run_script(_: str, text: str) -> str:
+    """Run a script of this project, made of numbers, as a user would; return what it prints."""
+    with redirect_stdout(StringIO()) as printed, suppress(Exception, SystemExit):
+        exec(compile(text, "script", "exec"), {"__name__": "__main__"})
+    return printed.getvalue()

@@ -5,9 +5,7 @@ What an importer raises becomes its refusal; what it computes is checked here, f
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
-from contextlib import redirect_stdout
 
 from plumbline.engines.adapter import EngineInfo
 from plumbline.engines.answers import check_numbers, check_version, describe_value
@@ -105,14 +103,6 @@ def evaluate_model_file(
     for index, (state, answer) in enumerate(zip(states, answers, strict=True)):
         _check(answer, len(state.velocities), f"{name}, state {index}")
     return answers
-
-
-def run_script(text: str) -> str:
-    """Run a script about an importer as a user would."""
-    printed = io.StringIO()
-    with redirect_stdout(printed):
-        exec(compile(text, "script", "exec"), {"__name__": "__main__"})
-    return printed.getvalue()
 
 
 def _check(answer: ModelQuantities, count: int, label: str) -> None:

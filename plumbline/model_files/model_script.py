@@ -15,8 +15,9 @@ from typing import Any
 
 import numpy as np
 
+from plumbline.engines.engine_calls import run_script
 from plumbline.engines.environments import split_version
-from plumbline.engines.importer_calls import evaluate_model_file, run_script
+from plumbline.engines.importer_calls import evaluate_model_file
 from plumbline.importers.neutral_model import CanonicalState, NeutralModel, without_passive_forces
 from plumbline.importers.xml_tree import Element, write_xml
 from plumbline.judging.rows import Verdict
@@ -241,7 +242,7 @@ def _write(bench: _Bench, form: str, result: FileResult, text: str, since: str) 
     explanation = result.explanations.get(bench.importer)
     for number in _shown_numbers(bench, result.model, bench.reading, explanation):
         script = _render(bench, form, result, text, since, number)
-        value = _printed_number(bench.call(run_script, script) or "")
+        value = _printed_number(bench.call(run_script, bench.name, script) or "")
         if math.isclose(value, number.engine_value, rel_tol=PRINTED_PRECISION):
             return ModelScript(script, text, number.engine_value, number.expected, number.allowed)
     raise NoModelScript("the difference does not show at a state with round numbers")

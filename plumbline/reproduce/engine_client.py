@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass
-from io import StringIO
 from typing import Any
 
 from plumbline.engines import engine_calls
@@ -69,16 +67,8 @@ class EngineClient:
             What it prints, up to its end or its failure.
 
         """
-        printed: str = self.call(_capture_output, script)
+        printed: str = self.call(engine_calls.run_script, script)
         return printed
-
-
-def _capture_output(_: str, script: str) -> str:
-    with redirect_stdout(StringIO()) as output, suppress(Exception, SystemExit):
-        exec(
-            compile(script, "script", "exec"), {"__name__": "__main__"}
-        )  # written by this project, from numbers
-    return output.getvalue()
 
 
 def _evaluate_variant(engine: str, variant: str, model: Model, state: State) -> StateQuantities:

@@ -41,10 +41,10 @@ def shrink(
 
     """
     for smaller_cases in passes:
-        place = 0
-        while not is_over() and (case := next(islice(smaller_cases(best), place, None), None)) is not None:
+        place, cases = 0, smaller_cases(best)
+        while not is_over() and (case := next(cases, None)) is not None:
             if shows(case):
-                best = case
+                best, cases = case, islice(smaller_cases(case), place, None)
             else:
                 place += 1
     return best

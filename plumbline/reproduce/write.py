@@ -205,7 +205,10 @@ def find_disagreement(document: dict[str, Any], rows: list[StoredRow], seconds: 
         raise NotReproducible(f"the results do not hold the scenario {row['scenario']!r}")
     model = Model.from_fields(scenario["model"])
     if not model.is_chain:
-        raise NotReproducible("scripts cover chains of rods and ball joints, this is a tree")
+        raise NotReproducible(
+            "scripts write out chains of rods and ball joints; this mechanism has other joints, branches, "
+            "loops or elements"
+        )
     start = {name: np.array(value, float) for name, value in scenario["state"].items()}
     state = state_from_minimal(model, **start)
     if row["level"] in ("trajectory", "invariants"):
