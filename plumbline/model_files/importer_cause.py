@@ -248,7 +248,7 @@ def _part_changes(
     lumped, bodies = _merge(parts), [part for part, _, _ in parts]
 
     def with_values(chosen: Sequence[NeutralBody], **values: Any) -> list[Part]:
-        return [(replace(p, **values) if p in chosen else p, *place) for p, *place in parts]
+        return [(replace(p, **values) if p in chosen else p, place, A) for p, place, A in parts]
 
     empty = {"mass": 0.0, "center": np.zeros(3), "inertia": np.zeros((3, 3))}
     fixed = [part for part in bodies[1:] if part.mass]

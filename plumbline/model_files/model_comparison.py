@@ -183,10 +183,10 @@ def mismatches(
         at = tuple(map(int, np.unravel_index(int(np.argmax(ratios)), ratios.shape)))
         if quantity not in found or ratios[at] > found[quantity].ratio:
             where = " and ".join(dict.fromkeys(labels[i] for i in at)) if labels else ""
-            numbers = [float(x[at]) for x in (errors, tolerances, ratios, values, expected)]
-            found[quantity] = Mismatch(*numbers[:3], state, where, at, *numbers[3:])
+            error, limit, ratio = (float(x[at]) for x in (errors, tolerances, ratios))
+            entry = float(values[at]), float(expected[at])
+            found[quantity] = Mismatch(error, limit, ratio, state, where, at, *entry)
 
-    first = truths[0].quantities.potential_energy, answers[0].potential_energy
     for state, (truth, answer) in enumerate(zip(truths, answers, strict=True)):
         own, tolerance = truth.quantities, truth.tolerance
         for body, pose in own.poses.items():
@@ -195,13 +195,15 @@ def mismatches(
                 note("position", other[:, 3], pose[:, 3], limit[:, 3], state, labels)
                 note("attitude", other[:, :3], pose[:, :3], limit[0, 0], state, labels)
         for quantity in (*VECTORS, "mass_matrix", "kinetic_energy"):
-            pair = getattr(answer, quantity), getattr(own, quantity)
-            if pair[0] is not None and pair[1] is not None:
-                labels = names if np.ndim(pair[0]) else []
-                note(quantity, *pair, tolerance[quantity], state, labels)
-        if state and None not in (*first, answer.potential_energy):
-            change = [one.potential_energy - start for one, start in ((answer, first[1]), (own, first[0]))]  # type: ignore[operator]
-            note("potential_energy", *change, tolerance["potential_energy"], state, ())
+            theirs, true = getattr(answer, quantity), getattr(own, quantity)
+            if theirs is not None and true is not None:
+                labels = names if np.ndim(theirs) else []
+                note(quantity, theirs, true, tolerance[quantity], state, labels)
+        four = (answers[0], truths[0].quantities, answer, own)
+        energies = [one.potential_energy for one in four if one.potential_energy is not None]
+        if state and len(energies) == 4:
+            theirs, true = np.subtract(energies[2:], energies[:2])
+            note("potential_energy", theirs, true, tolerance["potential_energy"], state, ())
     return found
 
 
@@ -227,11 +229,11 @@ def mismatches_as_read(
     back = np.argsort(np.array(order, int))
 
     def widened(name: str, limit: Any) -> Any:
-        other = read.tolerance.get(name)
+        other = read.tolerance.get(name, 0.0)
         if name == "poses":
             return {body: np.maximum(x, other.get(body, 0.0)) for body, x in limit.items()}
         limit = np.asarray(limit)[np.ix_(*[back] * np.ndim(limit))]
-        return limit if other is None or getattr(read.quantities, name) is None else np.maximum(limit, other)
+        return limit if getattr(read.quantities, name) is None else np.maximum(limit, other)
 
     tolerance = {name: widened(name, limit) for name, limit in truth.tolerance.items()}
     own = CertifiedModelQuantities(permuted(truth.quantities, back.tolist()), tolerance)

@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import cast
 
 import numpy as np
 
@@ -144,7 +143,7 @@ class Disagreement:
             found = smallest_case(case, self._measure, ratio, self.seconds, clock)
             if found is not None:
                 break
-        return cast("Evidence | None", found)
+        return found
 
 
 def _error_size(error: Array, quantity: str) -> Array:
