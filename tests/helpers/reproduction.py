@@ -18,6 +18,7 @@ from plumbline.measurements.state_relations import QUANTITIES, STATE_RELATIONS, 
 from plumbline.model.step_methods import JointSpaceMethod
 from plumbline.reproduce.engine_client import EngineClient
 from plumbline.reproduce.measure import ConvergenceMeasure, RelationMeasure, StateMeasure, StepMeasure
+from plumbline.reproduce.render import no_script_reason
 from plumbline.reproduce.shrink import ReproductionCase
 from tests.helpers import pendulums
 from tests.helpers.pendulums import JOINT_PATTERNS
@@ -84,11 +85,13 @@ def step_evidence(engine: str, integrator: str, case: ReproductionCase, count: i
 
 
 def second_ways(engine: str) -> list[str]:
-    """Relations in which the engine itself is set to a second way."""
+    """Relations in which the engine itself is set to a second way, and of which it has scripts."""
     hooks = metamorphic_hooks(load_adapter(engine))
     found = [OPTION_PREFIX + option for option in hooks.options if engine != "pinocchio-maximal"]
     found += [OTHER_FORMULATION_PREFIX + hooks.other_formulation] if hooks.other_formulation else []
-    return found + ([] if hooks.welding_unsupported_reason else [WELDED_HALVES])
+    found += [] if hooks.welding_unsupported_reason else [WELDED_HALVES]
+    row = {"level": "relations", "integrator": "-"}
+    return [name for name in found if not no_script_reason(engine, row | {"quantity": name})]
 
 
 def every_evidence(engine: str, joints: str, loaded: bool):
