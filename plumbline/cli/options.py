@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import click
 from click.core import ParameterSource
 
-from plumbline.engines import environments
-from plumbline.engines.registry import ENGINES
+from plumbline.engines import environments, specifications
+from plumbline.engines.registry import ENGINES, USER_ENGINES
 from plumbline.execution.exit_codes import ExitCode
 from plumbline.judging.known_issues import KNOWN_ISSUES_FILE, KnownIssue, load_known_issues
 from plumbline.processes.exceptions import PlumblineError
@@ -30,6 +30,7 @@ from plumbline.truth.closed_form import ClosedFormMismatch, closed_form_motion
 if TYPE_CHECKING:
     from plumbline.execution.result_cache import DiskResultCache
 
+_ADAPTERS, _TRUST = "plumbline.adapters", "plumbline.trust"  # what the context of a command remembers
 LOCK_FILE = ".lock"  # of an output folder, held by the command that writes to it
 MIN_TIMEOUT, MAX_TIMEOUT = 1.0, 1e7  # s; starting an engine takes longer than less
 MIN_MEMORY, MAX_MEMORY = 1.0, 1e6  # GB of address space; a worker with an engine does not start with less
@@ -134,17 +135,46 @@ def timeout_option(default: float) -> _Decorator:
     )
 
 
-def _choose_engines(_: click.Context, __: click.Parameter, names: Sequence[str]) -> list[str]:
-    """Check engine names; return them in the registry's order, or all engines where none is named."""
+def _choose_engines(context: click.Context, __: click.Parameter, names: Sequence[str]) -> list[str]:
+    """Check engine names; return them in the registry's order, then the user's; all where none is named."""
+    own: list[str] = context.meta.get(_ADAPTERS, [])
     for name in names:
         base, _version = environments.split_version(name)
-        if base not in ENGINES:
-            raise click.BadParameter(f"no engine {base!r}; {_nearest_or_all(base, ENGINES)}")
+        if base not in ENGINES and base not in USER_ENGINES:
+            _add_found_engine(base, is_trusting=context.meta.get(_TRUST, False))
         if problem := environments.version_problem(name):
             raise click.BadParameter(f"{name}: {problem}")
-    order = list(ENGINES)
+    order = [*ENGINES, *USER_ENGINES]
     chosen = sorted(dict.fromkeys(names), key=lambda e: order.index(environments.split_version(e)[0]))
-    return chosen or order
+    return [*chosen, *(name for name in own if name not in chosen)] or list(ENGINES)
+
+
+def _add_adapters(context: click.Context, _: click.Parameter, texts: Sequence[str]) -> None:
+    """Add the engines that the user typed; typing is consent."""
+    try:
+        context.meta[_ADAPTERS] = [specifications.add_engine(text, Path.cwd()) for text in texts]
+    except specifications.BadSpecification as error:
+        raise click.BadParameter(str(error)) from None
+
+
+def _note_trust(context: click.Context, _: click.Parameter, is_trusting: bool) -> None:
+    context.meta[_TRUST] = is_trusting
+
+
+def _add_found_engine(name: str, *, is_trusting: bool) -> None:
+    """Add an engine that plumbline.toml or an installed package names; that file needs the user's consent."""
+    try:
+        found = {one: (text, path) for one, text, path in specifications.found_engines(Path.cwd())}
+        if name not in found:
+            raise click.BadParameter(f"no engine {name!r}; {_nearest_or_all(name, {**ENGINES, **found})}")
+        text, path = found[name]
+        specification = specifications.resolve(text, Path.cwd())
+        if path and not specifications.is_trusted(specification, path, consent=is_trusting):
+            what = f"{path.name} of this folder would start {text}"
+            raise click.BadParameter(f"{what}; --trust allows it, as long as no file of it changes")
+        specifications.add_engine(f"{name}={text}", Path.cwd())
+    except specifications.BadSpecification as error:
+        raise click.BadParameter(str(error)) from None
 
 
 def _check_address(_: click.Context, __: click.Parameter, address: str | None) -> str | None:
@@ -154,14 +184,44 @@ def _check_address(_: click.Context, __: click.Parameter, address: str | None) -
     return address
 
 
-engines_option = click.option(
+_engine_option = click.option(
     "--engine",
     "engines",
     multiple=True,
     callback=_choose_engines,
     help="Only this engine (may be repeated); mujoco@3.12.0, @latest, @pre or @path/to.whl for another "
-    "version than the installed one. Default: all.",
+    "version than the installed one. Default: all, or those of --adapter.",
 )
+_adapter_option = click.option(
+    "--adapter",
+    multiple=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_add_adapters,
+    metavar="[NAME=]ENGINE",
+    help="An engine of your own (may be repeated): 'cmd:PROGRAM ARGUMENTS' that answers lines of JSON, "
+    "FILE.py:Class or package.module:Class; see docs/test-your-engine.md.",
+)
+_trust_option = click.option(
+    "--trust",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_note_trust,
+    help="Start the engines that plumbline.toml of this folder names, now and as long as it does not change.",
+)
+
+
+def engines_option(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the options that choose engines.
+
+    Returns:
+        The decorated command; it gets ``engines``.
+
+    """
+    return _trust_option(_adapter_option(_engine_option(command)))
+
+
 jobs_option = click.option(
     "--jobs",
     type=click.IntRange(1, MAX_JOBS),
@@ -276,7 +336,9 @@ def are_engines_named() -> bool:
         Whether ``--engine`` is on the command line.
 
     """
-    return click.get_current_context().get_parameter_source("engines") == ParameterSource.COMMANDLINE
+    context = click.get_current_context()
+    is_named = context.get_parameter_source("engines") == ParameterSource.COMMANDLINE
+    return is_named or bool(context.meta.get(_ADAPTERS))
 
 
 def _closed_form_problem(scenario: scenarios.Scenario) -> Problem | None:

@@ -25,7 +25,7 @@ from packaging.specifiers import SpecifierSet
 from packaging.utils import InvalidWheelFilename, canonicalize_name, parse_wheel_filename
 from packaging.version import Version
 
-from plumbline.engines.registry import ENGINES, IMPORTERS
+from plumbline.engines.registry import ENGINES, IMPORTERS, USER_ENGINES
 from plumbline.layout import IS_INSTALLED, PREFIX, ROOT
 from plumbline.processes.exceptions import PlumblineError
 from plumbline.processes.isolation import ScratchFolder
@@ -69,6 +69,8 @@ def version_problem(name: str) -> str | None:
 
     """
     base, version = split_version(name)
+    if "@" in name and base in USER_ENGINES:
+        return "its version is what it reports; @ is for engines of Plumbline"
     if "@" not in name or version in ("latest", "pre"):
         return None
     if version.endswith(".whl"):
@@ -102,9 +104,11 @@ def declared_attribute(engine: str, attribute: str) -> Any:
         attribute: name of a class attribute of the class or of one of its bases, written as a literal.
 
     Returns:
-        Its value; None where no class declares it.
+        Its value; None where no class declares it, and of an engine of the user.
 
     """
+    if engine in USER_ENGINES or ":" in engine:
+        return None
     module, _, class_name = {**IMPORTERS, **ENGINES}[engine].partition(":")
     return _read_attribute(module, class_name, attribute)
 

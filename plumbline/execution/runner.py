@@ -17,6 +17,7 @@ from typing import Any
 from plumbline.engines import engine_calls, environments
 from plumbline.engines.adapter import EngineInfo
 from plumbline.engines.importer_calls import describe_importer
+from plumbline.engines.specifications import task_engine
 from plumbline.execution.exit_codes import ExitCode
 from plumbline.execution.plan import (
     Plan,
@@ -113,7 +114,8 @@ def describe_engines(
             found[name] = EngineInfo(name, name, "", (), str(error), has_failed=bool(version))
             continue
         key = TaskKey(TaskKind.DESCRIPTION, engine=name)
-        tasks.append(Task(key, describe, (base,), executor.limits, python=python, engine=name))
+        engine, digest = task_engine(base)
+        tasks.append(Task(key, describe, (engine,), executor.limits, digest, python, engine=name))
     pythons = {task.key: task.python for task in tasks}
     for outcome in Scheduler(executor, result_cache).run(tasks):
         name, python = outcome.key.engine, pythons[outcome.key]

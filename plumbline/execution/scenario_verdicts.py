@@ -12,6 +12,7 @@ import numpy as np
 from plumbline.diagnosis.result import Diagnosis
 from plumbline.engines import engine_calls, environments
 from plumbline.engines.adapter import EngineInfo
+from plumbline.engines.specifications import task_engine
 from plumbline.execution.plan import (
     STATES_PER_RANDOM_SCENARIO,
     LevelSelection,
@@ -361,12 +362,18 @@ class ScenarioRun:
 
     def _cell_task(self, key: TaskKey) -> Task:
         call, arguments = self._call(key)
-        (base, _), info = environments.split_version(key.engine), self._engines[key.engine]
+        engine, version, python = self._task_engine(key)
         judge, judge_arguments = self._judge(key)
         return Task(
-            key, call, (base, *arguments), self._plan.limits, info.version, info.python, key.engine, judge,
+            key, call, (engine, *arguments), self._plan.limits, version, python, key.engine, judge,
             judge_arguments, JudgingResult.has_disagreement,  # only a diagnosis needs the answer
         )  # fmt: skip
+
+    def _task_engine(self, key: TaskKey) -> tuple[str, str, str]:
+        """What workers load the engine by, its version and files as a text, and its interpreter."""
+        engine, digest = task_engine(environments.split_version(key.engine)[0])
+        info = self._engines[key.engine]
+        return engine, info.version + digest, info.python
 
     def _call(self, key: TaskKey) -> tuple[Callable[..., Any], tuple[Any, ...]]:
         """The function that computes a cell, and its arguments after the engine."""
@@ -450,17 +457,17 @@ class ScenarioRun:
         from plumbline.diagnosis.diagnose import explain_disagreement  # few runs need them
         from plumbline.diagnosis.integrator_search import explain_disagreeing_steps
 
-        (base, _), info = environments.split_version(key.engine), self._engines[key.engine]
+        engine, version, python = self._task_engine(key)
         subject = TaskKey(TaskKind.DIAGNOSIS, self.scenario.name, key.engine, key.integrator)
         call: Callable[..., Diagnosis] = explain_disagreement
         arguments: tuple[Any, ...] = ()
         if key.kind == TaskKind.STATE:
             truth = self._packed_truths[TaskKind.STATE_TRUTH]
-            arguments = (base, model, answer.value.quantities, truth, is_known)
+            arguments = (engine, model, answer.value.quantities, truth, is_known)
         else:
             call = explain_disagreeing_steps
-            arguments = (base, key.integrator, model, self._step_states, answer.value, is_known)
-        return [Task(subject, call, arguments, self._plan.limits, info.version, info.python, key.engine)]
+            arguments = (engine, key.integrator, model, self._step_states, answer.value, is_known)
+        return [Task(subject, call, arguments, self._plan.limits, version, python, key.engine)]
 
     def _add_diagnosis(self, outcome: Outcome) -> None:
         diagnosis: Diagnosis = outcome.value or Diagnosis(f"no diagnosis: {outcome.failure}")

@@ -334,5 +334,6 @@ def initialize_worker(scratch: str, gigabytes: float, parent: int, environment: 
         import resource
 
         size = int(gigabytes * 2**30)
-        resource.setrlimit(resource.RLIMIT_AS, (size, size))
+        # the hard limit stays: programs that answer lines get another limit
+        resource.setrlimit(resource.RLIMIT_AS, (size, resource.getrlimit(resource.RLIMIT_AS)[1]))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))

@@ -1,0 +1,181 @@
+"""Engines as programs: honest ones are adapters like any other, each lie is the program's own failure."""
+
+import json
+import os
+import shlex
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from plumbline.engines import protocol
+from plumbline.engines.calls import describe_engine, evaluate_states
+from plumbline.engines.registry import load_adapter
+from plumbline.model.datatypes import EngineFailure, Unsupported
+from plumbline.processes.line_process import LineProcess
+from plumbline.processes.workers import Limits, Task, WorkerPool
+from tests.helpers import pendulums
+
+SERVER = Path(__file__).resolve().parents[1] / "helpers" / "lying_server.py"
+MODEL = pendulums.make_model("bb")
+STATES = [pendulums.state_from_seed(MODEL, seed=k, rate=0.5) for k in (2, 3)]
+TIMES = np.linspace(0.0, 0.2, 3)
+
+
+def specification(lie):
+    return "cmd:" + shlex.join([sys.executable, "-I", "-S", str(SERVER), *([lie] if lie else [])])
+
+
+def children():
+    found = []
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            name, parent = path.parent.name, path.read_bytes().rpartition(b")")[2].split()[:2]
+        except OSError:
+            continue
+        if int(parent[1]) == os.getpid() and parent[0] != b"Z":
+            found.append(int(name))
+    return found
+
+
+@pytest.fixture(autouse=True)
+def nothing_is_left():
+    before = set(children())
+    yield
+    for program in protocol._running.values():
+        program._lines.end()
+    protocol._running.clear()
+    assert set(children()) <= before
+
+
+def test_an_honest_program_is_an_adapter_like_any_other():
+    adapter = load_adapter(specification(""))
+    assert (adapter.name, adapter.title, adapter.version()) == ("liar", "Liar", "1")
+    assert not adapter.describe().missing and adapter.builds_trees and not adapter.builds_elements
+    for found in adapter.evaluate(MODEL, STATES):
+        assert np.array_equal(found.acceleration, np.zeros((2, 3))) and found.joint_reaction is None
+    run = adapter.simulate(MODEL, STATES[0], TIMES, "still", 0.1)
+    assert run.steps == 2 and np.allclose(run.r[1] - run.r[0], 0.1)
+    sprung = pendulums.make_model("bb").changed(damping=np.full((2, 2), 0.1))
+    with pytest.raises(Unsupported, match="covers no joints with rotors, springs"):
+        adapter.evaluate(sprung, STATES)
+
+
+LIES = {  # what the failure says
+    "another protocol": "protocol is the int 2, known is 1",
+    "no protocol": "protocol is None, known is 1",
+    "unknown joint": "no kind of joint is called elbow",
+    "unknown quantity": "no quantity is called colour",
+    "single precision": "precision: input should be 'double'",
+    "unknown field": "colour: ",
+    "rounded": "its JSON reader or writer rounds",
+    "echo too short": "echo returns other numbers",
+    "order zero": "has order 0",
+    "an integrator twice": "has a name twice: still",
+    "endless name": "must be a line of 1 to 200 characters",
+    "not a number": "instead of an answer: NaN is not a number",
+    "text for a number": "kinetic_energy: input should be a valid number",
+    "numbers in texts": "acceleration is an array of .* must hold numbers",
+    "ragged rows": "acceleration has rows of different lengths",
+    "another shape": r"acceleration has shape \(3,\), expected \(2, 3\)",
+    "a missing quantity": "acceleration is None",
+    "an undeclared quantity": "potential_energy that its hello does not declare",
+    "an unknown quantity": "colour: ",
+    "too few answers": "a value of type list of 1 as answers, must be 2",
+    "no list": "a value of type dict of 1 as answers, must be 2",
+    "no record": "must be quantities by name",
+    "an error": "the factorisation failed",
+    "an undeclared refusal": "not today",
+    "exit": "exited with code 7: cannot allocate, when asked to evaluate",
+    "signal": "died of SIGSEGV, when asked to evaluate",
+    "half a line": "exited with code 0, when asked to evaluate",
+    "words": "wrote 'Loading …' instead of an answer",
+    "late": "which is no answer with the id 4",
+    "no record at all": r"wrote '\[1, 2\]', which is no answer",
+    "deep": "instead of an answer",
+    "not UTF-8": "instead of an answer: 'utf-8' codec",
+    "huge": "wrote a line of more than 67108864 bytes",
+    "infinity": "answers, must be 2|is not finite",
+    "closed output": "closed its output",
+    "other steps": "steps is 3, but 2 steps",
+    "other times": "sampled 2 of 3 times",
+    "other shapes": "have the shapes",
+    "no steps": "steps: field required",
+    "another model": "expected",
+}
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_a_lie_is_the_program_s_own_failure(lie):
+    with pytest.raises((EngineFailure, Unsupported), match=LIES[lie]) as failure:
+        adapter = load_adapter(specification(lie))
+        adapter.describe()
+        adapter.evaluate(MODEL, STATES)
+        adapter.simulate(MODEL, STATES[0], TIMES, "still", 0.1)
+    assert len(str(failure.value)) < 2500
+    if lie == "an undeclared refusal":
+        assert failure.value.gap == ""
+
+
+def test_a_second_answer_to_one_question_is_a_fault_of_the_next():
+    adapter = load_adapter(specification("twice"))
+    adapter.evaluate(MODEL, STATES)
+    with pytest.raises(EngineFailure, match="which is no answer with the id 5"):
+        adapter.evaluate(MODEL, STATES)
+    assert len(adapter.evaluate(MODEL, STATES)) == 2, "it was started again"
+
+
+def test_a_program_that_is_another_at_its_next_start_has_failed():
+    adapter = load_adapter(specification("other at every start"))
+    adapter.evaluate(MODEL, STATES)
+    protocol._running.popitem()[1]._lines.end()
+    with pytest.raises(EngineFailure, match="hello is not what it was at first"):
+        adapter.evaluate(MODEL, STATES)
+
+
+def test_much_on_standard_error_stops_nothing():
+    assert len(load_adapter(specification("chatter")).evaluate(MODEL, STATES)) == 2
+
+
+def test_a_hanging_program_and_its_grandchild_end_at_the_time_limit():
+    with WorkerPool(1, Limits(seconds=20.0)) as pool:
+        task = Task("hang", evaluate_states, (specification("grandchild"), MODEL, STATES))
+        (outcome,) = pool.run([task])
+        assert outcome.is_overdue and outcome.failure
+    left = [path for path in Path("/proc").glob("[0-9]*/cmdline") if b"SIG_IGN" in _read(path)]
+    assert not left
+
+
+def _read(path):
+    try:
+        return path.read_bytes()
+    except OSError:
+        return b""
+
+
+def test_memory_has_a_limit_of_its_own():
+    with WorkerPool(1, Limits(seconds=100.0, gigabytes=1.0)) as pool:
+        task = Task("memory", evaluate_states, (specification("memory"), MODEL, STATES))
+        (outcome,) = pool.run([task])
+    assert "MemoryError" in outcome.value.failure and "exited with code 1" in outcome.value.failure
+
+
+def test_a_program_that_does_not_exist_cannot_be_loaded():
+    with pytest.raises(EngineFailure, match="cannot be started"):
+        describe_engine("cmd:/nowhere/engine")
+
+
+def test_only_declared_variables_reach_the_program(monkeypatch):
+    monkeypatch.setenv("SECRET_TOKEN", "x")
+    script = "import os, json; input(); print(json.dumps({'id': 1, 'names': sorted(os.environ)}))"
+    lines = LineProcess([sys.executable, "-I", "-c", script], {"MY_LIBRARY": "/opt/x"})
+    names = lines.ask({"ask": "names"})["names"]
+    lines.end()
+    assert "MY_LIBRARY" in names and "PATH" in names and "SECRET_TOKEN" not in names
+
+
+def test_questions_are_shortest_decimals_of_doubles():
+    value = {"r": np.array([0.1, 1 / 3, 5e-324])}
+    text = json.dumps(protocol.to_json([value["r"]]))
+    assert text == "[[0.1, 0.3333333333333333, 5e-324]]"
