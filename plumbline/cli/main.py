@@ -46,6 +46,8 @@ COMMANDS = {  # where each is, and its line in the list; imported when it is typ
     "history": ("result_commands:history", "Compare stored nights."),
     "report": ("result_commands:report", "Write the report of stored results again."),
     "check": ("scenario_commands:check", "Check scenario files."),
+    "contract": ("engine_commands:contract", "Test an engine of your own."),
+    "serve": ("engine_commands:serve", "Offer a Python adapter as a program that answers lines."),
     "schema": ("scenario_commands:schema", "Print the JSON Schema of scenario files."),
     "bisect": ("bisect_command:bisect", "Find the version of an engine that changed an answer."),
     "reproduce": ("result_commands:reproduce", "Write a stand-alone script of a disagreement."),

@@ -10,6 +10,7 @@ import click
 
 from plumbline.cli import options
 from plumbline.cli.terminal_output import count_noun, print_table
+from plumbline.engines.protocol import protocol_schema
 from plumbline.engines.registry import ENGINES
 from plumbline.execution.runner import describe_engines
 from plumbline.execution.scenario_verdicts import NO_REGULAR_POSE
@@ -102,6 +103,8 @@ def _describe_singular_pose(s: scenarios.Scenario) -> str:
 
 
 @click.command()
-def schema() -> None:
+@click.option("--protocol", is_flag=True, help="Of the answers of engines that are programs instead.")
+def schema(protocol: bool) -> None:
     """Print the JSON Schema of scenario files, for editors and other programs."""
-    click.echo(json.dumps(scenarios.json_schema(), ensure_ascii=False, indent=1))
+    found = protocol_schema() if protocol else scenarios.json_schema()
+    click.echo(json.dumps(found, ensure_ascii=False, indent=1))

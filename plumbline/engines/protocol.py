@@ -18,7 +18,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cache
 from typing import Any, ClassVar, Literal
 
@@ -40,7 +40,7 @@ from plumbline.model.datatypes import (
 )
 from plumbline.model.kinematics import quaternion_rate
 from plumbline.model.lift import BallRates, lift_acceleration
-from plumbline.processes.errors import one_line
+from plumbline.processes.exceptions import one_line
 from plumbline.processes.line_process import LineFault, LineProcess
 
 VERSIONS = (1,)  # of the protocol that this side speaks, the best first; a new one keeps the one before
@@ -121,14 +121,16 @@ def to_json(value: Any) -> Any:
     """Convert a mechanism or a state to lists and numbers.
 
     Args:
-        value: a dataclass of arrays, a sequence of such, an array, or a plain value.
+        value: a dataclass or mapping of arrays, a list of such, an array, or a plain value.
 
     """
     if isinstance(value, np.ndarray):
         return value.tolist()
-    if isinstance(value, Sequence) and not isinstance(value, str):
+    if isinstance(value, list | tuple):
         return [to_json(one) for one in value]
-    return {name: to_json(one) for name, one in vars(value).items()} if hasattr(value, "__dict__") else value
+    if is_dataclass(value):
+        value = vars(value)
+    return {name: to_json(one) for name, one in value.items()} if isinstance(value, Mapping) else value
 
 
 def read_answer(kind: type, answer: Mapping[str, Any], label: str) -> Any:
@@ -148,6 +150,12 @@ def read_answer(kind: type, answer: Mapping[str, Any], label: str) -> Any:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"])) or "the answer"
         raise EngineFailure(f"{label}: {one_line(where)}: {first['msg'].lower()}") from None
+
+
+def protocol_schema() -> dict[str, Any]:
+    """Return the JSON Schemas of the answers, by the question."""
+    records = {"hello": Hello, "evaluate: each of answers": StateAnswer, "simulate": RunAnswer}
+    return {name: _validator(kind).json_schema() for name, kind in records.items()}
 
 
 @cache

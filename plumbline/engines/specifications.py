@@ -22,7 +22,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 from plumbline.engines.registry import COMMAND_PREFIX, ENGINES, IMPORTERS, USER_ENGINES
-from plumbline.processes.errors import PlumblineError
+from plumbline.processes.exceptions import PlumblineError
 from plumbline.processes.user_cache import content_key, recall, remember
 
 PROJECT_FILE = "plumbline.toml"

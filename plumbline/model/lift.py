@@ -6,7 +6,7 @@ to rounding for a tiny h, because nothing is subtracted.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -76,7 +76,7 @@ def _count(kind: JointKind) -> int:
 
 
 def _absolute_rate(
-    model: Model, state: State, moved: dict[str, Array], k: int, step: Array, ball_rates: BallRates
+    model: Model, state: State, moved: dict[str, Any], k: int, step: Any, ball_rates: BallRates
 ) -> Array:
     """ω′ of the body on ball joint k a moment later, from its relative angular velocity."""
     far = int(model.body[k, 0])

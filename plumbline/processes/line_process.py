@@ -15,7 +15,7 @@ import threading
 from collections.abc import Mapping, Sequence
 from typing import Any, NoReturn
 
-from plumbline.processes.errors import PlumblineError, one_line
+from plumbline.processes.exceptions import PlumblineError, one_line
 from plumbline.processes.isolation import die_with_parent, kill_tree
 from plumbline.processes.remote_python import describe_exit
 from plumbline.processes.worker_environment import SINGLE_THREAD, TEMPORARY_FOLDER

@@ -1,7 +1,7 @@
 """Engines as programs: honest ones are adapters like any other, each lie is the program's own failure."""
 
+import contextlib
 import json
-import os
 import shlex
 import sys
 from pathlib import Path
@@ -10,14 +10,17 @@ import numpy as np
 import pytest
 
 from plumbline.engines import protocol
-from plumbline.engines.calls import describe_engine, evaluate_states
+from plumbline.engines.engine_calls import describe_engine, evaluate_states
 from plumbline.engines.registry import load_adapter
 from plumbline.model.datatypes import EngineFailure, Unsupported
+from plumbline.model.kinematics import angular_velocity
 from plumbline.processes.line_process import LineProcess
-from plumbline.processes.workers import Limits, Task, WorkerPool
+from plumbline.processes.worker_pool import Limits, Task, WorkerPool
 from tests.helpers import pendulums
 
-SERVER = Path(__file__).resolve().parents[1] / "helpers" / "lying_server.py"
+ROOT = Path(__file__).resolve().parents[2]
+SERVER = ROOT / "tests" / "helpers" / "lying_server.py"
+TRANSCRIPTS = ROOT / "tests" / "engines" / "transcripts"  # question, answer, question, …
 MODEL = pendulums.make_model("bb")
 STATES = [pendulums.state_from_seed(MODEL, seed=k, rate=0.5) for k in (2, 3)]
 TIMES = np.linspace(0.0, 0.2, 3)
@@ -27,26 +30,23 @@ def specification(lie):
     return "cmd:" + shlex.join([sys.executable, "-I", "-S", str(SERVER), *([lie] if lie else [])])
 
 
-def children():
+def processes(words):
+    """Command lines of this machine's processes that have these words."""
     found = []
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            name, parent = path.parent.name, path.read_bytes().rpartition(b")")[2].split()[:2]
-        except OSError:
-            continue
-        if int(parent[1]) == os.getpid() and parent[0] != b"Z":
-            found.append(int(name))
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        with contextlib.suppress(OSError):
+            if words.encode() in (line := path.read_bytes()):
+                found.append(line)
     return found
 
 
 @pytest.fixture(autouse=True)
 def nothing_is_left():
-    before = set(children())
     yield
     for program in protocol._running.values():
         program._lines.end()
     protocol._running.clear()
-    assert set(children()) <= before
+    assert not processes(str(SERVER))
 
 
 def test_an_honest_program_is_an_adapter_like_any_other():
@@ -69,7 +69,7 @@ LIES = {  # what the failure says
     "unknown quantity": "no quantity is called colour",
     "single precision": "precision: input should be 'double'",
     "unknown field": "colour: ",
-    "rounded": "its JSON reader or writer rounds",
+    "rounded": "its reader or writer of JSON rounds",
     "echo too short": "echo returns other numbers",
     "order zero": "has order 0",
     "an integrator twice": "has a name twice: still",
@@ -139,24 +139,18 @@ def test_much_on_standard_error_stops_nothing():
 
 
 def test_a_hanging_program_and_its_grandchild_end_at_the_time_limit():
-    with WorkerPool(1, Limits(seconds=20.0)) as pool:
-        task = Task("hang", evaluate_states, (specification("grandchild"), MODEL, STATES))
+    with WorkerPool(1) as pool:
+        limits = Limits(seconds=20.0)
+        task = Task("hang", evaluate_states, (specification("grandchild"), MODEL, STATES), limits)
         (outcome,) = pool.run([task])
         assert outcome.is_overdue and outcome.failure
-    left = [path for path in Path("/proc").glob("[0-9]*/cmdline") if b"SIG_IGN" in _read(path)]
-    assert not left
-
-
-def _read(path):
-    try:
-        return path.read_bytes()
-    except OSError:
-        return b""
+    assert not processes("SIG_IGN); time.sleep(600)")
 
 
 def test_memory_has_a_limit_of_its_own():
-    with WorkerPool(1, Limits(seconds=100.0, gigabytes=1.0)) as pool:
-        task = Task("memory", evaluate_states, (specification("memory"), MODEL, STATES))
+    limits = Limits(seconds=100.0, gigabytes=1.0)
+    with WorkerPool(1, limits) as pool:
+        task = Task("memory", evaluate_states, (specification("memory"), MODEL, STATES), limits)
         (outcome,) = pool.run([task])
     assert "MemoryError" in outcome.value.failure and "exited with code 1" in outcome.value.failure
 
@@ -179,3 +173,60 @@ def test_questions_are_shortest_decimals_of_doubles():
     value = {"r": np.array([0.1, 1 / 3, 5e-324])}
     text = json.dumps(protocol.to_json([value["r"]]))
     assert text == "[[0.1, 0.3333333333333333, 5e-324]]"
+
+
+def test_an_adapter_served_over_the_protocol_answers_bit_for_bit_as_in_this_process():
+    """The reference, as a program: a tree with loads, and a motion."""
+    command = [sys.executable, "-m", "plumbline", "serve", "adapters.reference_engine:Reference"]
+    served = load_adapter(f"cmd:PYTHONPATH={ROOT} {shlex.join(command)}")
+    own = load_adapter("reference")
+    assert served.describe().version == own.version() and served.builds_trees == own.builds_trees
+    for found, expected in zip(served.evaluate(MODEL, STATES), own.evaluate(MODEL, STATES), strict=True):
+        for name, value in vars(expected).items():
+            assert np.array_equal(getattr(found, name), value), name
+    method = own.integrators[0]
+    runs = [one.simulate(MODEL, STATES[0], TIMES, method.name, 1e-8) for one in (served, own)]
+    for name in ("t", "r", "p", "v"):
+        assert np.array_equal(*(getattr(run, name) for run in runs)), name
+    omega = [angular_velocity(run.p, run.pdot) for run in runs]  # ṗ along p is drift, which is not sent
+    assert np.allclose(*omega, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("transcript", sorted(TRANSCRIPTS.glob("*.jsonl")), ids=lambda path: path.stem)
+def test_a_stored_transcript_is_what_is_asked_and_answered_today(transcript):
+    """Servers that were written for a version of the protocol are asked in the same words."""
+    lines = [json.loads(line) for line in transcript.read_text(encoding="utf-8").splitlines()]
+    asked, answers = lines[::2], lines[1::2]
+
+    class Replay:
+        has_ended = False
+
+        def ask(self, question):
+            number = len(seen)
+            seen.append(json.loads(json.dumps({"id": number + 1, **question})))
+            return {**answers[number]}
+
+        def end(self):
+            pass
+
+    seen = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(protocol, "LineProcess", lambda command, variables: Replay())
+        adapter = protocol.served_engine(["transcript"], {})
+        adapter.evaluate(MODEL, STATES)
+        adapter.simulate(MODEL, STATES[0], TIMES, "still", 0.1)
+    assert seen == asked
+
+
+def test_the_schemas_of_the_records_describe_what_servers_answer():
+    schemas = protocol.protocol_schema()
+    assert set(schemas["hello"]["required"]) == {
+        "protocol",
+        "name",
+        "title",
+        "version",
+        "joints",
+        "quantities",
+    }
+    assert set(schemas["simulate"]["required"]) == {"t", "r", "p", "v", "omega", "steps"}
+    assert not schemas["evaluate: each of answers"].get("required")

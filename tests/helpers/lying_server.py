@@ -1,4 +1,4 @@
-"""A program that answers protocol 1 with zeros of the right shapes, but for the lie that its argument names."""
+"""A program that answers protocol 1 with zeros of the right shapes, but for the lie its argument names."""
 
 import json
 import os
@@ -137,9 +137,9 @@ def answer(question):
         case "hello":
             return {**HELLO, **HELLOS.get(LIE, {})}
         case "echo":
-            digits = 15 if LIE == "rounded" else 17
             lost = 1 if LIE == "echo too short" else 0
-            return {"values": [float(f"{x:.{digits}g}") for x in question["values"][lost:]]}
+            values = question["values"][lost:]
+            return {"values": [x * (1 + 2**-52) if LIE == "rounded" and x < 1 else x for x in values]}
         case "model":
             model.update(question["model"])
             return {}

@@ -1,0 +1,136 @@
+"""Engines of the user: by command, file or plumbline.toml; nothing of a folder is started without consent."""
+
+import json
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from plumbline.cli.main import main
+from plumbline.engines import specifications
+from plumbline.engines.registry import USER_ENGINES
+from plumbline.engines.specifications import BadSpecification
+
+ROOT = Path(__file__).resolve().parents[2]
+TOY = ROOT / "tests" / "helpers" / "toy_server.py"
+RUN = ("run", "tumbling-ball", "--level", "state")
+
+
+@pytest.fixture(autouse=True)
+def no_engine_is_left(tmp_path, monkeypatch):
+    monkeypatch.setenv("PLUMBLINE_CACHE", str(tmp_path / "cache"))
+    USER_ENGINES.clear()
+    yield
+    USER_ENGINES.clear()
+
+
+def run(*words, folder=None):
+    return CliRunner().invoke(main, [*map(str, words)], catch_exceptions=False)
+
+
+def toy(path=TOY):
+    return f"cmd:{shlex.quote(sys.executable)} {shlex.quote(str(path))}"
+
+
+def test_a_program_is_a_column_and_its_answers_are_kept_until_it_changes(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    server = tmp_path / "toy.py"
+    server.write_text(TOY.read_text())
+    words = *RUN, "--adapter", toy("toy.py"), "--out", tmp_path / "out"
+    first, second = run(*words), run(*words)
+    assert first.exit_code == second.exit_code == 0, first.output
+    assert "2 agree" in first.stdout and "answers of earlier runs" not in first.stderr
+    assert "answers of earlier runs were used" in second.stderr
+    run_data = json.loads((tmp_path / "out/results.json").read_text())["run"]
+    assert run_data["versions"] == {"toy": "0.1"}
+    server.write_text(server.read_text().replace("omega, J @ omega", "omega, 1.001 * J @ omega"))
+    third = run(*words)
+    assert third.exit_code == 1 and "disagree" in third.stdout, third.output
+
+
+def test_what_the_folder_names_is_started_only_with_consent_to_its_contents(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    marks = tmp_path / "started"
+    server = tmp_path / "engine.py"
+    server.write_text(f"open({str(marks)!r}, 'a').write('x')\n")
+    python = shlex.quote(sys.executable)
+    Path("plumbline.toml").write_text(f"[engines]\nmine = {json.dumps(f'cmd:{python} engine.py')}\n")
+    words = *RUN, "--engine", "mine", "--out", tmp_path / "out"
+    for command in (words, (*RUN, "--engine", "reference", "--out", tmp_path / "out")):
+        refused = run(*command)
+        assert not marks.exists()
+    refused = run(*words)
+    assert refused.exit_code == 2 and "--trust allows it" in refused.stderr and not marks.exists()
+    assert run(*words, "--trust").exit_code == 3 and marks.exists()
+    USER_ENGINES.clear()
+    marks.unlink()
+    assert run(*words, "--fresh").exit_code == 3 and marks.exists(), "the consent is kept"
+    USER_ENGINES.clear()
+    marks.unlink()
+    server.write_text(server.read_text() + "\n")
+    assert run(*words).exit_code == 2 and not marks.exists(), "another file needs another consent"
+
+
+@pytest.mark.parametrize(
+    "text, reason",
+    [
+        ("cmd:", "names no program"),
+        ("cmd:A=1 B=2", "names no program"),
+        ("cmd:'open", "No closing quotation"),
+        ("cmd:./nothing-here", "there is no program ./nothing-here"),
+        ("nothing.py:Engine", "there is no file nothing.py"),
+        ("some words", "is none of cmd:PROGRAM"),
+        ("mujoco=package.module:Engine", "mujoco is an engine of Plumbline"),
+        ("package.module:class-name", "is none of"),
+    ],
+)
+def test_a_specification_with_a_mistake_is_bad_usage(text, reason):
+    done = run(*RUN, "--adapter", text)
+    assert done.exit_code == 2 and reason in " ".join(done.stderr.split())
+
+
+def test_words_of_a_command_reach_the_program_as_they_are(tmp_path):
+    (tmp_path / "a file").write_text("")
+    found = specifications.resolve(f"cmd:X='1; echo' {sys.executable} 'a file' '$HOME' ';' -c", tmp_path)
+    command, variables = specifications.split_command(found)
+    assert command == (sys.executable, str(tmp_path / "a file"), "$HOME", ";", "-c")
+    assert variables == {"X": "1; echo"}
+
+
+def test_a_bad_project_file_is_bad_usage(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for text in ("[engines", "[engines]\nx = 1\n", "engines = 3\n"):
+        Path("plumbline.toml").write_text(text)
+        done = run(*RUN, "--engine", "mine")
+        assert done.exit_code == 2 and "plumbline.toml" in done.stderr
+    with pytest.raises(BadSpecification):
+        list(specifications.found_engines(tmp_path))
+
+
+def test_an_adapter_of_a_file_is_a_column(tmp_path):
+    file = tmp_path / "mine.py"
+    file.write_text(
+        "from adapters.reference_engine import Reference\n"
+        "class Mine(Reference):\n    name = 'mine'\n    title = 'Mine'\n"
+    )
+    done = run(*RUN, "--adapter", f"{file}:Mine", "--out", tmp_path / "out")
+    assert done.exit_code == 0 and "7 agree" in done.stdout, done.output
+
+
+def test_a_contract_names_what_differs_with_its_cause_and_writes_junit(tmp_path):
+    wrong = tmp_path / "wrong.py"
+    wrong.write_text(TOY.read_text().replace("omega, J @ omega", "omega, 1.001 * J @ omega"))
+    words = [sys.executable, "-m", "plumbline", "contract", f"cmd:{sys.executable} {wrong}"]
+    done = subprocess.run(
+        [*words, "--level", "state", "--junit", tmp_path / "junit.xml"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 1, done.stderr
+    assert "✗ tumbling-ball/wrong/state/-/acceleration" in done.stdout
+    assert "unsupported as declared" in done.stdout
+    assert "<failure" in (tmp_path / "junit.xml").read_text()
