@@ -12,6 +12,7 @@ import click
 from plumbline.cli import options
 from plumbline.cli.help_texts import EXIT_CODES, examples
 from plumbline.engines import specifications
+from plumbline.processes.line_process import BadSpecification
 from plumbline.processes.worker_pool import Limits
 from plumbline.storage.results_store import row_record, write_atomically
 from reports.junit import add_suite
@@ -30,7 +31,7 @@ def serve(engine: str) -> None:
 
     try:
         adapter = load_adapter(specifications.resolve(engine, Path.cwd()))
-    except (specifications.BadSpecification, ImportError, AttributeError) as error:
+    except (BadSpecification, ImportError, AttributeError) as error:
         raise click.BadParameter(str(error), param_hint="ENGINE") from None
     serve_standard_streams(adapter)
 
@@ -63,7 +64,7 @@ def contract(engine: str, level: Any, junit: Path | None, jobs: int, timeout: fl
 
     try:
         found = compare(engine, CONTRACT_SCENARIOS, level, jobs=jobs, limits=Limits(timeout, memory))
-    except specifications.BadSpecification as error:
+    except BadSpecification as error:
         raise click.BadParameter(str(error), param_hint="ENGINE") from None
     for row in found.problems:
         click.echo(f"{row.style.glyph} {row.key}: {row.reason}")

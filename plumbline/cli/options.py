@@ -21,6 +21,7 @@ from plumbline.execution.exit_codes import ExitCode
 from plumbline.judging.known_issues import KNOWN_ISSUES_FILE, KnownIssue, load_known_issues
 from plumbline.processes.exceptions import PlumblineError
 from plumbline.processes.isolation import FileLock, LockHeld
+from plumbline.processes.line_process import BadSpecification
 from plumbline.processes.worker_pool import ExecutorLost, ExecutorUnavailable
 from plumbline.scenario import loader as scenarios
 from plumbline.scenario.line_and_column_errors import Problem, ScenarioError, did_you_mean, shorten
@@ -153,7 +154,7 @@ def _add_adapters(context: click.Context, _: click.Parameter, texts: Sequence[st
     """Add the engines that the user typed; typing is consent."""
     try:
         context.meta[_ADAPTERS] = [specifications.add_engine(text, Path.cwd()) for text in texts]
-    except specifications.BadSpecification as error:
+    except BadSpecification as error:
         raise click.BadParameter(str(error)) from None
 
 
@@ -173,7 +174,7 @@ def _add_found_engine(name: str, *, is_trusting: bool) -> None:
             what = f"{path.name} of this folder would start {text}"
             raise click.BadParameter(f"{what}; --trust allows it, as long as no file of it changes")
         specifications.add_engine(f"{name}={text}", Path.cwd())
-    except specifications.BadSpecification as error:
+    except BadSpecification as error:
         raise click.BadParameter(str(error)) from None
 
 

@@ -264,10 +264,8 @@ class _Program:
         """Ask who the program is, and prove that it reads and writes doubles as they are."""
         answer = self.ask({"ask": "hello", "protocols": VERSIONS})
         if answer.get("protocol") not in VERSIONS:
-            spoken = describe_value(answer.get("protocol"))
-            raise EngineFailure(
-                f"{self.label} speaks protocol {spoken}, known is {', '.join(map(str, VERSIONS))}"
-            )
+            spoken, known = describe_value(answer.get("protocol")), ", ".join(map(str, VERSIONS))
+            raise EngineFailure(f"{self.label}: hello: protocol is {spoken}, known is {known}")
         hello: Hello = read_answer(Hello, answer, f"{self.label}: hello")
         if unknown := {*hello.joints} - {*KINDS}:
             raise EngineFailure(f"{self.label}: hello: no kind of joint is called {min(unknown)}")

@@ -14,6 +14,7 @@ from plumbline.engines.answers import describe_value
 from plumbline.importers.importer import Importer
 from plumbline.layout import PREFIX
 from plumbline.model.datatypes import EngineFailure
+from plumbline.processes.line_process import COMMAND_PREFIX, split_command
 
 ENGINES = {
     "reference": "adapters.reference_engine:Reference",
@@ -29,7 +30,6 @@ ENGINES = {
 # Engines of the user by name: specifications, as `plumbline.engines.specifications` has them. Workers get the
 # specification, not the name.
 USER_ENGINES: dict[str, str] = {}
-COMMAND_PREFIX = "cmd:"
 
 # Importers of model files, by the name as typed; an engine may have one without an adapter.
 IMPORTERS = {
@@ -57,7 +57,6 @@ def load_adapter(name: str) -> Adapter:
     """
     if name.startswith(COMMAND_PREFIX):
         from plumbline.engines.protocol import served_engine
-        from plumbline.engines.specifications import split_command
 
         return served_engine(*split_command(name))
     place, _, class_name = (PREFIX + ENGINES[name] if name in ENGINES else name).rpartition(":")

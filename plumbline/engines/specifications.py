@@ -21,36 +21,14 @@ from collections.abc import Iterator
 from importlib.metadata import entry_points
 from pathlib import Path
 
-from plumbline.engines.registry import COMMAND_PREFIX, ENGINES, IMPORTERS, USER_ENGINES
-from plumbline.processes.exceptions import PlumblineError
+from plumbline.engines.registry import ENGINES, IMPORTERS, USER_ENGINES
+from plumbline.processes.line_process import COMMAND_PREFIX, BadSpecification, split_command
 from plumbline.processes.user_cache import content_key, recall, remember
 
 PROJECT_FILE = "plumbline.toml"
 ENTRY_POINTS = "plumbline.engines"
 MAX_HASHED_FILE = 2**28  # bytes of a file that a command names
 _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,39}")
-_VARIABLE = re.compile(r"[A-Za-z_]\w*=.*", re.DOTALL)
-
-
-class BadSpecification(PlumblineError):
-    """An engine of the user cannot be what its specification says; the message says why."""
-
-
-def split_command(specification: str) -> tuple[tuple[str, ...], dict[str, str]]:
-    """Split a specification with `cmd:` into program and arguments, and environment variables before them.
-
-    Raises:
-        BadSpecification: there is no program, or a quotation mark is not closed.
-
-    """
-    try:
-        words = shlex.split(specification.removeprefix(COMMAND_PREFIX))
-    except ValueError as error:
-        raise BadSpecification(f"{specification!r}: {error}") from None
-    count = next((i for i, word in enumerate(words) if not _VARIABLE.fullmatch(word)), len(words))
-    if count == len(words):
-        raise BadSpecification(f"{specification!r} names no program")
-    return tuple(words[count:]), dict(word.split("=", 1) for word in words[:count])
 
 
 def resolve(specification: str, folder: Path) -> str:

@@ -10,6 +10,8 @@ import atexit
 import contextlib
 import json
 import os
+import re
+import shlex
 import subprocess
 import threading
 from collections.abc import Mapping, Sequence
@@ -20,10 +22,33 @@ from plumbline.processes.isolation import die_with_parent, kill_tree
 from plumbline.processes.remote_python import describe_exit
 from plumbline.processes.worker_environment import SINGLE_THREAD, TEMPORARY_FOLDER
 
+COMMAND_PREFIX = "cmd:"
+_VARIABLE = re.compile(r"[A-Za-z_]\w*=.*", re.DOTALL)
 MAX_LINE = 2**26  # bytes of an answer
 MAX_SHOWN = 200  # characters of a line or of the last words, in messages
 SECONDS_TO_END = 2.0  # after its input was closed, or its output
 INHERITED = ("PATH", "HOME", "LANG", "LC_ALL", "SYSTEMROOT", *TEMPORARY_FOLDER, *SINGLE_THREAD)
+
+
+class BadSpecification(PlumblineError):
+    """An engine of the user cannot be what its specification says; the message says why."""
+
+
+def split_command(specification: str) -> tuple[tuple[str, ...], dict[str, str]]:
+    """Split a specification with `cmd:` into program and arguments, and environment variables before them.
+
+    Raises:
+        BadSpecification: there is no program, or a quotation mark is not closed.
+
+    """
+    try:
+        words = shlex.split(specification.removeprefix(COMMAND_PREFIX))
+    except ValueError as error:
+        raise BadSpecification(f"{specification!r}: {error}") from None
+    count = next((i for i, word in enumerate(words) if not _VARIABLE.fullmatch(word)), len(words))
+    if count == len(words):
+        raise BadSpecification(f"{specification!r} names no program")
+    return tuple(words[count:]), dict(word.split("=", 1) for word in words[:count])
 
 
 class LineFault(PlumblineError):

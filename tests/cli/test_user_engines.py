@@ -12,7 +12,7 @@ from click.testing import CliRunner
 from plumbline.cli.main import main
 from plumbline.engines import specifications
 from plumbline.engines.registry import USER_ENGINES
-from plumbline.engines.specifications import BadSpecification
+from plumbline.processes.line_process import BadSpecification
 
 ROOT = Path(__file__).resolve().parents[2]
 TOY = ROOT / "tests" / "helpers" / "toy_server.py"
