@@ -114,7 +114,7 @@ class LineProcess:
         if not line.endswith(b"\n"):
             self._fail(f"wrote a line of more than {MAX_LINE} bytes" if len(line) > MAX_LINE else "")
         try:
-            answer = json.loads(line.decode(), parse_constant=_refuse)
+            answer = json.loads(line.decode(), parse_constant=_refuse, parse_int=_whole_number)
         except (ValueError, RecursionError) as error:
             self._fail(f"wrote {_shown(line)} instead of an answer: {one_line(str(error))[:MAX_SHOWN]}")
         if not isinstance(answer, dict) or answer.get("id") != self._number:
@@ -163,6 +163,11 @@ def _prepare(owner: int) -> None:
 
 def _refuse(word: str) -> NoReturn:
     raise ValueError(f"{word} is not a number")
+
+
+def _whole_number(text: str) -> float:
+    """−0.0 is "-0" in the decimals of C."""
+    return -0.0 if text == "-0" else int(text)
 
 
 def _shown(line: bytes) -> str:
