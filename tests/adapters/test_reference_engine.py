@@ -1,12 +1,11 @@
 """The reference as an engine: the map to the contract's quantities, its errors, its raw trajectories."""
 
-import tomllib
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
+import plumbline
 from adapters.reference_engine import Reference
 from plumbline.model.datatypes import EngineFailure
 from plumbline.model.kinematics import (
@@ -85,11 +84,8 @@ def test_a_singular_model_fails_with_its_cause():
 
 
 def test_the_version_is_the_checkouts():
-    pyproject = tomllib.loads(
-        (Path(__file__).resolve().parents[2] / "pyproject.toml").read_text(encoding="utf-8")
-    )
-    assert Reference().version() == pyproject["project"]["version"]
-    assert Reference.package == pyproject["project"]["name"]
+    assert Reference().version() == plumbline.__version__
+    assert Reference.package == plumbline.__name__
 
 
 @pytest.mark.full
