@@ -24,7 +24,6 @@ from plumbline.judging.rows import Verdict
 from plumbline.model_files.importer_cause import Explanation
 from plumbline.model_files.model_comparison import (
     certify_states,
-    joint_keys,
     joint_permutation,
     mismatches_as_read,
 )
@@ -86,13 +85,11 @@ class ModelScript:
 
     text: str
     file: str  # the shrunk model file
-    engine_value: float
-    expected: float
-    allowed: float
+    number: Shown
 
 
 @dataclass(frozen=True, eq=False)
-class _Shown:
+class Shown:
     """One number of the shrunk file at which engine and truth differ."""
 
     quantity: str
@@ -231,7 +228,7 @@ class _Bench:
         assert reading is not None and reading.model is not None
         return reading.model
 
-    def shown(self, result: FileResult) -> _Shown | None:
+    def shown(self, result: FileResult) -> Shown | None:
         """The first number that a script of the file that was judged last can print."""
         explanation = result.explanations.get(self.importer)
         return next(_shown_numbers(self, result.model, self.reading, explanation), None)
@@ -244,7 +241,7 @@ def _write(bench: _Bench, form: str, result: FileResult, text: str, since: str) 
         script = _render(bench, form, result, text, since, number)
         value = _printed_number(bench.call(run_script, bench.name, script) or "")
         if math.isclose(value, number.engine_value, rel_tol=PRINTED_PRECISION):
-            return ModelScript(script, text, number.engine_value, number.expected, number.allowed)
+            return ModelScript(script, text, number)
     raise NoModelScript("the difference does not show at a state with round numbers")
 
 
@@ -257,7 +254,7 @@ def _printed_number(printed: str) -> float:
         return math.nan
 
 
-def _render(bench: _Bench, form: str, result: FileResult, text: str, since: str, number: _Shown) -> str:
+def _render(bench: _Bench, form: str, result: FileResult, text: str, since: str, number: Shown) -> str:
     explanation = result.explanations.get(bench.importer)
     title = f"{bench.info.title} {bench.info.version}"
     phrases = [cause.phrase for cause in explanation.causes] if explanation else []
@@ -296,7 +293,7 @@ def _literal(values: Any) -> str:
 
 
 def _simple_states(model: NeutralModel) -> list[CanonicalState]:
-    """At rest and moving, with round numbers."""
+    """At rest and moving, with round numbers: the same of all joints of a kind, whatever their order."""
     rows = []
     for angle, rate in ((0.0, 0.0), (0.5, 0.0), (0.5, 1.0)):
         x: list[float] = []
@@ -310,20 +307,20 @@ def _simple_states(model: NeutralModel) -> list[CanonicalState]:
 
 def _shown_numbers(
     bench: _Bench, model: NeutralModel, reading: NeutralModel, explanation: Explanation | None
-) -> Iterator[_Shown]:
+) -> Iterator[Shown]:
     """Go through the numbers that a script can print, the simplest to understand first."""
     order = joint_permutation(model, reading)
     if order is None:
         count = float(reading.velocity_count)
         if count != model.velocity_count:
             state = CanonicalState(np.zeros(0), np.zeros(0))
-            yield _Shown("freedom", (), "degrees of freedom", state, count, float(model.velocity_count), 0.0)
+            yield Shown("freedom", (), "degrees of freedom", state, count, float(model.velocity_count), 0.0)
         return
     states = _simple_states(reading)
     answers = bench.call(evaluate_model_file, bench.name, bench.run.prepared.file, tuple(states))
     applied = all(answer.passive_force is not None for answer in answers)
     judged, theirs = (m if applied else without_passive_forces(m) for m in (model, reading))
-    truths = certify_states(judged, [_reordered(state, reading, model) for state in states])
+    truths = certify_states(judged, _simple_states(model))
     pairs = zip(truths, certify_states(theirs, states), answers, strict=True)
     worst = [mismatches_as_read(reading, *pair, order) for pair in pairs]
     for quantity in SHOWN_QUANTITIES:
@@ -332,29 +329,16 @@ def _shown_numbers(
             if is_shown and (number := found.get(quantity)) and number.ratio > 1:
                 body = f" of {number.where}" if quantity == "position" else ""
                 label, numbers = f"{quantity.replace('_', ' ')}{body}", (number.value, number.expected)
-                yield _Shown(quantity, tuple(sorted(number.place)), label, state, *numbers, number.tolerance)
+                yield Shown(quantity, tuple(sorted(number.place)), label, state, *numbers, number.tolerance)
     if bench.name == "exudyn":
         yield from _shown_damping(explanation, reading)
 
 
-def _shown_damping(explanation: Explanation | None, reading: NeutralModel) -> Iterator[_Shown]:
+def _shown_damping(explanation: Explanation | None, reading: NeutralModel) -> Iterator[Shown]:
     """The damping that Exudyn's loader returns for the caller's use: no quantity of the engine shows it."""
     changes = [c for cause in explanation.causes for c in cause.changes] if explanation else []
     names = [joint.name for joint in reading.joints]
     for change in changes:
         if change.field == "damping" and change.joint in names:
             index, label = (names.index(change.joint),), f"damping of joint {change.joint}"
-            yield _Shown("damping", index, label, _simple_states(reading)[0], change.theirs, change.own, 0.0)
-
-
-def _reordered(state: CanonicalState, reading: NeutralModel, model: NeutralModel) -> CanonicalState:
-    """The state of a reading in the order of the model's joints."""
-    parts = {
-        key: (state.coordinates[x], state.velocities[v])
-        for key, (_, x, v) in zip(joint_keys(reading), reading.joint_slices(), strict=True)
-    }
-    chosen = [parts[key] for key in joint_keys(model)]
-    return CanonicalState(
-        np.concatenate([x for x, _ in chosen] or [np.zeros(0)]),
-        np.concatenate([v for _, v in chosen] or [np.zeros(0)]),
-    )
+            yield Shown("damping", index, label, _simple_states(reading)[0], change.theirs, change.own, 0.0)

@@ -240,28 +240,26 @@ def _derived_fields(model: Model, state: State) -> dict[str, Array]:
     rates = velocity_jacobian(model, state).reshape(n, 6, -1)
     omega_of_rates = rates[:, 3:].transpose(2, 0, 1)
     pdot_rates = quaternion_rate(np.broadcast_to(state.p, (size, n, 4)), omega_of_rates).transpose(1, 2, 0)
-    # of every link: its attitude, its angular velocity (own frame), and that of every unit rate
-    links: list[tuple[Array, Array, Array]] = []
+    omega, udot = (np.concatenate(pair) for pair in (([state.omega], unit_omega), ([state.udot], unit_udot)))
+    # of every link its attitude, and its angular velocities (own frame) of the state and of every unit rate
+    links: list[tuple[Array, Array]] = []
     for k in range(n):
         if model.rods[k]:
             x = turn_of_z(state.u[k])
             x = x / np.linalg.norm(x)
             own = rotation_matrix(x) * np.array([1.0, 1.0, 0.0])  # the rod does not spin about its axis
-            spins = np.cross(state.u[k], state.udot[k]), np.cross(state.u[k], unit_udot[:, k])
-            links.append((x, spins[0] @ own, spins[1] @ own))
-        links.append((state.p[k], state.omega[k], unit_omega[:, k]))
-    q, w, joint_rates = [links[0][0]], [links[0][1]], [links[0][2]]
-    for (above, spin_above, rates_above), (x, spin, unit_spins) in pairwise(links):
+            links.append((x, np.cross(state.u[k], udot[:, k]) @ own))
+        links.append((state.p[k], omega[:, k]))
+    q, w = [links[0][0]], [links[0][1]]
+    for (above, spins_above), (x, spins) in pairwise(links):
         q.append(quaternion_product(quaternion_conjugate(above), x))
-        R = rotation_matrix(q[-1])
-        w.append(spin - spin_above @ R)
-        joint_rates.append(unit_spins - rates_above @ R)
+        w.append(spins - spins_above @ rotation_matrix(q[-1]))
     return {
         "A": A,
         "pdot": quaternion_rate(state.p, state.omega),
         "q": np.array(q),
-        "w": np.array(w),
-        "joint_rates": np.concatenate(joint_rates, axis=1).T,
+        "w": np.array(w)[:, 0],
+        "joint_rates": np.concatenate(w, axis=1)[1:].T,
         "local_rates": np.concatenate([A.mT @ rates[:, :3], rates[:, 3:]], axis=1).reshape(6 * n, -1),
         "euler_rates": np.concatenate([rates[:, :3], pdot_rates], axis=1).reshape(7 * n, -1),
         "unit_udot": unit_udot,

@@ -49,13 +49,13 @@ def test_a_script_shows_the_difference_of_the_smallest_file(tmp_path):
     )
     assert ran.returncode == 0, ran.stderr
     value, expected = map(float, re.search(r": (\S+) expected: (\S+)", ran.stdout).groups())
-    assert value == pytest.approx(script.engine_value, rel=1e-12)
-    assert expected == script.expected
+    assert value == pytest.approx(script.number.engine_value, rel=1e-12)
+    assert expected == script.number.expected
     assert abs(value - expected) > 1e-6
     difference, allowed = map(float, re.search(r"difference: (\S+) allowed: (\S+)", ran.stdout).groups())
     assert (
         difference == value - expected
-        and allowed == pytest.approx(script.allowed, rel=0.01)
+        and allowed == pytest.approx(script.number.allowed, rel=0.01)
         and allowed < 1e-12
     )
 
@@ -90,8 +90,8 @@ def test_a_script_of_exudyns_loader(tmp_path, axis, words):
     ran = subprocess.run([python, "-W", "ignore", "-c", script.text], capture_output=True, text=True)
     assert ran.returncode == 0, ran.stderr
     value, expected = map(float, re.search(r": (\S+) expected: (\S+)", ran.stdout).groups())
-    assert value == pytest.approx(script.engine_value, rel=1e-12)
-    assert expected == script.expected
+    assert value == pytest.approx(script.number.engine_value, rel=1e-12)
+    assert expected == script.number.expected
     assert abs(value - expected) > 1e-6
 
 
