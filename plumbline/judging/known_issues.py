@@ -36,7 +36,7 @@ from pydantic import (
 )
 
 from plumbline.engines.declared_names import declared_integrators, declared_texts
-from plumbline.engines.registry import ENGINES, IMPORTERS
+from plumbline.engines.registry import ENGINES, IMPORTERS, USER_ENGINES
 from plumbline.importers.neutral_model import MODEL_UNITS
 from plumbline.judging.rows import DECLARED_PREFIX, Level, Row, Verdict
 from plumbline.judging.state_level import SINGULAR_POSE, STATE_UNITS
@@ -403,7 +403,7 @@ def _name_problems(source: YamlSource, entries: Sequence[_Entry], others: set[st
             f"{RANDOM_FAMILY}-1-1",
             *(f"{prefix}1-1" for prefix in (MOTION_PREFIX, MECHANISM_PREFIX)),
         },
-        "engine": {*ENGINES, *IMPORTERS},
+        "engine": {*ENGINES, *IMPORTERS, *USER_ENGINES},
         "shown_by": set(ENGINES),
         "level": set(map(str, LEVELS)),
         "integrator": {"-", *declared_integrators()},

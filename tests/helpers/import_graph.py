@@ -5,8 +5,9 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 LAYERS = (  # from the top; a package imports only what follows it
-    "cli", "studies", "model_files", "execution", "reproduce", "storage", "judging", "measurements",
-    "diagnosis", "truth", "equations", "engines", "importers", "scenario", "model", "processes",
+    "cli", "conformance", "studies", "model_files", "execution", "reproduce", "storage", "judging",
+    "measurements", "diagnosis", "truth", "equations", "engines", "importers", "scenario", "model",
+    "processes",
 )  # fmt: skip
 OUTSIDE = {  # packages beside the core, and what of the project each may import
     "reference_impl": ("reference_impl",),

@@ -1,0 +1,36 @@
+"""The suite for an engine's own repository finds what is wrong, and expects what the engine's file lists."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+TOY = ROOT / "tests" / "helpers" / "toy_server.py"
+
+
+def outcomes(folder, server, *words):
+    command = [
+        sys.executable, "-m", "pytest", "-q", "-p", "plumbline.conformance.plugin", "-p", "no:cacheprovider",
+        "-c", os.devnull, "--rootdir", folder, "--pyargs", "plumbline.conformance",
+        "--plumbline-engine", f"cmd:{sys.executable} {server}",
+        "-k", "state/tumbling-ball or state/double-tumbling-balls", *words,
+    ]  # fmt: skip
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, env=environment)
+    found = {what: int(n) for n, what in re.findall(r"(\d+) (passed|failed|skipped|xfailed)", done.stdout)}
+    return done.stdout + done.stderr, found
+
+
+def test_tests_pass_fail_skip_and_are_expected_to_fail(tmp_path):
+    known, wrong = tmp_path / "plumbline-known.toml", tmp_path / "wrong.py"
+    wrong.write_text(TOY.read_text().replace("omega, J @ omega", "omega, 1.001 * J @ omega"))
+    assert outcomes(tmp_path, TOY)[1] == {"passed": 2, "skipped": 14}
+    known.write_text('"state/tumbling-ball/acceleration" = "the spin is off"\n')
+    text, found = outcomes(tmp_path, wrong)
+    assert found == {"xfailed": 1, "failed": 1, "skipped": 14} and "times the rounding bound" in text, text
+    text, found = outcomes(tmp_path, TOY)
+    assert found == {"passed": 1, "failed": 1, "skipped": 14} and "XPASS(strict)" in text
+    known.write_text('"state/tumbling-bull/*" = "x"\n')
+    assert "matches no test" in outcomes(tmp_path, TOY)[0]
