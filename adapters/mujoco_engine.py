@@ -502,9 +502,9 @@ class _SoftMechanism:
             there = state_of_cylinders(self.opened, self.tree.model, there)
         return there
 
-    def quantities(self, state: State) -> StateQuantities:
-        """Evaluate at one state what is determinate, without a mass matrix."""
-        answer = self.tree.quantities(self.state(state))
+    def quantities(self, state: State, there: State) -> StateQuantities:
+        """Evaluate what is determinate, without a mass matrix; ``there`` is the state of the tree."""
+        answer = self.tree.quantities(there)
         answer = self.cut.source_quantities(answer) if self.cut else answer
         if self.rodless:
             answer = self._with_rods(state, answer, self.rodless)
@@ -532,9 +532,10 @@ def _rigid_limit(soft: _SoftMechanism, state: State) -> StateQuantities:
     Rounding of the forces grows with 1/R.  The limit's uncertainty, by rounding and by what is left of R, is
     three times the largest difference between the extrapolations of three sequences.
     """
+    there = soft.state(state)
     for largest in LARGEST_REGULARISATIONS:
         try:
-            limits = _three_limits(soft, state, largest)
+            limits = _three_limits(soft, state, there, largest)
             break
         except EngineFailure:
             if largest == LARGEST_REGULARISATIONS[-1]:
@@ -547,12 +548,14 @@ def _rigid_limit(soft: _SoftMechanism, state: State) -> StateQuantities:
     return StateQuantities(**values, limit_error=errors)
 
 
-def _three_limits(soft: _SoftMechanism, state: State, largest: float) -> list[dict[str, Array]]:
+def _three_limits(
+    soft: _SoftMechanism, state: State, there: State, largest: float
+) -> list[dict[str, Array]]:
     """Extrapolate three sequences: rounding can spoil one, and is another in the next."""
     found, refusals = list[dict[str, Array]](), list[Unsupported]()
     for factor in SEQUENCES:
         try:
-            found.append(_extrapolated(soft, state, factor * largest))
+            found.append(_extrapolated(soft, state, there, factor * largest))
         except Unsupported as refusal:
             refusals.append(refusal)
         if len(found) == 3:
@@ -564,12 +567,12 @@ def _largest_norm(difference: Array) -> float:
     return float(np.max(np.linalg.norm(np.atleast_2d(difference), axis=-1)))
 
 
-def _extrapolated(soft: _SoftMechanism, state: State, largest: float) -> dict[str, Array]:
+def _extrapolated(soft: _SoftMechanism, state: State, there: State, largest: float) -> dict[str, Array]:
     """Extrapolate all quantities from one sequence of regularisations (Neville's scheme)."""
     found = list[dict[str, Array]]()
     for k in range(REGULARISATIONS):
         soft.tree.soften(largest / RATIO**k)
-        answer = soft.quantities(state)
+        answer = soft.quantities(state, there)
         found.append({name: np.asarray(x) for name, x in vars(answer).items() if x is not None})
     limit: dict[str, Array] = {}
     length = wrench_length(soft.source)

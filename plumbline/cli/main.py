@@ -20,6 +20,7 @@ import click
 from plumbline import __version__
 from plumbline.cli.help_texts import EXIT_CODES
 from plumbline.execution.exit_codes import ExitCode
+from plumbline.processes.worker_environment import SINGLE_THREAD
 from plumbline.scenario.line_and_column_errors import Problem, did_you_mean, shorten
 
 SECONDS_TO_NEXT_TRY = 0.05  # of an interruption that came during an import
@@ -112,6 +113,7 @@ class LazyGroup(click.Group):
             What the command returns, where click does not exit.
 
         """
+        os.environ.update(SINGLE_THREAD)  # before a command loads NumPy: threads only wait for each other
         try:
             return super().main(*args, **extra)
         except OSError:

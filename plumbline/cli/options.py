@@ -17,15 +17,17 @@ from click.core import ParameterSource
 
 from plumbline.engines import environments, specifications
 from plumbline.engines.registry import ENGINES, USER_ENGINES
+from plumbline.execution.environment_fingerprint import environment_fingerprint
 from plumbline.execution.exit_codes import ExitCode
 from plumbline.judging.known_issues import KNOWN_ISSUES_FILE, KnownIssue, load_known_issues
 from plumbline.processes.exceptions import PlumblineError
 from plumbline.processes.isolation import FileLock, LockHeld
 from plumbline.processes.line_process import BadSpecification
+from plumbline.processes.user_cache import content_key, recall, remember
 from plumbline.processes.worker_pool import ExecutorLost, ExecutorUnavailable
 from plumbline.scenario import loader as scenarios
 from plumbline.scenario.line_and_column_errors import Problem, ScenarioError, did_you_mean, shorten
-from plumbline.scenario.yaml_reader import is_file, read_yaml
+from plumbline.scenario.yaml_reader import is_file, read_bytes, read_yaml
 from plumbline.truth.closed_form import ClosedFormMismatch, closed_form_motion
 
 if TYPE_CHECKING:
@@ -262,14 +264,42 @@ def read_scenarios(names: Iterable[str | Path]) -> list[scenarios.Scenario]:
         The scenarios, each once, in the order of ``names``.
 
     """
+    return _read_scenarios(names, _load_scenario)
+
+
+def _read_scenarios(
+    names: Iterable[str | Path], load: Callable[[Path], scenarios.Scenario]
+) -> list[scenarios.Scenario]:
     try:
-        found = scenarios.load_scenarios(names)
-        error = ScenarioError(problem for s in found if (problem := _closed_form_problem(s)))
-    except ScenarioError as load_error:
-        error = load_error
-    if error.problems:
+        return scenarios.load_scenarios(names, load)
+    except ScenarioError as error:
         exit_on_bad_file(error)
-    return found
+
+
+def _load_scenario(path: Path) -> scenarios.Scenario:
+    """Load a scenario and check that it is the motion of the closed form named in its file."""
+    scenario = scenarios.load_scenario(path)
+    try:
+        closed_form_motion(scenario)
+    except ClosedFormMismatch as error:
+        line, column = read_yaml(path).value_positions.get(("exact",), (1, 1))
+        hint = "remove `exact`, or name the closed form that fits"
+        raise ScenarioError([Problem(str(path), line, column, "exact", str(error), hint=hint)]) from None
+    return scenario
+
+
+def _recall_scenario(path: Path) -> scenarios.Scenario:
+    """Load a scenario; one that was loaded before is neither built nor checked again.
+
+    Its key covers the file, and all that the cells of the result cache depend on.
+    """
+    code = Path(__file__).read_bytes()
+    key = content_key("scenario", environment_fingerprint(""), code, str(path), read_bytes(path))
+    known: scenarios.Scenario | None = recall(key, lambda found: isinstance(found, scenarios.Scenario))
+    if known is None:
+        known = _load_scenario(path)
+        remember(key, known)
+    return known
 
 
 def are_scenarios_found(names: Iterable[str]) -> bool:
@@ -342,19 +372,8 @@ def are_engines_named() -> bool:
     return is_named or bool(context.meta.get(_ADAPTERS))
 
 
-def _closed_form_problem(scenario: scenarios.Scenario) -> Problem | None:
-    """Find out whether the scenario lacks what the closed form named in its file needs."""
-    try:
-        closed_form_motion(scenario)
-    except ClosedFormMismatch as error:
-        line, column = read_yaml(scenario.path).value_positions.get(("exact",), (1, 1))
-        hint = "remove `exact`, or name the closed form that fits"
-        return Problem(str(scenario.path), line, column, "exact", str(error), hint=hint)
-    return None
-
-
 def choose_scenarios(names: Sequence[str], families: Sequence[str]) -> list[scenarios.Scenario]:
-    """Load the named scenarios, or the catalogue, narrowed to families.
+    """Load the named scenarios, or the catalogue, narrowed to families, for commands with a result cache.
 
     Args:
         names: names of the catalogue or paths; empty for the whole catalogue.
@@ -364,7 +383,7 @@ def choose_scenarios(names: Sequence[str], families: Sequence[str]) -> list[scen
         BadParameter: no scenario is of one of the families.
 
     """
-    found = read_scenarios(names or tuple(scenarios.catalogue()))
+    found = _read_scenarios(names or tuple(scenarios.catalogue()), _recall_scenario)
     known = {s.family for s in found}
     for family in families:
         if family not in known:

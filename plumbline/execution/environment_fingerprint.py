@@ -40,7 +40,7 @@ _FileIdentity = tuple[str, int, int, int]  # path, size, times of change of cont
 
 
 @cache
-def environment_fingerprint(python: str = "") -> str:
+def environment_fingerprint(python: str) -> str:
     """Hash what every answer of this process's tasks depends on.
 
     Args:
@@ -52,7 +52,7 @@ def environment_fingerprint(python: str = "") -> str:
     """
     digest = hashlib.sha256()
     if python:
-        digest.update(environment_fingerprint().encode())
+        digest.update(environment_fingerprint("").encode())
         facts: list[Any] = sorted(installed_files([Path(python).parent.parent]))
     else:
         for path in _project_files():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -68,6 +68,7 @@ class TruthFailure:
     reason: str
 
 
+@cache
 def _family(engine: str) -> str:
     """What an engine is a formulation or version of: its distribution."""
     base = environments.split_version(engine)[0]

@@ -577,6 +577,7 @@ def independent_rows(matrix: Array, scale: Array | None = None) -> NDArray[np.in
     return np.sort(order[: int(np.sum(size > RANK_TOLERANCE * size[0]))])
 
 
+@lru_cache(maxsize=1)  # adapters reduce many answers at one state
 def determinate_projectors(model: Model, state: State) -> Array | None:
     """Find what dependent rows leave of each joint's wrench: forces F and moments N/ℓ about the near points.
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -156,11 +157,14 @@ def scenario_from_dict(content: dict[str, Any], name: str) -> Scenario:
     return build_scenario(YamlSource(name, content, value_positions=defaultdict(lambda: (1, 1))), Path(name))
 
 
-def load_scenarios(names: Iterable[str | Path]) -> list[Scenario]:
+def load_scenarios(
+    names: Iterable[str | Path], load: Callable[[Path], Scenario] = load_scenario
+) -> list[Scenario]:
     """Read and check several scenarios.
 
     Args:
         names: names of the catalogue, or paths of files.
+        load: reads and checks one file.
 
     Returns:
         The scenarios in this order, each once.
@@ -173,7 +177,7 @@ def load_scenarios(names: Iterable[str | Path]) -> list[Scenario]:
     problems: list[Problem] = []
     for name in names:
         try:
-            scenario = load_scenario(find_scenario_file(name))
+            scenario = load(find_scenario_file(name))
         except ScenarioError as error:
             problems += error.problems
             continue
@@ -186,19 +190,24 @@ def load_scenarios(names: Iterable[str | Path]) -> list[Scenario]:
     return list(found.values())
 
 
-def catalogue() -> dict[str, Path]:
-    """List the scenarios that come with the project.
-
-    Returns:
-        Name → file, family by family.
-
-    """
+@cache
+def _catalogue() -> dict[str, Path]:
     files = (
         path
         for family in FAMILIES
         for path in sorted((CATALOGUE_FOLDER / family).glob("*.yaml"), key=lambda path: path.stem)
     )
     return {path.stem: path for path in files}
+
+
+def catalogue() -> dict[str, Path]:
+    """List the scenarios that come with the project, as they were when this process first asked.
+
+    Returns:
+        Name → file, family by family.
+
+    """
+    return dict(_catalogue())
 
 
 def find_scenario_file(name: str | Path) -> Path:

@@ -29,17 +29,14 @@ def is_file(path: Path) -> bool:
         return False
 
 
-def read_yaml(path: Path) -> YamlSource:
-    """Read a YAML file.
+def read_bytes(path: Path) -> bytes:
+    """Read the content of a YAML file.
 
     Args:
-        path: a regular file of at most MAX_BYTES, UTF-8 with or without a byte order mark.
-
-    Returns:
-        Its data, positions and problems.
+        path: a regular file of at most MAX_BYTES.
 
     Raises:
-        ScenarioError: the file cannot be read or is not YAML text.
+        ScenarioError: the file cannot be read.
 
     """
     source = YamlSource(str(path))
@@ -56,6 +53,24 @@ def read_yaml(path: Path) -> YamlSource:
         raise source.fatal_error(
             f"is larger than {MAX_BYTES} bytes", "a smaller file; `repeat` makes long chains"
         )
+    return raw
+
+
+def read_yaml(path: Path) -> YamlSource:
+    """Read a YAML file.
+
+    Args:
+        path: as of `read_bytes`; UTF-8 with or without a byte order mark.
+
+    Returns:
+        Its data, positions and problems.
+
+    Raises:
+        ScenarioError: the file cannot be read or is not YAML text.
+
+    """
+    raw = read_bytes(path)
+    source = YamlSource(str(path))
     try:
         content = raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
