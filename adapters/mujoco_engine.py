@@ -548,9 +548,7 @@ def _rigid_limit(soft: _SoftMechanism, state: State) -> StateQuantities:
     return StateQuantities(**values, limit_error=errors)
 
 
-def _three_limits(
-    soft: _SoftMechanism, state: State, there: State, largest: float
-) -> list[dict[str, Array]]:
+def _three_limits(soft: _SoftMechanism, state: State, there: State, largest: float) -> list[dict[str, Array]]:
     """Extrapolate three sequences: rounding can spoil one, and is another in the next."""
     found, refusals = list[dict[str, Array]](), list[Unsupported]()
     for factor in SEQUENCES:
