@@ -181,21 +181,24 @@ def scenario_chunk(name: str, results: Results, tables: ScenarioTables, points: 
 
 
 def _state_errors(name: str, tables: ScenarioTables, packer: ChunkBuilder) -> list[Record]:
-    states = tables["states"].get(name, {})
+    states = tables["states"].get(name)
+    if states is None:
+        return []
+    error, bound = (states[column].astype(float) for column in ("error", "bound"))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        quotient = np.where((error == 0) & (bound == 0), 0.0, error / bound)  # both of a body at rest
+    codes, sizes = log_scale_codes(quotient), np.where(np.isfinite(quotient), quotient, np.inf)
     found = []
     for (engine, quantity), rows in group_rows(states, "engine", "quantity"):
-        error, bound = states["error"][rows].astype(float), states["bound"][rows].astype(float)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            quotient = np.where((error == 0) & (bound == 0), 0.0, error / bound)  # both of a body at rest
-        order = np.argsort(states["state"][rows], kind="stable")
-        top = int(np.argmax(np.where(np.isfinite(quotient), quotient, np.inf)))
+        order = rows[np.argsort(states["state"][rows], kind="stable")]
+        top = rows[int(np.argmax(sizes[rows]))]
         found.append(
             {
                 "engine": engine,
                 "quantity": quantity,
-                "ratio": packer.add(log_scale_codes(quotient[order])),
-                "worst": [int(states["state"][rows][top]), int(states["body"][rows][top]) + 1],
-                "bound": _json_number(np.median(bound), 3),
+                "ratio": packer.add(codes[order]),
+                "worst": [int(states["state"][top]), int(states["body"][top]) + 1],
+                "bound": _json_number(np.median(bound[rows]), 3),
                 "error": _json_number(error[top], 3),
             }
         )

@@ -14,7 +14,7 @@ import types
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from enum import Enum
-from functools import cache, cached_property
+from functools import cache, cached_property, lru_cache
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -212,12 +212,21 @@ def _decode_any(value: Any, contents: memoryview) -> Any:
 
 def _decode_array(value: Any, contents: memoryview, wanted: np.dtype[Any] | None = None) -> Any:
     kind, shape, *place = value["array"]
-    dtype = np.dtype(kind)
-    _require(dtype.kind in _ARRAY_KINDS and wanted in (None, dtype), dtype, wanted)
+    dtype = _data_type(kind)
+    if wanted is not dtype and wanted not in (None, dtype):
+        raise UnfitRecord(f"an array of {dtype} in place of {wanted}")
     return np.frombuffer(_content(place, contents), dtype).reshape(shape).copy()
+
+
+@lru_cache(maxsize=64)  # a record has hundreds of arrays, of few types
+def _data_type(kind: str) -> np.dtype[Any]:
+    dtype = np.dtype(kind)
+    _require(dtype.kind in _ARRAY_KINDS, dtype, "numbers or texts")
+    return dtype
 
 
 def _content(place: Sequence[int], contents: memoryview) -> memoryview:
     begin, size = place
-    _require(0 <= begin <= begin + size <= len(contents), place, "a part of the record")
+    if not 0 <= begin <= begin + size <= len(contents):
+        raise UnfitRecord(f"{place} in place of a part of the record")
     return contents[begin : begin + size]

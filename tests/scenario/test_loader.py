@@ -119,6 +119,7 @@ TREE_JOINTS = {
 }
 LOOP_JOINTS = {  # the tree's, then those that close loops
     "bricard": ("hinge",) * 6,
+    "elements-alone": ("hinge",) * 7,
     "flyball-governor": ("hinge", "hinge", "hinge", "slide", "rod", "rod"),
     "four-bar": ("hinge",) * 4,
     "four-bars-2": ("hinge",) * 7,

@@ -144,3 +144,31 @@ def test_a_week_of_nights_has_the_legal_triples():
         found[np.ix_(some, some, some)] = True
     wanted = pairs[:, :, None] & pairs[:, None, :] & pairs[None, :, :]
     assert np.count_nonzero(found & wanted) > 0.99 * np.count_nonzero(wanted)
+
+
+def test_everything_of_a_joint_a_body_or_a_spring_stands_alone_once():
+    """An adapter may read one thing only where there is another: a scenario has it without the other."""
+    of_joint, of_body = ("armature", "damping", "stiffness", "effort", "rest"), ("force", "moment")
+    of_body += ("drag_force", "drag_moment")
+    of_spring = ("spring_stiffness", "spring_damping", "spring_length")
+    needs = {"rest": {"stiffness"}, "spring_length": {"spring_stiffness"}}  # without effect beside it alone
+    found, wanted = set(), set()
+    for model in (load(name).model for name in catalogue()):
+        for k, kind in enumerate(model.kinds):
+            where = "a closing joint" if k >= model.n else "a joint"
+            for i in range(kind.element_count):
+                has = {name for name in of_joint if getattr(model, name)[k, i]}
+                found |= {(where, one, other) for one in has for other in set(of_joint) - has}
+        for k in range(model.n):
+            has = {name for name in of_body if np.any(getattr(model, name)[k])}
+            found |= {("a body", one, other) for one in has for other in set(of_body) - has}
+        for i in range(len(model.spring_length)):
+            has = {name for name in of_spring if getattr(model, name)[i]}
+            found |= {("a spring", one, other) for one in has for other in set(of_spring) - has}
+    groups = ("a joint", of_joint), ("a closing joint", of_joint), ("a body", of_body), ("a spring", of_spring)
+    for where, names in groups:
+        wanted |= {
+            (where, *pair) for pair in itertools.permutations(names, 2) if pair[1] not in needs.get(pair[0], ())
+        }
+    # a rotor on a closing joint stands beside a spring and a damper everywhere
+    assert wanted - found == {("a closing joint", "armature", other) for other in ("damping", "stiffness")}
