@@ -165,10 +165,17 @@ def test_everything_of_a_joint_a_body_or_a_spring_stands_alone_once():
         for i in range(len(model.spring_length)):
             has = {name for name in of_spring if getattr(model, name)[i]}
             found |= {("a spring", one, other) for one in has for other in set(of_spring) - has}
-    groups = ("a joint", of_joint), ("a closing joint", of_joint), ("a body", of_body), ("a spring", of_spring)
+    groups = (
+        ("a joint", of_joint),
+        ("a closing joint", of_joint),
+        ("a body", of_body),
+        ("a spring", of_spring),
+    )
     for where, names in groups:
         wanted |= {
-            (where, *pair) for pair in itertools.permutations(names, 2) if pair[1] not in needs.get(pair[0], ())
+            (where, *pair)
+            for pair in itertools.permutations(names, 2)
+            if pair[1] not in needs.get(pair[0], ())
         }
     # a rotor on a closing joint stands beside a spring and a damper everywhere
     assert wanted - found == {("a closing joint", "armature", other) for other in ("damping", "stiffness")}
