@@ -118,18 +118,19 @@ def no_script_reason(engine: str, row: dict[str, Any]) -> str:
         A sentence, or an empty string where the row has a script.
 
     """
-    if not declared_attribute(engine, "reproduction_template"):
-        return f"engine {engine} has no template of scripts"
+    relation, is_other = row["quantity"], str(row["quantity"]).startswith(OTHER_FORMULATION_PREFIX)
+    for name in (engine, relation.removeprefix(OTHER_FORMULATION_PREFIX) if is_other else engine):
+        if not declared_attribute(name, "reproduction_template"):
+            return f"engine {name} has no template of scripts"
     if row["level"] == "step" and row["quantity"] in CONSTRAINED_UNITS:
         return "rows of single steps with constraints have no script"
-    relation = row["quantity"]
     if relation.endswith(LONG_RUN_SUFFIXES):
         return "rows of long runs have no script"
     if row["level"] != "relations":
         return ""
     if row["integrator"] != "-":
         return "relations of runs have no script"
-    if relation in TRANSFORMS or relation.startswith(OTHER_FORMULATION_PREFIX):
+    if relation in TRANSFORMS or is_other:
         return ""
     block = {relation: "option"} if relation.startswith(OPTION_PREFIX) else {WELDED_HALVES: "welded"}
     is_known = block.get(relation) in _template(engine).blocks

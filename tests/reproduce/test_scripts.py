@@ -230,6 +230,7 @@ def test_literals_are_exact_and_hostile_names_stay_text(tmp_path):
         ("exudyn", "relations", "something new", "-", "cannot show 'something new'"),
         ("exudyn", "invariants", "energy_drift_long", "trapezoidal", "long runs have no script"),
         ("reference", "state", "acceleration", "-", "no template"),
+        ("pinocchio", "relations", "as reference", "-", "engine reference has no template"),
         ("exudyn", "state", "acceleration", "-", ""),
         ("exudyn", "relations", "rotated world", "-", ""),
         ("pinocchio", "relations", "by cholesky", "-", ""),
