@@ -13,7 +13,7 @@ from plumbline.model.kinematics import rotation_matrix
 from plumbline.model.sampling import random_states
 from plumbline.truth.ground_truth import state_truth
 from tests.helpers.nightly_tests import SLOW
-from tests.helpers.planted_elements import subject
+from tests.helpers.planting import every_joint
 
 pytest.importorskip("flint")
 STATES = 3
@@ -23,7 +23,7 @@ DRAWS = np.random.default_rng(5).normal(size=(STATES, 6))
 @cache
 def right():
     """Three bodies on a ball, a hinge and a universal joint, with two springs."""
-    every = subject()
+    every = every_joint()
     names = (
         "mass",
         "inertia",

@@ -11,34 +11,30 @@ from collections.abc import Callable
 import numpy as np
 
 from plumbline.model.datatypes import Array, Model, State
-from tests.helpers.planted_defects import (
-    Defect,
-    E,
-    Inputs,
-    M,
-    P,
-    added_moment,
-    at_identity,
-    body_change,
-    body_state_change,
-    gyroscopic_moment,
-    model_change,
-    parameter_change,
-    state_change,
-    to_body,
-    to_world,
-    when,
-    with_coordinates,
-)
+from tests.helpers.planted_defects import E, M, P, at_identity
 from tests.helpers.planted_steps import (
     CLASSICAL,
     WEIGHTS,
     Step,
-    StepDefect,
     exchanged_halves,
     first_order_quaternion,
     runge_kutta,
     stale_velocity,
+    step_defect,
+)
+from tests.helpers.planting import (
+    Defect,
+    Inputs,
+    added_moment,
+    body_change,
+    body_state_change,
+    gyroscopic_moment,
+    model_change,
+    number_change,
+    state_change,
+    to_body,
+    to_world,
+    when,
 )
 
 Condition = Callable[[Model, State], bool]
@@ -82,11 +78,9 @@ def is_axisymmetric(model: Model) -> Array:
     return is_diagonal & ((d[:, 0] == d[:, 1]) | (d[:, 1] == d[:, 2]))
 
 
-def rod_rates_scaled(which: Callable[[State], Array], **factors: float) -> Inputs:
+def rod_rates_scaled(which: Callable[[State], Array], factor: float) -> Inputs:
     """u̇ of the rods of a direction times a factor."""
-    return lambda m, s: (
-        m, with_coordinates(m, s, udot=np.where(which(s)[:, None], factors["udot"], 1.0) * s.udot)
-    )  # fmt: skip
+    return state_change(lambda _, s: {"udot": np.where(which(s)[:, None], factor, 1.0) * s.udot})
 
 
 SMALL = 1 + 1e-6
@@ -142,9 +136,9 @@ BRANCH_DEFECTS = (
     # numbers of the model
     Defect("equal-masses", "m of body 2 × (1 + 1e-6) where it equals that of body 1", engine=M,
            inputs=when(lambda m, _: m.n > 1 and m.mass[0] == m.mass[1],
-                       parameter_change("mass", 1, times=SMALL))),
+                       number_change("mass", 1, times=SMALL))),
     Defect("mass-ratio-300", "m of body 1 × (1 + 1e-4) where neighbours differ by 300", engine=P,
-           inputs=when(lambda m, _: mass_ratio(m) > 300, parameter_change("mass", 0, times=1 + 1e-4))),
+           inputs=when(lambda m, _: mass_ratio(m) > 300, number_change("mass", 0, times=1 + 1e-4))),
     Defect("light-body", "J × (1 + 1e-6) of bodies below 20 g", engine=E, inputs=model_change(
         lambda m, _: {"inertia": m.inertia * np.where(m.mass < 0.02, SMALL, 1.0)[:, None, None]})),
     Defect("heavy-body", "m × (1 + 1e-6) of bodies above 100 kg", engine=M, inputs=model_change(
@@ -161,14 +155,14 @@ BRANCH_DEFECTS = (
         lambda m, _: {"proximal": np.where(m.proximal == 0, 1e-7, m.proximal)})),
     # rods
     Defect("rod-along-axis", "u̇ × -1 of rods along a coordinate axis", engine=M,
-           inputs=rod_rates_scaled(lambda s: np.max(np.abs(s.u), axis=1) == 1, udot=-1.0)),
+           inputs=rod_rates_scaled(lambda s: np.max(np.abs(s.u), axis=1) == 1, -1.0)),
     Defect("rod-straight-down", "u̇ × 0 of rods straight down", engine=P,
-           inputs=rod_rates_scaled(lambda s: s.u[:, 2] == -1, udot=0.0)),
+           inputs=rod_rates_scaled(lambda s: s.u[:, 2] == -1, 0.0)),
     Defect("long-rod", "ℓ × (1 + 1e-6) above 1.5 m", engine=E, inputs=model_change(
         lambda m, _: {"length": m.length * np.where(m.length > 1.5, SMALL, 1.0)})),
     Defect("rod-after-ball-after-rod", "ℓ of the third × (1 + 1e-6) where kinds alternate", engine=M,
            inputs=when(lambda m, _: m.n > 2 and bool(m.rods[0] and not m.rods[1] and m.rods[2]),
-                       lambda m, s: parameter_change("length", 2, times=SMALL)(m, s))),
+                       lambda m, s: number_change("length", 2, times=SMALL)(m, s))),
     Defect("rod-last-drag", "c_t × 2 of the last body on a rod", engine=P,
            inputs=when(lambda m, _: m.n > 1 and bool(m.rods[-1]),
                        on_last_body(scaled("drag_force", 2.0)))),
@@ -214,30 +208,30 @@ def step_scaled(factor: float, right: Step) -> Step:
 
 
 BRANCH_STEPS = (
-    StepDefect("not-power-of-two", "h × (1 + 1e-7) unless h is a power of two", M, "Euler",
-               step=wrong_when(lambda _, q, v, h: not is_power_of_two(h),
+    step_defect("not-power-of-two", "h × (1 + 1e-7) unless h is a power of two", M, "Euler",
+               wrong_when(lambda _, q, v, h: not is_power_of_two(h),
                                step_scaled(1 + 1e-7, euler), euler)),
-    StepDefect("not-power-of-two-rk4", "h × (1 + 1e-7) unless h is a power of two", P, "rkmk4",
-               step=wrong_when(lambda _, q, v, h: not is_power_of_two(h), step_scaled(1 + 1e-7, rk4), rk4)),
-    StepDefect("long-steps", "explicit Euler above h = 0.02", M, "Euler",
-               step=wrong_when(lambda _, q, v, h: h > 0.02, stale_velocity, euler)),
-    StepDefect("fast-joint", "explicit Euler above 15 rad/s", P, "semi-implicit-euler",
-               step=wrong_when(lambda _, q, v, h: np.max(np.abs(v)) > 15, stale_velocity, euler)),
-    StepDefect("slow-joint", "exchanged halves below 0.5 rad/s", M, "Euler",
-               step=wrong_when(lambda _, q, v, h: np.max(np.abs(v)) < 0.5, exchanged_halves, euler)),
-    StepDefect("large-turn", "p + h ṗ where a joint turns by more than 0.1 rad", M, "Euler",
-               step=wrong_when(lambda _, q, v, h: h * np.max(np.abs(v)) > 0.1,
+    step_defect("not-power-of-two-rk4", "h × (1 + 1e-7) unless h is a power of two", P, "rkmk4",
+               wrong_when(lambda _, q, v, h: not is_power_of_two(h), step_scaled(1 + 1e-7, rk4), rk4)),
+    step_defect("long-steps", "explicit Euler above h = 0.02", M, "Euler",
+               wrong_when(lambda _, q, v, h: h > 0.02, stale_velocity, euler)),
+    step_defect("fast-joint", "explicit Euler above 15 rad/s", P, "semi-implicit-euler",
+               wrong_when(lambda _, q, v, h: np.max(np.abs(v)) > 15, stale_velocity, euler)),
+    step_defect("slow-joint", "exchanged halves below 0.5 rad/s", M, "Euler",
+               wrong_when(lambda _, q, v, h: np.max(np.abs(v)) < 0.5, exchanged_halves, euler)),
+    step_defect("large-turn", "p + h ṗ where a joint turns by more than 0.1 rad", M, "Euler",
+               wrong_when(lambda _, q, v, h: h * np.max(np.abs(v)) > 0.1,
                                first_order_quaternion, euler)),
-    StepDefect("negative-scalars", "explicit Euler where all joints' scalar parts are negative", P,
+    step_defect("negative-scalars", "explicit Euler where all joints' scalar parts are negative", P,
                "semi-implicit-euler",
-               step=wrong_when(lambda s, q, v, h: bool(np.all(joint_scalar_parts(s, q) < 0)),
+               wrong_when(lambda s, q, v, h: bool(np.all(joint_scalar_parts(s, q) < 0)),
                           stale_velocity, euler)),
-    StepDefect("identity-joint", "exchanged halves where a joint is at the identity", M, "Euler",
-               step=wrong_when(lambda s, q, v, h: bool(np.any(np.abs(joint_scalar_parts(s, q)) == 1)),
+    step_defect("identity-joint", "exchanged halves where a joint is at the identity", M, "Euler",
+               wrong_when(lambda s, q, v, h: bool(np.any(np.abs(joint_scalar_parts(s, q)) == 1)),
                           exchanged_halves, euler)),
-    StepDefect("three-joints", "explicit Euler with three joints and more", M, "Euler",
-               step=wrong_when(lambda _, q, v, h: len(v) >= 9, stale_velocity, euler)),
-    StepDefect("rk4-one-body", "θ̇ = v with one joint", M, "RK4",
-               step=wrong_when(lambda _, q, v, h: len(v) == 3, lambda s, q, v, h: runge_kutta(
+    step_defect("three-joints", "explicit Euler with three joints and more", M, "Euler",
+               wrong_when(lambda _, q, v, h: len(v) >= 9, stale_velocity, euler)),
+    step_defect("rk4-one-body", "θ̇ = v with one joint", M, "RK4",
+               wrong_when(lambda _, q, v, h: len(v) == 3, lambda s, q, v, h: runge_kutta(
                    s, q, v, h, CLASSICAL, WEIGHTS, terms=0), rk4)),
 )  # fmt: skip

@@ -1,187 +1,75 @@
-"""Defects with known names and sizes, planted in real adapters: what the harness must report, and name.
+"""Defects of chains at one state and along a motion: what the harness must report, and name.
 
-A defect alters what a real engine is given (model, state), what it gives back, or how it steps in time;
-the engine itself runs.  ``expected`` are the words of which the diagnosis must use one; a
-defect without them need only be reported.  Indices in names count from 1, as in the results.
+``expected`` are the words of which the diagnosis must use one; a defect without them need only be reported.
 """
 
 from __future__ import annotations
 
-import zlib
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, replace
-from typing import Any, Literal
-from unittest.mock import patch
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from plumbline.engines.adapter import Adapter
 from plumbline.model import equivalent
 from plumbline.model.datatypes import Array, Integrator, Model, State, StateQuantities, Trajectory
 from plumbline.model.kinematics import (
+    complete_state,
     quaternion_conjugate,
     quaternion_product,
     rotation_matrix,
-    state_from_minimal,
 )
-from reference_impl.direct import DirectSystem, Solution
-from reference_impl.euler_parameters import angular_velocity
-
-Inputs = Callable[[Model, State], tuple[Model, State]]
-Answers = Callable[[Model, list[State], list[StateQuantities]], list[StateQuantities]]
-Run = Callable[[Callable[..., Trajectory], Model, State, Array, Integrator, float], Trajectory]
-
-
-@dataclass(frozen=True)
-class Defect:
-    """One planted defect. Exactly one of inputs, answers, gamma, run and engine_patch is given."""
-
-    name: str
-    description: str  # with its size
-    expected: tuple[str, ...] = ()  # words of the diagnosis, one of which must occur
-    engine: str = "mujoco"
-    joints: str = "balls"  # key of tests.helpers.pendulums.JOINT_PATTERNS
-    loaded: bool = False  # with applied loads and drag
-    level: Literal["state", "motion"] = "state"
-    inputs: Inputs | None = None
-    answers: Answers | None = None
-    gamma: Callable[[Model, State], Array] | None = None  # (c,) added to γ, on the reference
-    run: Run | None = None
-    integrator: str = "RK4"
-    engine_patch: Callable[[], AbstractContextManager[Any]] | None = None  # alters the engine's own model
-
-
-def plant(real: type[Adapter], defect: Defect) -> Adapter:
-    """An instance of a subclass of the real adapter with the defect in it."""
-
-    class Planted(real):  # type: ignore[misc, valid-type]
-        def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
-            given = [defect.inputs(model, s) if defect.inputs else (model, s) for s in states]
-            reported = [super(Planted, self)._evaluate(m, [s])[0] for m, s in given]
-            return defect.answers(model, list(states), reported) if defect.answers else reported
-
-        def _simulate(
-            self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
-        ) -> Trajectory:
-            if defect.inputs:
-                model, state = defect.inputs(model, state)
-            real_run = super()._simulate
-            if defect.run:
-                return defect.run(real_run, model, state, times, integrator, resolution)
-            return real_run(model, state, times, integrator, resolution)
-
-    return Planted()
-
-
-class WrongGammaSystem(DirectSystem):
-    """The notes' system with something added to γ: patched into the reference's adapter."""
-
-    model: Model
-    defect: Callable[[Model, State], Array]
-
-    def solve(self, r: Array, p: Array, v: Array, pdot: Array, gamma_defect: Any = 0.0) -> Solution:
-        """Solve with the defect in γ."""
-        d = joint_directions(self.model, r, p)
-        ddot = joint_directions(self.model, v, p, angular_velocity(p, pdot))
-        length = np.where(self.model.rods, self.model.length, 1.0)[:, None]
-        state = State(p, angular_velocity(p, pdot), d / length, ddot / length, r, v)
-        return super().solve(r, p, v, pdot, type(self).defect(self.model, state))
-
-
-def joint_directions(model: Model, r: Array, p: Array, omega: Array | None = None) -> Array:
-    """(N, 3) joint vectors d, or their rates where r is a velocity and ω′ is given."""
-    a = rotation_matrix(p)
-
-    def point(s: Array) -> Array:
-        arm = s if omega is None else np.cross(omega, s)
-        return np.asarray(r + (a @ arm[..., None])[..., 0])
-
-    return point(model.proximal) - np.concatenate([np.zeros((1, 3)), point(model.distal)[:-1]])
-
-
-# --- what is altered ----------------------------------------------------------------------------
-
-
-def with_coordinates(model: Model, state: State, **minimal: Array) -> State:
-    """The state of a model from its minimal coordinates, some of them replaced."""
-    parts = {k: minimal.get(k, getattr(state, k)) for k in ("p", "omega", "u", "udot")}
-    return state_from_minimal(model, **parts)
-
-
-def parameter_change(answer_change: str, *index: int, by: float = 0.0, times: float = 1.0) -> Inputs:
-    """One number of the model wrong (an inertia's product on both sides), or a whole field of it."""
-
-    def alter(model: Model, state: State) -> tuple[Model, State]:
-        value = getattr(model, answer_change).copy()
-        for at in {index, (*index[:1], *index[:0:-1])}:
-            value[at] = value[at] * times + by
-        wrong = model.changed(**{answer_change: value})
-        return wrong, with_coordinates(wrong, state)
-
-    return alter
-
-
-def model_change(change: Callable[[Model, State], dict[str, Array]]) -> Inputs:
-    """Fields of the model replaced, depending on the state or not; of chains only."""
-
-    def alter(model: Model, state: State) -> tuple[Model, State]:
-        if not model.is_chain:  # as a relation writes it anew
-            return model, state
-        wrong = model.changed(**change(model, state))
-        return wrong, with_coordinates(wrong, state)
-
-    return alter
-
-
-def state_change(change: Callable[[Model, State], dict[str, Array]]) -> Inputs:
-    """Minimal coordinates of the state replaced."""
-    return lambda model, state: (model, with_coordinates(model, state, **change(model, state)))
-
-
-def to_world(state: State, vectors: Array) -> Array:
-    """A x of each body."""
-    return np.asarray((rotation_matrix(state.p) @ vectors[..., None])[..., 0])
-
-
-def to_body(state: State, vectors: Array) -> Array:
-    """Aᵀ x of each body."""
-    return np.asarray((rotation_matrix(state.p).mT @ vectors[..., None])[..., 0])
-
-
-def gyroscopic_moment(model: Model, state: State) -> Array:
-    """ω′ × J ω′ (N, 3)."""
-    return np.cross(state.omega, (model.inertia @ state.omega[..., None])[..., 0])
+from tests.helpers.planting import (
+    Answers,
+    Defect,
+    Inputs,
+    added_gamma,
+    added_moment,
+    answer_change,
+    body_answer_change,
+    body_change,
+    body_spins,
+    body_state_change,
+    built_with,
+    gyroscopic_moment,
+    model_change,
+    noise_growing,
+    normalised,
+    number_change,
+    recomputed,
+    rows_reordered,
+    run_as,
+    run_with_clock,
+    sample_change,
+    stale_answers,
+    state_change,
+    to_body,
+    to_world,
+    turned_by,
+    when,
+    without,
+    without_gamma,
+)
+from tests.helpers.planting import plant as plant
 
 
 def centre_of_mass_moved(k: int, shift: Array) -> Inputs:
-    """The centre of mass of body k at ``shift`` from where it is: its attachments move the other way."""
-
-    def change(model: Model, _: State) -> dict[str, Array]:
-        moved = np.where(np.arange(model.n)[:, None] == k, shift, 0.0)
-        return {"proximal": model.proximal - moved, "distal": model.distal - moved}
-
-    return model_change(change)
+    """The centre of mass of body k at ``shift`` from where it is: its points move the other way."""
+    return model_change(lambda m, _: {"point": m.point - shift * (m.body == k)[..., None]})
 
 
-def inertia_about_proximal(model: Model, _: State) -> dict[str, Array]:
+def inertia_about_proximal(model: Model, _: State) -> Array:
     """Inertia of every body about its proximal point (Huygens and Steiner)."""
-    s = model.proximal
+    s = model.proximal[: model.n]
     square = np.sum(s * s, -1)[:, None, None] * np.eye(3) - s[:, :, None] * s[:, None, :]
-    return {"inertia": model.inertia + model.mass[:, None, None] * square}
+    return np.asarray(model.inertia + model.mass[:, None, None] * square)
 
 
-def attitude_turned(k: int, angle: float) -> Inputs:
-    """The attitude of body k turned by an angle about its own x axis."""
-
-    def change(_: Model, state: State) -> dict[str, Array]:
-        p = state.p.copy()
-        w, x, y, z = p[k]
-        c, s = np.cos(angle / 2), np.sin(angle / 2)
-        p[k] = [w * c - x * s, x * c + w * s, y * c + z * s, z * c - y * s]
-        return {"p": p / np.linalg.norm(p, axis=1, keepdims=True)}
-
-    return state_change(change)
+def inertia_in_world_axes(model: Model, state: State) -> Array:
+    """Aᵀ J A of every body."""
+    turn = rotation_matrix(state.p)
+    inertia = turn.mT @ model.inertia @ turn
+    return np.asarray((inertia + inertia.mT) / 2)
 
 
 def to_single_precision(x: Array) -> Array:
@@ -189,45 +77,12 @@ def to_single_precision(x: Array) -> Array:
     return np.asarray(x, np.float32).astype(float)
 
 
-def normalised(p: Array) -> Array:
-    """Normalised."""
-    return np.asarray(p / np.linalg.norm(p, axis=-1, keepdims=True))
-
-
 def inputs_in_single_precision(model: Model, state: State) -> tuple[Model, State]:
     """Everything the engine is given passes through single precision."""
     wrong = model.changed(**{k: to_single_precision(v) for k, v in model.fields.items()})
     rounded = {k: to_single_precision(getattr(state, k)) for k in ("omega", "u", "udot")}
-    return wrong, with_coordinates(wrong, state, p=normalised(to_single_precision(state.p)), **rounded)
-
-
-def answer_change(name: str, change: Callable[[Model, State, Any], Any]) -> Answers:
-    """One quantity of each answer altered."""
-
-    def alter(model: Model, states: list[State], reported: list[StateQuantities]) -> list[StateQuantities]:
-        return [
-            replace(a, **{name: change(model, s, getattr(a, name))})
-            for s, a in zip(states, reported, strict=True)
-        ]
-
-    return alter
-
-
-def stale_answers(*names: str) -> Answers:
-    """Fields still hold what they were at the state before."""
-
-    def alter(_: Model, __: list[State], reported: list[StateQuantities]) -> list[StateQuantities]:
-        before = [reported[-1], *reported[:-1]]
-        return [
-            replace(a, **{n: getattr(b, n) for n in names}) for a, b in zip(reported, before, strict=True)
-        ]
-
-    return alter
-
-
-def body_spins(model: Model, state: State) -> Array:
-    """J ω′ of each body (N, 3)."""
-    return np.asarray((model.inertia @ state.omega[..., None])[..., 0])
+    p = normalised(to_single_precision(state.p))
+    return wrong, complete_state(wrong, replace(state, p=p, **rounded))
 
 
 def rotational_energy(model: Model, state: State) -> Array:
@@ -247,25 +102,12 @@ def distal_gamma(model: Model, state: State) -> Array:
     return -np.concatenate([np.zeros((1, 3)), centripetal[:-1]]).ravel()
 
 
-def ball_gamma(model: Model, state: State) -> Array:
-    """−γ of ball joints."""
-    centripetal = to_world(state, np.cross(state.omega, np.cross(state.omega, model.proximal)))
-    return centripetal.ravel() + distal_gamma(model, state)
-
-
 def rod_gamma(model: Model, state: State) -> Array:
     """−(−2 ḋᵀḋ) of the rods' γ."""
     return np.asarray(2 * model.length**2 * np.sum(state.udot**2, -1))
 
 
 # --- in time ------------------------------------------------------------------------------------
-
-
-def euler_as_rk4(
-    simulate: Any, model: Model, state: State, times: Array, i: Integrator, h: float
-) -> Trajectory:
-    """A first-order step under the name of RK4."""
-    return simulate(model, state, times, replace(i, name="Euler"), h)
 
 
 def extrapolated_euler(
@@ -284,42 +126,13 @@ def extrapolated_euler(
     )
 
 
-def fast_clock(
-    simulate: Any, model: Model, state: State, times: Array, i: Integrator, h: float
-) -> Trajectory:
-    """Time runs 1e-6 too fast; the sample times are the requested ones."""
-    off = 1 + 1e-6
-    return replace(simulate(model, state, times * off, i, h * off), t=times)
-
-
 def one_step_late(
     simulate: Any, model: Model, state: State, times: Array, i: Integrator, h: float
 ) -> Trajectory:
     """Samples are taken one step after their time."""
-    late = np.concatenate([[0.0], times + h])
-    run = simulate(model, state, late, i, h)
-    kept = [0, *range(2, len(late))]
-    return Trajectory(times, *(getattr(run, k)[kept] for k in ("r", "p", "v", "pdot")), run.steps)
-
-
-def rows_reordered(rows: Callable[[int], list[int]]) -> Run:
-    """Rows of the trajectory taken from others, the times as requested."""
-
-    def alter(simulate: Any, model: Model, state: State, times: Array, i: Integrator, h: float) -> Trajectory:
-        run, order = simulate(model, state, times, i, h), rows(len(times))
-        return Trajectory(times, *(getattr(run, k)[order] for k in ("r", "p", "v", "pdot")), run.steps)
-
-    return alter
-
-
-def sample_change(change: Callable[[Trajectory], dict[str, Array]]) -> Run:
-    """Columns of the trajectory replaced."""
-
-    def alter(simulate: Any, model: Model, state: State, times: Array, i: Integrator, h: float) -> Trajectory:
-        run = simulate(model, state, times, i, h)
-        return replace(run, **change(run))
-
-    return alter
+    run = simulate(model, state, np.concatenate([[0.0], times + h]), i, h)
+    kept = [0, *range(2, len(run.t))]
+    return replace(run, t=times, **{k: getattr(run, k)[kept] for k in ("r", "p", "v", "pdot")})
 
 
 def short_run(simulate: Any, model: Model, state: State, times: Array, i: Integrator, h: float) -> Trajectory:
@@ -327,53 +140,7 @@ def short_run(simulate: Any, model: Model, state: State, times: Array, i: Integr
     return simulate(model, state, times[:-3], i, h)
 
 
-def damped(simulate: Any, model: Model, state: State, times: Array, i: Integrator, h: float) -> Trajectory:
-    """Drag of 1e-6 N m s on every body."""
-    return simulate(model.changed(drag_moment=model.drag_moment + 1e-6), state, times, i, h)
-
-
 # --- of one body, or in a rare branch ------------------------------------------------------------
-
-
-def with_row(k: int, right: Array, wrong: Array) -> Array:
-    """Row k of the second, the other rows of the first."""
-    out = np.array(right)
-    out[k] = wrong[k]
-    return out
-
-
-def body_change(k: int, **change: Callable[[Model, State], Array]) -> Inputs:
-    """Fields of the model replaced in the row of one body."""
-    return model_change(
-        lambda m, s: {name: with_row(k, getattr(m, name), f(m, s)) for name, f in change.items()}
-    )
-
-
-def body_state_change(k: int, **change: Callable[[Model, State], Array]) -> Inputs:
-    """Minimal coordinates of one body replaced."""
-    return state_change(
-        lambda m, s: {name: with_row(k, getattr(s, name), f(m, s)) for name, f in change.items()}
-    )
-
-
-def body_answer_change(k: int, name: str, change: Callable[[Model, State, Array], Array]) -> Answers:
-    """One quantity of one body altered in each answer."""
-    return answer_change(name, lambda m, s, x: with_row(k, x, change(m, s, x)))
-
-
-def when(condition: Callable[[Model, State], bool], change: Inputs) -> Inputs:
-    """A change in a branch that is rarely taken."""
-    return lambda m, s: change(m, s) if condition(m, s) else (m, s)
-
-
-def added_moment(extra: Callable[[Model, State], Array], *bodies: int) -> Inputs:
-    """A moment (N, 3) in body axes on some bodies, or on all."""
-
-    def change(model: Model, state: State) -> dict[str, Array]:
-        on = np.isin(np.arange(model.n), bodies)[:, None] if bodies else True
-        return {"moment": model.moment + np.where(on, extra(model, state), 0.0)}
-
-    return model_change(change)
 
 
 def moment_of_force_at(point: str, force: Callable[[Model, State], Array]) -> Callable[[Model, State], Array]:
@@ -420,11 +187,6 @@ def proximal_velocity(model: Model, state: State) -> Array:
     return state.v + to_world(state, np.cross(state.omega, model.proximal))
 
 
-def one_inertia(k: int, change: Callable[[Model, State], Array]) -> Inputs:
-    """The inertia of one body replaced."""
-    return body_change(k, inertia=change)
-
-
 def stale_state(*names: str) -> Inputs:
     """Minimal coordinates of the state before; of the first state its own."""
     last: list[State] = []
@@ -432,20 +194,7 @@ def stale_state(*names: str) -> Inputs:
     def alter(model: Model, state: State) -> tuple[Model, State]:
         before = last[-1] if last and last[-1].p.shape == state.p.shape else state
         last[:] = [state]
-        return model, with_coordinates(model, state, **{name: getattr(before, name) for name in names})
-
-    return alter
-
-
-def stale_body_answer(k: int, name: str) -> Answers:
-    """One body's row still holds what it was at the state before."""
-
-    def alter(_: Model, __: list[State], reported: list[StateQuantities]) -> list[StateQuantities]:
-        before = [reported[-1], *reported[:-1]]
-        return [
-            replace(a, **{name: with_row(k, getattr(a, name), getattr(b, name))})
-            for a, b in zip(reported, before, strict=True)
-        ]
+        return model, complete_state(model, replace(state, **{name: getattr(before, name) for name in names}))
 
     return alter
 
@@ -476,103 +225,46 @@ def proximal_gamma(k: int) -> Callable[[Model, State], Array]:
     return defect
 
 
-def noise_growing(base: float, size: float) -> Callable[[Model, State, Array], Array]:
-    """Relative noise that depends on every bit of the state and grows from body to body."""
-
-    def noisy(model: Model, state: State, x: Array) -> Array:
-        bits = state.p.tobytes() + state.omega.tobytes() + model.gravity.tobytes()
-        rng = np.random.default_rng(zlib.crc32(bits))
-        return np.asarray(x * (1 + size * base ** np.arange(len(x))[:, None] * rng.normal(size=x.shape)))
-
-    return noisy
-
-
-@contextmanager
-def mujoco_armature(*values: float) -> Iterator[None]:
-    """Armature of the ball joints, one value each or one for all."""
-    from adapters import mujoco_engine
-
-    real = mujoco_engine._MujocoChain.__init__
-
-    def build(self: Any, *args: Any, **options: Any) -> None:
-        real(self, *args, **options)
-        self.m.dof_armature[:] = np.repeat(values, 3) if len(values) > 1 else values[0]
-
-    with patch.object(mujoco_engine._MujocoChain, "__init__", build):
-        yield
-
-
-@contextmanager
-def mujoco_damping(value: float) -> Iterator[None]:
-    """Viscous damping in every joint."""
-    from adapters import mujoco_engine
-
-    real = mujoco_engine._MujocoChain.__init__
-
-    def build(self: Any, *args: Any, **options: Any) -> None:
-        real(self, *args, **options)
-        self.m.dof_damping[:] = value
-
-    with patch.object(mujoco_engine._MujocoChain, "__init__", build):
-        yield
-
-
-@contextmanager
-def pinocchio_armature(value: float) -> Iterator[None]:
-    """Armature of every joint."""
-    from adapters import pinocchio_engine
-
-    real = pinocchio_engine.PinocchioChain.__init__
-
-    def build(self: Any, *args: Any, **options: Any) -> None:
-        real(self, *args, **options)
-        self.pin_model.armature = np.full(self.pin_model.nv, value)
-
-    with patch.object(pinocchio_engine.PinocchioChain, "__init__", build):
-        yield
-
-
 M, P, E, R = "mujoco", "pinocchio", "exudyn", "reference"
+MUJOCO = "adapters.mujoco_engine:_MujocoChain"
 X = np.array([1.0, 0.0, 0.0])
 
 STATE_DEFECTS = (
     # numbers of the model
     Defect("inertia-yy-1e-4", "J_yy of body 2 × (1 + 1e-4)", ("inertia yy of body 2",), M,
-           inputs=parameter_change("inertia", 1, 1, 1, times=1 + 1e-4)),
+           inputs=number_change("inertia", 1, 1, 1, times=1 + 1e-4)),
     Defect("inertia-xx-1e-6", "J_xx of body 1 × (1 + 1e-6)", ("inertia xx of body 1",), P,
-           inputs=parameter_change("inertia", 0, 0, 0, times=1 + 1e-6)),
+           inputs=number_change("inertia", 0, 0, 0, times=1 + 1e-6)),
     Defect("inertia-yy-7-percent", "J_yy of body 2 × 0.93", ("inertia yy of body 2",), E, "rods",
-           inputs=parameter_change("inertia", 1, 1, 1, times=0.93)),
+           inputs=number_change("inertia", 1, 1, 1, times=0.93)),
     Defect("inertia-xy-sign", "J_xy of body 1 × -1", ("inertia xy of body 1",), M,
-           inputs=parameter_change("inertia", 0, 0, 1, times=-1.0)),
+           inputs=number_change("inertia", 0, 0, 1, times=-1.0)),
     Defect("inertia-products-dropped", "all products of inertia 0", ("products of inertia",), P,
            inputs=model_change(lambda m, _: {"inertia": m.inertia * np.eye(3)})),
     Defect("inertia-about-proximal", "J + m (s² I - s sᵀ)", ("inertia about the proximal point",), E,
-           inputs=model_change(inertia_about_proximal)),
+           inputs=model_change(lambda m, s: {"inertia": inertia_about_proximal(m, s)})),
     Defect("inertia-in-world-axes", "A J Aᵀ in place of J", ("inertia in world axes",), M,
-           inputs=model_change(lambda m, s: {"inertia": (lambda x: (x + x.mT) / 2)(
-               rotation_matrix(s.p).mT @ m.inertia @ rotation_matrix(s.p))})),
+           inputs=model_change(lambda m, s: {"inertia": inertia_in_world_axes(m, s)})),
     Defect("centre-0.1mm", "centre of mass of body 1 by 0.1 mm in x", ("centre of mass of body 1",), M,
            inputs=centre_of_mass_moved(0, 1e-4 * X)),
     Defect("proximal-1e-5", "proximal y of body 1 by 1e-5 m", ("proximal y of body 1",), P,
-           inputs=parameter_change("proximal", 0, 1, by=1e-5)),
+           inputs=number_change("proximal", 0, 1, by=1e-5)),
     Defect("distal-1e-5", "distal x of body 1 by 1e-5 m", ("distal x of body 1",), E,
-           inputs=parameter_change("distal", 0, 0, by=1e-5)),
+           inputs=number_change("distal", 0, 0, by=1e-5)),
     Defect("rod-length-1e-5", "length of rod 2 × (1 + 1e-5)", ("length of rod 2",), M, "rods",
-           inputs=parameter_change("length", 1, times=1 + 1e-5)),
+           inputs=number_change("length", 1, times=1 + 1e-5)),
     Defect("mass-1-1e-5", "mass of body 1 × (1 + 1e-5)", ("mass of body 1",), E,
-           inputs=parameter_change("mass", 0, times=1 + 1e-5)),
+           inputs=number_change("mass", 0, times=1 + 1e-5)),
     Defect("mass-2-1e-5", "mass of body 2 × (1 + 1e-5)", ("mass of body 2",), P, "rods",
-           inputs=parameter_change("mass", 1, times=1 + 1e-5)),
+           inputs=number_change("mass", 1, times=1 + 1e-5)),
     Defect("mass-and-inertia-together", "all masses and inertias × (1 + 1e-4)", ("all masses and inertias",),
            inputs=model_change(lambda m, _: {k: getattr(m, k) * (1 + 1e-4) for k in ("mass", "inertia")})),
     Defect("lengths-1e-5", "all offsets × (1 + 1e-5)", ("all lengths",), P,
-           inputs=model_change(lambda m, _: {k: getattr(m, k) * (1 + 1e-5)
-                                             for k in ("proximal", "distal", "length")})),
+           inputs=model_change(lambda m, _: {k: getattr(m, k) * (1 + 1e-5) for k in ("point", "length")})),
     Defect("gravity-1e-5", "gravity × (1 + 1e-5)", ("gravity's size",), P,
            inputs=model_change(lambda m, _: {"gravity": m.gravity * (1 + 1e-5)})),
     Defect("gravity-z", "gravity z by -1e-3 m/s²", ("gravity z",), E,
-           inputs=parameter_change("gravity", 2, by=-1e-3)),
+           inputs=number_change("gravity", 2, by=-1e-3)),
     Defect("gravity-sign", "gravity × -1", ("gravity reversed", "gravity's size"), M, "rods",
            inputs=model_change(lambda m, _: {"gravity": -m.gravity})),
     Defect("gravity-axes", "gravity's y and z exchanged", ("gravity's y and z",), P,
@@ -603,7 +295,7 @@ STATE_DEFECTS = (
     Defect("rod-rate-dropped", "u̇ = 0", ("rod rate",), M, "rods",
            inputs=state_change(lambda _, s: {"udot": 0 * s.udot})),
     Defect("tilt-1e-6", "body 2 turned by 1e-6 rad about its x", ("attitude of body 2",), E,
-           inputs=attitude_turned(1, 1e-6)),
+           inputs=body_state_change(1, p=lambda _, s: turned_by(1e-6, 0, 0)(s.p))),
     Defect("single-inside", "all inputs through single precision", (), M, inputs=inputs_in_single_precision),
     # terms of the equations
     Defect("gyroscopic-dropped", "8 L̇ᵀJL̇p × 0", ("gyroscopic term",), P,
@@ -611,9 +303,10 @@ STATE_DEFECTS = (
     Defect("gyroscopic-doubled", "8 L̇ᵀJL̇p × 2", ("gyroscopic term",), M, "rods",
            inputs=model_change(lambda m, s: {"moment": m.moment - gyroscopic_moment(m, s)})),
     Defect("gamma-far-dropped", "γ without the far body's term", ("distal term of γ",), R,
-           gamma=distal_gamma),
-    Defect("gamma-dropped", "γ = 0 (missing J̇v)", ("γ (J̇v)",), R, gamma=ball_gamma),
-    Defect("gamma-rod-dropped", "γ of rods without ḋᵀḋ", ("rod term of γ",), R, "rods", gamma=rod_gamma),
+           patch=added_gamma(distal_gamma)),
+    Defect("gamma-dropped", "γ = 0 (missing J̇v)", ("γ (J̇v)",), R, patch=without_gamma(0, 1)),
+    Defect("gamma-rod-dropped", "γ of rods without ḋᵀḋ", ("rod term of γ",), R, "rods",
+           patch=added_gamma(rod_gamma)),
     # what comes back
     Defect("spatial-acceleration", "r̈ - ω × ṙ in place of r̈", ("spatial acceleration",), P,
            answers=answer_change("acceleration", lambda _, s, a: a - np.cross(to_world(s, s.omega), s.v))),
@@ -659,7 +352,7 @@ BODY_DEFECTS = (
     Defect("force-2-sign", "F of body 2 × -1", ("applied force of body 2",), E, loaded=True,
            inputs=body_change(1, force=lambda m, _: -m.force)),
     Defect("force-x-of-2-dropped", "F_x of body 2 = 0", ("applied force x of body 2",), P, loaded=True,
-           inputs=parameter_change("force", 1, 0, times=0.0)),
+           inputs=number_change("force", 1, 0, times=0.0)),
     Defect("moment-1-dropped", "n′ of body 1 × 0", ("applied moment of body 1",), E, loaded=True,
            inputs=body_change(0, moment=lambda m, _: 0 * m.moment)),
     Defect("moment-2-doubled", "n′ of body 2 × 2", ("applied moment of body 2",), P, "rod-ball", loaded=True,
@@ -667,14 +360,14 @@ BODY_DEFECTS = (
     Defect("moment-1-sign", "n′ of body 1 × -1", ("applied moment of body 1",), M, "rods", loaded=True,
            inputs=body_change(0, moment=lambda m, _: -m.moment)),
     Defect("moment-z-of-1-dropped", "n′_z of body 1 = 0", ("applied moment z of body 1",), M, loaded=True,
-           inputs=parameter_change("moment", 0, 2, times=0.0)),
+           inputs=number_change("moment", 0, 2, times=0.0)),
     Defect("loads-2-dropped", "F and n′ of body 2 × 0", ("applied loads of body 2",), M, loaded=True,
            inputs=body_change(1, force=lambda m, _: 0 * m.force, moment=lambda m, _: 0 * m.moment)),
     Defect("loads-3-dropped", "F and n′ of body 3 of five × 0", ("applied loads of body 3",), P, "mixed",
            loaded=True,
            inputs=body_change(2, force=lambda m, _: 0 * m.force, moment=lambda m, _: 0 * m.moment)),
     Defect("load-where-none-is", "F_y of body 1 = 1e-5 N", ("applied force y of body 1",), E,
-           inputs=parameter_change("force", 0, 1, by=1e-5)),
+           inputs=number_change("force", 0, 1, by=1e-5)),
     Defect("force-1-in-body-frame", "A F of body 1", ("force of body 1 were taken in the body frame",), P,
            loaded=True, inputs=body_change(0, force=lambda m, s: to_world(s, m.force))),
     Defect("moment-2-in-world-frame", "Aᵀ n′ of body 2", ("moment of body 2 were taken in the world frame",),
@@ -701,13 +394,13 @@ BODY_DEFECTS = (
            inputs=added_moment(moment_of_force_at("distal", lambda m, _: m.mass[:, None] * m.gravity))),
     # drag
     Defect("drag-force-2-dropped", "c_t of body 2 × 0", ("drag force of body 2",), M, loaded=True,
-           inputs=parameter_change("drag_force", 1, times=0.0)),
+           inputs=number_change("drag_force", 1, times=0.0)),
     Defect("drag-force-1-1e-6", "c_t of body 1 × (1 + 1e-6)", ("drag force of body 1",), P, loaded=True,
-           inputs=parameter_change("drag_force", 0, times=1 + 1e-6)),
+           inputs=number_change("drag_force", 0, times=1 + 1e-6)),
     Defect("drag-moment-1-dropped", "c_r of body 1 × 0", ("drag moment of body 1",), E, loaded=True,
-           inputs=parameter_change("drag_moment", 0, times=0.0)),
+           inputs=number_change("drag_moment", 0, times=0.0)),
     Defect("drag-moment-2-sign", "c_r of body 2 × -1", ("drag moment of body 2",), P, "rods", loaded=True,
-           inputs=parameter_change("drag_moment", 1, times=-1.0)),
+           inputs=number_change("drag_moment", 1, times=-1.0)),
     Defect("drag-2-doubled", "c_t and c_r of body 2 × 2", ("drag of body 2",), M, loaded=True,
            inputs=body_change(1, drag_force=lambda m, _: 2 * m.drag_force,
                           drag_moment=lambda m, _: 2 * m.drag_moment)),
@@ -728,15 +421,16 @@ BODY_DEFECTS = (
            ("drag force acted at the proximal point",), M, loaded=True,
            inputs=added_moment(moment_of_force_at("proximal", lambda m, s: -m.drag_force[:, None] * s.v))),
     Defect("damping-of-body-2", "c_r of body 2 by 1e-6 N m s", ("rotation of body 2",), P,
-           inputs=parameter_change("drag_moment", 1, by=1e-6)),
+           inputs=number_change("drag_moment", 1, by=1e-6)),
     Defect("joint-damping", "1e-4 N m s in every joint", ("damping in every joint", "damping in the joints"),
-           M, engine_patch=lambda: mujoco_damping(1e-4)),
+           M, patch=built_with(MUJOCO, "m", "dof_damping", 1e-4)),
     Defect("armature", "1e-4 kg m² in every joint", ("armature",), M,
-           engine_patch=lambda: mujoco_armature(1e-4)),
+           patch=built_with(MUJOCO, "m", "dof_armature", 1e-4)),
     Defect("armature-of-joint-2", "1e-6 kg m² in joint 2", ("armature of joint 2",), M,
-           engine_patch=lambda: mujoco_armature(0.0, 1e-6)),
+           patch=built_with(MUJOCO, "m", "dof_armature", np.repeat([0.0, 1e-6], 3))),
     Defect("armature-of-three-percent", "1e-3 kg m² in every joint", ("armature",), P,
-           engine_patch=lambda: pinocchio_armature(1e-3)),
+           patch=built_with(
+               "adapters.pinocchio_engine:PinocchioChain", "pin_model", "armature", 1e-3)),
     # velocity terms
     Defect("gyroscopic-1-dropped", "ω′ × J ω′ of body 1 × 0", ("gyroscopic term of body 1",), P,
            inputs=added_moment(gyroscopic_moment, 0)),
@@ -747,7 +441,7 @@ BODY_DEFECTS = (
     Defect("gyroscopic-1-1e-6", "ω′ × J ω′ of body 1 × (1 + 1e-6)", ("gyroscopic term of body 1",), M,
            inputs=added_moment(lambda m, s: -1e-6 * gyroscopic_moment(m, s), 0)),
     Defect("gamma-2-proximal-dropped", "ω × (ω × s) of body 2 missing in γ",
-           ("proximal term of γ of body 2",), R, gamma=proximal_gamma(1)),
+           ("proximal term of γ of body 2",), R, patch=added_gamma(proximal_gamma(1))),
     # attitude, rates, inertia and points of one body
     Defect("attitude-2-conjugated", "q* of body 2", ("rotation matrix of body 2 were transposed",), M,
            inputs=body_state_change(1, p=lambda _, s: quaternion_conjugate(s.p))),
@@ -770,15 +464,14 @@ BODY_DEFECTS = (
     Defect("rod-rate-2-dropped", "u̇ of rod 2 = 0", ("rod rate u̇ of rod 2",), M, "rods",
            inputs=body_state_change(1, udot=lambda _, s: 0 * s.udot)),
     Defect("inertia-2-in-world-axes", "A J Aᵀ of body 2", ("inertia of body 2 in world axes",), P,
-           inputs=one_inertia(1, lambda m, s: (lambda x: (x + x.mT) / 2)(
-               rotation_matrix(s.p).mT @ m.inertia @ rotation_matrix(s.p)))),
+           inputs=body_change(1, inertia=inertia_in_world_axes)),
     Defect("inertia-1-about-proximal", "J + m (s² I - s sᵀ) of body 1",
            ("inertia of body 1 about the proximal point",), M,
-           inputs=one_inertia(0, lambda m, s: inertia_about_proximal(m, s)["inertia"])),
+           inputs=body_change(0, inertia=inertia_about_proximal)),
     Defect("products-2-dropped", "products of inertia of body 2 = 0", ("products of inertia of body 2",), E,
-           inputs=one_inertia(1, lambda m, _: m.inertia * np.eye(3))),
+           inputs=body_change(1, inertia=lambda m, _: m.inertia * np.eye(3))),
     Defect("products-1-sign", "products of inertia of body 1 × -1", ("products of inertia of body 1",), P,
-           inputs=one_inertia(0, lambda m, _: m.inertia * (2 * np.eye(3) - 1))),
+           inputs=body_change(0, inertia=lambda m, _: m.inertia * (2 * np.eye(3) - 1))),
     Defect("points-1-exchanged", "proximal and distal of body 1", ("proximal and distal points of body 1",),
            M, inputs=body_change(0, proximal=lambda m, _: m.distal, distal=lambda m, _: m.proximal)),
     Defect("points-1-sign", "proximal and distal of body 1 × -1", ("attachment points of body 1",), P,
@@ -788,9 +481,9 @@ BODY_DEFECTS = (
                              inertia=lambda m, _: (1 + 1e-5) * m.inertia)),
     # answers of one body
     Defect("acceleration-1-stale", "r̈ of body 1 of the state before", ("of body 1 of the previous state",), M,
-           answers=stale_body_answer(0, "acceleration")),
+           answers=stale_answers("acceleration", body=0)),
     Defect("reaction-2-stale", "F of body 2 of the state before", ("of body 2 of the previous state",), P,
-           "rods", answers=stale_body_answer(1, "joint_reaction")),
+           "rods", answers=stale_answers("joint_reaction", body=1)),
     Defect("angular-1-for-2", "ω̇′ of body 1 for that of body 2", ("angular acceleration of body 1 as that",),
            E, answers=answer_change("angular_acceleration", lambda _, __, a: a[[0, 0]])),
     Defect("acceleration-4-for-3", "r̈ of body 4 for that of body 3 of five",
@@ -825,12 +518,12 @@ BODY_DEFECTS = (
     Defect("n3-gyroscopic", "ω′ × J ω′ of body 3 dropped where N ≥ 3", ("gyroscopic term of body 3",), M,
            "mixed", inputs=when(lambda m, _: m.n >= 3, added_moment(gyroscopic_moment, 2))),
     Defect("rod-after-ball-length", "rods after balls longer by 1e-6", ("length of rod 4",), P, "mixed",
-           inputs=parameter_change("length", 3, times=1 + 1e-6)),
+           inputs=number_change("length", 3, times=1 + 1e-6)),
     Defect("rod-after-ball-gamma", "γ of rods after balls without ḋᵀḋ", ("rod term of γ of rod 4",), R,
-           "mixed", gamma=rod_gamma_after_balls),
+           "mixed", patch=added_gamma(rod_gamma_after_balls)),
     Defect("loaded-mass", "mass of body 1 × (1 + 1e-5) where there is a load", ("mass of body 1",), E,
            loaded=True,
-           inputs=when(lambda m, _: m.has_loads, parameter_change("mass", 0, times=1 + 1e-5))),
+           inputs=when(lambda m, _: m.has_loads, number_change("mass", 0, times=1 + 1e-5))),
     Defect("loaded-gravity", "no gravity where there is a load", ("no gravity", "gravity's size"), M,
            loaded=True, inputs=when(lambda m, _: m.has_loads, model_change(
                lambda m, _: {"gravity": 0 * m.gravity}))),
@@ -857,59 +550,53 @@ BODY_DEFECTS = (
 STATE_DEFECTS = (*STATE_DEFECTS, *BODY_DEFECTS)
 
 MOTION_DEFECTS = (
-    Defect("order-1-named-RK4", "Euler's step under the name RK4", level="motion", run=euler_as_rk4),
-    Defect("order-2-named-RK4", "an order-2 step under the name RK4", level="motion", run=extrapolated_euler),
-    Defect("clock-1e-6", "time × (1 + 1e-6)", level="motion", run=fast_clock),
-    Defect("one-step-late", "samples shifted by one step", level="motion", run=one_step_late),
-    Defect("silent-reset", "the last third starts again", level="motion",
+    Defect("order-1-named-RK4", "Euler's step under the name RK4", run=run_as("Euler")),
+    Defect("order-2-named-RK4", "an order-2 step under the name RK4", run=extrapolated_euler),
+    Defect("clock-1e-6", "time × (1 + 1e-6)", run=run_with_clock(1 + 1e-6)),
+    Defect("one-step-late", "samples shifted by one step", run=one_step_late),
+    Defect("silent-reset", "the last third starts again",
            run=rows_reordered(lambda n: [*range(n - n // 3), *range(n // 3)])),
-    Defect("repeated-last-rows", "the last three rows repeat", level="motion",
+    Defect("repeated-last-rows", "the last three rows repeat",
            run=rows_reordered(lambda n: [*range(n - 2), n - 3, n - 3])),
-    Defect("early-stop", "the last three samples missing", level="motion", run=short_run),
-    Defect("not-finite", "the last row NaN", level="motion",
+    Defect("early-stop", "the last three samples missing", run=short_run),
+    Defect("not-finite", "the last row NaN",
            run=sample_change(lambda run: {
                "r": np.where(np.arange(len(run.t))[:, None, None] == len(run.t) - 1, np.nan, run.r)})),
-    Defect("damping-1e-6-in-time", "drag of 1e-6 N m s on every body", level="motion", run=damped),
-    Defect("single-precision-samples", "positions rounded to single precision", level="motion",
+    Defect("damping-1e-6-in-time", "drag of 1e-6 N m s on every body", inputs=model_change(
+        lambda m, _: {"drag_moment": m.drag_moment + 1e-6})),
+    Defect("single-precision-samples", "positions rounded to single precision",
            run=sample_change(lambda run: {"r": to_single_precision(run.r)})),
-    Defect("norm-1e-9", "quaternions × (1 + 1e-9) from the second row on", level="motion",
+    Defect("norm-1e-9", "quaternions × (1 + 1e-9) from the second row on",
            run=sample_change(lambda run: {"p": run.p * (1 + 1e-9 * (run.t > 0))[:, None, None]})),
-    Defect("stale-velocity", "ṙ of the sample before", level="motion",
+    Defect("stale-velocity", "ṙ of the sample before",
            run=sample_change(lambda run: {"v": run.v[[0, *range(len(run.t) - 1)]]})),
-    Defect("gravity-1e-5-in-time", "gravity × (1 + 1e-5)", level="motion",
+    Defect("gravity-1e-5-in-time", "gravity × (1 + 1e-5)",
            inputs=model_change(lambda m, _: {"gravity": m.gravity * (1 + 1e-5)})),
-    Defect("force-2-dropped-in-time", "F of body 2 × 0", level="motion", loaded=True,
+    Defect("force-2-dropped-in-time", "F of body 2 × 0", loaded=True,
            inputs=body_change(1, force=lambda m, _: 0 * m.force)),
-    Defect("drag-exchanged-in-time", "c_t for c_r", level="motion", loaded=True,
+    Defect("drag-exchanged-in-time", "c_t for c_r", loaded=True,
            inputs=model_change(lambda m, _: {"drag_force": m.drag_moment, "drag_moment": m.drag_force})),
-    Defect("moment-1-at-the-start-only", "n′ of body 1 as it was in world axes at the start", level="motion",
+    Defect("moment-1-at-the-start-only", "n′ of body 1 as it was in world axes at the start",
            loaded=True, engine=P, integrator="rkmk4",
            inputs=body_change(0, moment=lambda m, s: to_body(s, m.moment))),
-    Defect("armature-in-time", "1e-4 kg m² in every joint", level="motion",
-           engine_patch=lambda: mujoco_armature(1e-4)),
-    Defect("attitude-2-conjugated-in-time", "q* of body 2 in the samples", level="motion",
+    Defect("armature-in-time", "1e-4 kg m² in every joint",
+           patch=built_with(MUJOCO, "m", "dof_armature", 1e-4)),
+    Defect("attitude-2-conjugated-in-time", "q* of body 2 in the samples",
            run=sample_change(lambda run: {"p": np.stack(
                [run.p[:, 0], quaternion_conjugate(run.p[:, 1])], axis=1)})),
-    Defect("row-of-another-body", "ṙ of body 1 for that of body 2", level="motion",
+    Defect("row-of-another-body", "ṙ of body 1 for that of body 2",
            run=sample_change(lambda run: {"v": run.v[:, [0, 0]]})),
-    Defect("noise-1e-8-in-samples", "positions with noise of 1e-8 m", level="motion",
+    Defect("noise-1e-8-in-samples", "positions with noise of 1e-8 m",
            run=sample_change(lambda run: {
                "r": run.r + 1e-8 * np.random.default_rng(5).normal(size=run.r.shape)})),
 )  # fmt: skip
 
 DEFECTS = STATE_DEFECTS + MOTION_DEFECTS
 
-# Two causes with one effect on every quantity: the diagnosis must name both, or see neither.
-INDISTINGUISHABLE = (
-    (
-        Defect("centre-of-last-body", "centre of mass of body 2 by 1e-5 m in x",
-               inputs=centre_of_mass_moved(1, 1e-5 * X)),
-        ("centre of mass of body 2", "proximal x of body 2"),
-    ),
-    (
-        Defect("zeroth-sign", "-p for p: the same attitude", inputs=state_change(lambda _, s: {"p": -s.p})),
-        (),
-    ),
+# Two causes with one effect on every quantity: the diagnosis must name both.
+INDISTINGUISHABLE = Defect(
+    "centre-of-last-body", "centre of mass of body 2 by 1e-5 m in x", ("centre of mass of body 2",),
+    inputs=centre_of_mass_moved(1, 1e-5 * X), equal=("proximal x of body 2",),
 )  # fmt: skip
 
 # --- equivalent implementations, none of which may be accused -------------------------------------
@@ -947,7 +634,7 @@ def other_units(mass: float, length: float) -> Defect:
             "force": m * x, "moment": m * x * x, "drag_force": m, "drag_moment": m * x * x,
         }  # fmt: skip
         other = model.changed(**{name: getattr(model, name) * f for name, f in factors.items()})
-        return other, with_coordinates(other, state)
+        return other, complete_state(other, state)
 
     def back(model: Model, states: list[State], reported: list[StateQuantities]) -> list[StateQuantities]:
         factors = {
@@ -960,11 +647,6 @@ def other_units(mass: float, length: float) -> Defect:
         ]
 
     return Defect("", "", inputs=inputs, answers=back)
-
-
-def without_mass_matrix(_: Model, __: list[State], reported: list[StateQuantities]) -> list[StateQuantities]:
-    """The mass matrix belongs to the engine's own coordinates and is not given."""
-    return [replace(a, mass_matrix=None) for a in reported]
 
 
 def both_changes(first: Answers | None, second: Answers) -> Answers:
@@ -982,13 +664,6 @@ def recomputed_reaction(order: int) -> Callable[[Model, State, StateQuantities],
         return {"joint_reaction": np.sum(f, axis=0) - np.cumsum(f, axis=0) + f}
 
     return change
-
-
-def recomputed(change: Callable[[Model, State, StateQuantities], dict[str, Any]]) -> Answers:
-    """Quantities recomputed from model, state and the other answers."""
-    return lambda m, states, reported: [
-        replace(a, **change(m, s, a)) for s, a in zip(states, reported, strict=True)
-    ]
 
 
 def recomputed_sums(order: int) -> Callable[[Model, State, StateQuantities], dict[str, Any]]:
@@ -1013,7 +688,7 @@ WORLD_AXES = (equivalent.rotate_world, equivalent.WORLD_VECTORS)
 
 def control(name: str, size: str, engine: str, like: Defect, joints: str = "balls", **kind: Any) -> Defect:
     """A control with the changes of another defect; its mass matrix is not judged."""
-    answers = both_changes(like.answers, without_mass_matrix)
+    answers = both_changes(like.answers, without("mass_matrix"))
     return Defect(name, size, (), engine, joints, inputs=like.inputs, answers=answers, **kind)
 
 
@@ -1027,8 +702,9 @@ def through_rotation_matrix(_: Model, state: State) -> Array:
 
 ANY, HALF = np.array([1.0, -3.0, 2.0, 5.0]) / np.sqrt(39.0), np.array([0.5, 0.5, 0.5, 0.5])
 CONTROLS = (
+    Defect("zeroth-sign", "-p for p: the same attitude", inputs=state_change(lambda _, s: {"p": -s.p})),
     Defect("minus-p-1", "-p of body 1", engine=M, inputs=negated_quaternions(0)),
-    Defect("minus-p-all", "-p of all bodies", engine=P, joints="rods", inputs=negated_quaternions(0, 1)),
+    Defect("minus-p-all", "-p of all bodies", engine=P, mechanism="rods", inputs=negated_quaternions(0, 1)),
     Defect("minus-p-2", "-p of body 2", engine=E, loaded=True, inputs=negated_quaternions(1)),
     control("frames-turned", "other body axes", M, in_axes(ANY, *BODY_AXES), loaded=True),
     control("frames-permuted", "body axes exchanged", P, in_axes(HALF, *BODY_AXES), "rods", loaded=True),
@@ -1042,17 +718,17 @@ CONTROLS = (
     control("tonnes-and-kilometres", "other units", R, other_units(1e-3, 1e-3), "rod-ball"),
     Defect("reactions-from-the-end", "F summed from the free end", engine=M, loaded=True,
            answers=recomputed(recomputed_reaction(1))),
-    Defect("reactions-as-rest", "F as the total less the rest", engine=E, joints="rods", loaded=True,
+    Defect("reactions-as-rest", "F as the total less the rest", engine=E, mechanism="rods", loaded=True,
            answers=recomputed(recomputed_reaction(-1))),
-    Defect("sums-forward", "energies and momentum summed anew", engine=P, joints="mixed",
+    Defect("sums-forward", "energies and momentum summed anew", engine=P, mechanism="mixed",
            answers=recomputed(recomputed_sums(1))),
-    Defect("sums-backward", "energies and momentum summed from the free end", engine=M, joints="mixed",
+    Defect("sums-backward", "energies and momentum summed from the free end", engine=M, mechanism="mixed",
            loaded=True, answers=recomputed(recomputed_sums(-1))),
     Defect("by-rotation-matrix", "attitudes by way of their matrices", engine=P, loaded=True,
            inputs=body_state_change(1, p=through_rotation_matrix)),
     Defect("rates-there-and-back", "ω′ turned into the world and back", engine=E, loaded=True,
            inputs=state_change(lambda _, s: {"omega": to_body(s, to_world(s, s.omega))})),
-    Defect("accelerations-there-and-back", "r̈ turned into body axes and back", engine=M, joints="rods",
+    Defect("accelerations-there-and-back", "r̈ turned into body axes and back", engine=M, mechanism="rods",
            answers=answer_change("acceleration", lambda _, s, a: to_world(s, to_body(s, a)))),
     Defect("drag-as-load", "drag given as loads", engine=M, loaded=True, inputs=model_change(
         lambda m, s: {"force": m.force - m.drag_force[:, None] * s.v, "drag_force": 0 * m.drag_force,
@@ -1064,8 +740,8 @@ CONTROLS = (
            answers=recomputed(lambda m, s, a: recomputed_sums(1)(m, s, a))),
     Defect("one-ulp", "every answer rounded differently in its last digit", engine=M, loaded=True,
            answers=answer_change("acceleration", noise_growing(1.0, 1e-16))),
-    Defect("one-ulp-of-reactions", "the last digit of F", engine=E, joints="rods",
+    Defect("one-ulp-of-reactions", "the last digit of F", engine=E, mechanism="rods",
            answers=answer_change("joint_reaction", noise_growing(1.0, 2e-16))),
-    Defect("spin-axis-moved", "u made a unit vector again", engine=M, joints="rods",
+    Defect("spin-axis-moved", "u made a unit vector again", engine=M, mechanism="rods",
            inputs=state_change(lambda _, s: {"u": s.u / np.linalg.norm(s.u, axis=1, keepdims=True)})),
 )  # fmt: skip

@@ -6,42 +6,21 @@ refinement study do not show it.  Accelerations, rotations and read-outs are the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
 from typing import Any, Literal
-from unittest.mock import patch
 
 import mujoco
 import numpy as np
 
-from adapters import exudyn_engine, exudyn_tree_engine, mujoco_engine, pinocchio_engine
-from plumbline.engines.adapter import Adapter
-from plumbline.engines.registry import load_adapter
+from adapters import mujoco_engine, pinocchio_engine
 from plumbline.model.datatypes import Array, Integrator, Model, State, Trajectory
 from plumbline.model.kinematics import quaternion_rate
+from tests.helpers.planting import Defect, replaced_by, run_as, run_with_clock
 
 Step = Callable[[Any, Array, Array, float], tuple[Array, Array]]  # system, q, v, h -> q, v
-
-
-@dataclass(frozen=True)
-class StepDefect:
-    """A wrong integrator: of step, integrator_used, settings and samples one is given."""
-
-    name: str
-    description: str
-    engine: str
-    integrator: str  # the name that it goes by
-    joints: str = "balls"  # key of tests.helpers.pendulums.JOINT_PATTERNS
-    has_drag: bool = False
-    step: Step | None = None  # replaces the step, on the engine's accelerations and rotations
-    integrator_used: str = ""  # another integrator of the same engine in its place
-    step_factor: float = 1.0  # on the step size
-    solver_type: str = ""  # another explicit solver of Exudyn
-    settings: tuple[tuple[str, Any], ...] = ()  # attributes of Exudyn's generalizedAlpha
-    quadrature: Literal["", "a is the acceleration", "sign of alpha_m", "rates by Euler"] = ""
+Quadrature = Literal["", "a is the acceleration", "sign of alpha_m", "rates by Euler"]
 
 
 class MujocoSystem:
@@ -205,167 +184,61 @@ M, P, E, T = "mujoco", "pinocchio", "exudyn", "exudyn-tree"
 EULERS = ((M, "Euler"), (M, "implicit"), (P, "semi-implicit-euler"))
 RK4S = ((M, "RK4"), (P, "rkmk4"))
 
-STEP_DEFECTS = (
-    *(
-        StepDefect(f"{name}-{engine}-{integrator}", size, engine, integrator, step=step)
-        for engine, integrator in EULERS if integrator != "implicit"
-        for name, size, step in (
-            ("exchanged-halves", "position first, then velocity", exchanged_halves),
-            ("stale-velocity", "positions by the old velocity", stale_velocity),
-            ("mean-velocity", "positions by the mean velocity", mean_velocity),
-            ("first-order-quaternion", "p + h ṗ normalised", first_order_quaternion),
-            ("two-half-steps", "two steps of h/2", two_half_steps),
-            ("last-joint-stale", "stale velocity of the last joint only", last_body_stale),
-            ("verlet", "velocity Verlet", velocity_verlet),
-        )
-    ),
-    *(
-        StepDefect(f"{name}-{engine}", size, engine, integrator, step=step)
-        for engine, integrator in RK4S
-        for name, size, step in (
-            ("no-dexp", "θ̇ = v: order 2", no_correction),
-            ("one-dexp-term", "θ̇ = v + θ×v/2", one_term),
-            ("third-stage-by-first", "k₃ from k₁", third_by_first),
-            ("reused-acceleration", "k₁ is k₄ of the step before", reused_acceleration),
-            ("three-eighths-rule", "Kutta's 3/8 rule: order 4 too", three_eighths),
-            ("weights-2.001-1.999", "weights 1, 2.001, 1.999, 1", wrong_weights),
-        )
-    ),
-    StepDefect("implicit-is-euler", "no damping in the matrix", M, "implicit", integrator_used="Euler"),
-    StepDefect("implicit-is-implicitfast", "D without Coriolis terms", M, "implicit", "rods", True,
-               integrator_used="implicitfast"),
-    StepDefect("damping-halved", "D/2", M, "implicit", step=halved_damping),
-    StepDefect("damping-symmetric", "(D + Dᵀ)/2", M, "implicit", step=symmetric_damping),
-    StepDefect("implicit-stale", "positions by the old velocity", M, "implicit", step=implicit_stale),
-    StepDefect("drag-explicit", "drag by the old velocity", M, "implicitfast", has_drag=True,
-               integrator_used="Euler"),
-    StepDefect("drag-implicit", "drag by the new velocity", M, "Euler", has_drag=True,
-               integrator_used="implicitfast"),
-    StepDefect("euler-is-rk4", "a better method than declared", M, "Euler", integrator_used="RK4"),
-    StepDefect("long-step-mujoco", "h (1 + 1e-9)", M, "RK4", step_factor=1 + 1e-9),
-    StepDefect("long-step-tree", "h (1 + 1e-9)", T, "RK44", step_factor=1 + 1e-9),
-    StepDefect("tree-rk33", "Heun's order 3", T, "RK44", solver_type="RK33"),
-    StepDefect("tree-rk67", "order 6 in place of order 4", T, "RK44", solver_type="RK67"),
-    StepDefect("tree-verlet", "velocity Verlet", T, "RK44", solver_type="VelocityVerlet"),
-    *(
-        StepDefect(f"spectral-radius-{radius:.10g}", f"ρ = {radius:.10g}", E, "generalized-alpha", joints,
-                   settings=(("spectralRadius", radius),))
-        for radius in (0.8, 0.89, 0.900001) for joints in ("balls",)
-    ),
-    StepDefect("newmark-for-alpha", "Newmark, index 3", E, "generalized-alpha",
-               settings=(("useNewmark", True),)),
-    StepDefect("newmark-on-velocities", "Newmark, index 2", E, "generalized-alpha",
-               settings=(("useNewmark", True), ("useIndex2Constraints", True))),
-    StepDefect("alpha-acceleration", "a = q̈ in place of the averaged a", E, "generalized-alpha",
-               quadrature="a is the acceleration"),
-    StepDefect("alpha-m-sign", "−αm in place of αm", E, "generalized-alpha", quadrature="sign of alpha_m"),
-    StepDefect("trapezoidal-beta", "β = 1/6", E, "trapezoidal", settings=(("newmarkBeta", 1 / 6),)),
-    StepDefect("trapezoidal-gamma", "γ = ½ + 1e-6", E, "trapezoidal",
-               settings=(("newmarkGamma", 0.5 + 1e-6),)),
-    StepDefect("trapezoidal-index-3", "constraints on positions", E, "trapezoidal", "rods",
-               settings=(("useIndex2Constraints", False),)),
-    StepDefect("trapezoidal-is-alpha", "generalised-α 0.9", E, "trapezoidal",
-               settings=(("useNewmark", False), ("useIndex2Constraints", False), ("spectralRadius", 0.9))),
-    StepDefect("rates-by-euler", "q̇₁ = q̇₀ + h q̈₁", E, "trapezoidal", quadrature="rates by Euler"),
-    StepDefect("first-accelerations-zero", "q̈₀ = 0", E, "trapezoidal", "rods",
-               settings=(("computeInitialAccelerations", False),)),
-    StepDefect("first-accelerations-zero-alpha", "q̈₀ = 0", E, "generalized-alpha",
-               settings=(("computeInitialAccelerations", False),)),
-)  # fmt: skip
-
-
-# What the diagnosis must say, by the beginning of a defect's name; of others, that nothing explains them.
-STEP_NAMES = {
-    "exchanged-halves": "exchanged the halves of semi-implicit Euler",
-    "stale-velocity": "explicit Euler's step",
-    "mean-velocity": "the mean of the old and the new velocity",
-    "first-order-quaternion": "quaternions by p + h ṗ",
-    "two-half-steps": "2 steps of 1/2 of the size",
-    "last-joint-stale": "the joint of body 2 by the old velocity",
-    "verlet": "velocity Verlet's step",
-    "no-dexp": "left dexp⁻¹ out",
-    "one-dexp-term": "cut dexp⁻¹ after θ×v/2",
-    "reused-acceleration": "its declared step, with the last acceleration of the step before",
-    "third-stage-by-first": "third stage by the first slope",
-    "three-eighths-rule": "3/8 rule",
-    "weights-2.001": "weight of stage 2 were larger by 0.000167",
-    "implicit-is-euler": "semi-implicit Euler's step, with all forces explicit",
-    "implicit-is-implicitfast": "with the drag implicit",
-    "damping-halved": "derivatives of forces in the matrix were 0.5 times as large",
-    "damping-symmetric": "symmetrised the derivatives",
-    "implicit-stale": "positions by the old velocity",
-    "drag-explicit": "with all forces explicit",
-    "drag-implicit": "with the drag implicit",
-    "euler-is-rk4": "the classical Runge–Kutta method",
-    "long-step": "a step 1.000000001 times as long",
-    "tree-verlet": "velocity Verlet's step, with the last acceleration of the step before",
-    "tree-rk33": "Heun's method of order 3",
-    "tree-rk67": "Butcher's method of order 6",
-    "spectral-radius-0.8": "spectral radius 0.8",
-    "spectral-radius-0.89": "spectral radius 0.89",
-    "spectral-radius-0.900001": "spectral radius 0.900001",
-    "newmark-for-alpha": "the trapezoidal rule",
-    "newmark-on-velocities": "constraints on velocities",
-    "alpha-acceleration": "a were q̈",
-    "alpha-m-sign": "αm had the opposite sign",
-    "trapezoidal-beta": "β were 0.1667",
-    "trapezoidal-gamma": "γ were 0.500001",
-    "trapezoidal-index-3": "constraints on positions",
-    "trapezoidal-is-alpha": "spectral radius 0.9 with constraints on positions",
-    "rates-by-euler": "γ were 1 ",
-    "first-accelerations-zero": "first accelerations were 0",
-}
-
-
-def words_for(defect: StepDefect) -> str:
-    """What the diagnosis must say about a defect; empty where no formula explains it."""
-    found = [name for name in STEP_NAMES if defect.name.startswith(name)]
-    return STEP_NAMES[max(found, key=len)] if found else ""
-
-
 # -- planting ------------------------------------------------------------------------------------
 
 
-@contextmanager
-def planted_step(defect: StepDefect) -> Iterator[Adapter]:
-    """The real adapter with a wrong integrator inside."""
-    real = type(load_adapter(defect.engine))
-
-    class Planted(real):  # type: ignore[misc, valid-type]
-        def _simulate(
-            self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
-        ) -> Trajectory:
-            if defect.engine == M and defect.step:
-                return _mujoco_run(defect.step, model, state, times, resolution)
-            if defect.integrator_used:
-                integrator = replace(integrator, name=defect.integrator_used)
-            factor = defect.step_factor
-            run = super()._simulate(model, state, times * factor, integrator, resolution * factor)
-            return replace(run, t=times)
-
-    steps = pinocchio_engine.FIXED_STEPS
-    if defect.engine == P and defect.step:
-        steps = steps | {defect.integrator: _pinocchio_step(defect.step)}
-    with (
-        patch.object(pinocchio_engine, "FIXED_STEPS", steps),
-        patch.object(exudyn_engine, "run_solver", partial(_run_altered, defect)),
-        patch.object(exudyn_tree_engine, "run_solver", partial(_run_altered, defect)),
-    ):
-        yield Planted()
+def step_defect(
+    name: str, description: str, engine: str, integrator: str, step: Step, *expected: str
+) -> Defect:
+    """A step that replaces the engine's own, on its accelerations and rotations."""
+    defect = partial(Defect, name, description, expected, engine, integrator=integrator)
+    if engine == M:
+        return defect(run=_mujoco_run(step))
+    steps = pinocchio_engine.FIXED_STEPS | {integrator: _pinocchio_step(step)}
+    return defect(patch=replaced_by("adapters.pinocchio_engine:FIXED_STEPS", lambda _: steps))
 
 
-def _mujoco_run(step: Step, model: Model, state: State, times: Array, h: float) -> Trajectory:
-    chain = mujoco_engine._MujocoChain(model)
-    chain.set_state(state)
-    system, rows = MujocoSystem(chain), [chain.sample()]
-    q, v = np.array(chain.d.qpos), np.array(chain.d.qvel)
-    for count in np.diff(np.rint(times / h).astype(int)):
-        for _ in range(count):
-            q, v = step(system, q, v, h)
-        chain.d.qpos, chain.d.qvel = q, v
-        rows.append(tuple(np.array(part) for part in chain.sample()))
-    r, p, rdot, omega = (np.array(column) for column in zip(*rows, strict=True))
-    return Trajectory(times, r, p, rdot, quaternion_rate(p, omega), round(times[-1] / h))
+def exudyn_defect(
+    name: str, description: str, integrator: str, *expected: str, solver_type: str = "",
+    mechanism: str = "balls", quadrature: Quadrature = "", **settings: Any,
+) -> Defect:  # fmt: skip
+    """Other attributes of Exudyn's generalizedAlpha, another explicit solver, or samples requadrated."""
+
+    def make(run_solver: Any) -> Any:
+        def run(solver: Any, mbs: Any, options: Any, *more: Any, **names: Any) -> Any:
+            import exudyn
+
+            for attribute, value in settings.items():
+                setattr(options.timeIntegration.generalizedAlpha, attribute, value)
+            if solver_type:
+                options.timeIntegration.solverType = getattr(exudyn.DynamicSolverType, solver_type)
+            samples = run_solver(solver, mbs, options, *more, **names)
+            return _requadrated(quadrature, samples, more[1]) if quadrature else samples
+
+        return run
+
+    engine, module = (T, "exudyn_tree_engine") if solver_type else (E, "exudyn_engine")
+    patch = replaced_by(f"adapters.{module}:run_solver", make)
+    return Defect(name, description, expected, engine, mechanism, integrator=integrator, patch=patch)
+
+
+def _mujoco_run(step: Step) -> Callable[..., Trajectory]:
+    """The run of MuJoCo's model by another step."""
+
+    def run(_: Any, model: Model, state: State, times: Array, __: Integrator, h: float) -> Trajectory:
+        chain = mujoco_engine._MujocoChain(model)
+        chain.set_state(state)
+        system, rows = MujocoSystem(chain), [chain.sample()]
+        q, v = np.array(chain.d.qpos), np.array(chain.d.qvel)
+        for count in np.diff(np.rint(times / h).astype(int)):
+            for _ in range(count):
+                q, v = step(system, q, v, h)
+            chain.d.qpos, chain.d.qvel = q, v
+            rows.append(tuple(np.array(part) for part in chain.sample()))
+        r, p, rdot, omega = (np.array(column) for column in zip(*rows, strict=True))
+        return Trajectory(times, r, p, rdot, quaternion_rate(p, omega), round(times[-1] / h))
+
+    return run
 
 
 def _pinocchio_step(step: Step) -> Step:
@@ -377,20 +250,6 @@ def _pinocchio_step(step: Step) -> Step:
         return step(system, q, v, h)
 
     return wrapped
-
-
-def _run_altered(defect: StepDefect, solver: Any, mbs: Any, settings: Any, *more: Any, **names: Any) -> Any:
-    """`run_solver` with other settings, or with samples from another quadrature of the same q̈."""
-    import exudyn
-
-    from adapters.exudyn_common import run_solver
-
-    for name, value in defect.settings:
-        setattr(settings.timeIntegration.generalizedAlpha, name, value)
-    if defect.solver_type:
-        settings.timeIntegration.solverType = getattr(exudyn.DynamicSolverType, defect.solver_type)
-    samples = run_solver(solver, mbs, settings, *more, **names)
-    return _requadrated(defect.quadrature, samples, more[1]) if defect.quadrature else samples
 
 
 def _requadrated(how: str, samples: list[Any], h: float) -> list[Any]:
@@ -413,3 +272,103 @@ def _requadrated(how: str, samples: list[Any], h: float) -> list[Any]:
                     v + h * ((1 - gamma) * a + gamma * new), *q1[2:]))  # fmt: skip
         a = new
     return out
+
+
+STEP_DEFECTS = (
+    *(
+        step_defect(f"{name}-{engine}-{integrator}", size, engine, integrator, step, words)
+        for engine, integrator in EULERS if integrator != "implicit"
+        for name, size, step, words in (
+            ("exchanged-halves", "position first, then velocity", exchanged_halves,
+             "exchanged the halves of semi-implicit Euler"),
+            ("stale-velocity", "positions by the old velocity", stale_velocity,
+             "explicit Euler's step"),
+            ("mean-velocity", "positions by the mean velocity", mean_velocity,
+             "the mean of the old and the new velocity"),
+            ("first-order-quaternion", "p + h ṗ normalised", first_order_quaternion,
+             "quaternions by p + h ṗ"),
+            ("two-half-steps", "two steps of h/2", two_half_steps,
+             "2 steps of 1/2 of the size"),
+            ("last-joint-stale", "stale velocity of the last joint only", last_body_stale,
+             "the joint of body 2 by the old velocity"),
+            ("verlet", "velocity Verlet", velocity_verlet,
+             "velocity Verlet's step"),
+        )
+    ),
+    *(
+        step_defect(f"{name}-{engine}", size, engine, integrator, step, words)
+        for engine, integrator in RK4S
+        for name, size, step, words in (
+            ("no-dexp", "θ̇ = v: order 2", no_correction,
+             "left dexp⁻¹ out"),
+            ("one-dexp-term", "θ̇ = v + θ×v/2", one_term,
+             "cut dexp⁻¹ after θ×v/2"),
+            ("third-stage-by-first", "k₃ from k₁", third_by_first,
+             "third stage by the first slope"),
+            ("reused-acceleration", "k₁ is k₄ of the step before", reused_acceleration,
+             "its declared step, with the last acceleration of the step before"),
+            ("three-eighths-rule", "Kutta's 3/8 rule: order 4 too", three_eighths,
+             "3/8 rule"),
+            ("weights-2.001-1.999", "weights 1, 2.001, 1.999, 1", wrong_weights,
+             "weight of stage 2 were larger by 0.000167"),
+        )
+    ),
+    *(
+        Defect(name, size, (words,), engine, mechanism, loaded, integrator, run=run)
+        for name, size, engine, mechanism, loaded, integrator, run, words in (
+            ("implicit-is-euler", "no damping in the matrix", M, "balls", False, "implicit",
+             run_as("Euler"), "semi-implicit Euler's step, with all forces explicit"),
+            ("implicit-is-implicitfast", "D without Coriolis terms", M, "rods", True, "implicit",
+             run_as("implicitfast"), "with the drag implicit"),
+            ("drag-explicit", "drag by the old velocity", M, "balls", True, "implicitfast",
+             run_as("Euler"), "with all forces explicit"),
+            ("drag-implicit", "drag by the new velocity", M, "balls", True, "Euler",
+             run_as("implicitfast"), "with the drag implicit"),
+            ("euler-is-rk4", "a better method than declared", M, "balls", False, "Euler",
+             run_as("RK4"), "the classical Runge–Kutta method"),
+            ("long-step-mujoco", "h (1 + 1e-9)", M, "balls", False, "RK4",
+             run_with_clock(1 + 1e-9), "a step 1.000000001 times as long"),
+            ("long-step-tree", "h (1 + 1e-9)", T, "balls", False, "RK44",
+             run_with_clock(1 + 1e-9), "a step 1.000000001 times as long"),
+        )
+    ),
+    step_defect("damping-halved", "D/2", M, "implicit", halved_damping,
+                "derivatives of forces in the matrix were 0.5 times as large"),
+    step_defect("damping-symmetric", "(D + Dᵀ)/2", M, "implicit", symmetric_damping,
+                "symmetrised the derivatives"),
+    step_defect("implicit-stale", "positions by the old velocity", M, "implicit", implicit_stale,
+                "positions by the old velocity"),
+    exudyn_defect("tree-rk33", "Heun's order 3", "RK44", "Heun's method of order 3", solver_type="RK33"),
+    exudyn_defect("tree-rk67", "order 6 in place of order 4", "RK44", "Butcher's method of order 6",
+                  solver_type="RK67"),
+    exudyn_defect("tree-verlet", "velocity Verlet", "RK44",
+                  "velocity Verlet's step, with the last acceleration of the step before",
+                  solver_type="VelocityVerlet"),
+    *(
+        exudyn_defect(f"spectral-radius-{radius:.10g}", f"ρ = {radius:.10g}", "generalized-alpha",
+                      f"spectral radius {radius:.10g}", spectralRadius=radius)
+        for radius in (0.8, 0.89, 0.900001)
+    ),
+    exudyn_defect("newmark-for-alpha", "Newmark, index 3", "generalized-alpha", "the trapezoidal rule",
+                  useNewmark=True),
+    exudyn_defect("newmark-on-velocities", "Newmark, index 2", "generalized-alpha",
+                  "constraints on velocities", useNewmark=True, useIndex2Constraints=True),
+    exudyn_defect("alpha-acceleration", "a = q̈ in place of the averaged a", "generalized-alpha", "a were q̈",
+                  quadrature="a is the acceleration"),
+    exudyn_defect("alpha-m-sign", "−αm in place of αm", "generalized-alpha", "αm had the opposite sign",
+                  quadrature="sign of alpha_m"),
+    exudyn_defect("trapezoidal-beta", "β = 1/6", "trapezoidal", "β were 0.1667", newmarkBeta=1 / 6),
+    exudyn_defect("trapezoidal-gamma", "γ = ½ + 1e-6", "trapezoidal", "γ were 0.500001",
+                  newmarkGamma=0.5 + 1e-6),
+    exudyn_defect("trapezoidal-index-3", "constraints on positions", "trapezoidal",
+                  "constraints on positions", mechanism="rods", useIndex2Constraints=False),
+    exudyn_defect("trapezoidal-is-alpha", "generalised-α 0.9", "trapezoidal",
+                  "spectral radius 0.9 with constraints on positions",
+                  useNewmark=False, useIndex2Constraints=False, spectralRadius=0.9),
+    exudyn_defect("rates-by-euler", "q̇₁ = q̇₀ + h q̈₁", "trapezoidal", "γ were 1 ",
+                  quadrature="rates by Euler"),
+    exudyn_defect("first-accelerations-zero", "q̈₀ = 0", "trapezoidal", "first accelerations were 0",
+                  mechanism="rods", computeInitialAccelerations=False),
+    exudyn_defect("first-accelerations-zero-alpha", "q̈₀ = 0", "generalized-alpha",
+                  "first accelerations were 0", computeInitialAccelerations=False),
+)  # fmt: skip

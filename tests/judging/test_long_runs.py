@@ -1,11 +1,8 @@
 """Long runs: what is conserved is judged by its fall from step to step, and planted leaks are seen."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from adapters.mujoco_engine import Mujoco
 from plumbline.engines.registry import load_adapter
 from plumbline.execution.plan import Plan
 from plumbline.execution.runner import run_plan
@@ -22,12 +19,13 @@ from plumbline.measurements.long_run_study import (
     plan_long_run,
     run_long_run_study,
 )
-from plumbline.model.datatypes import Integrator, Trajectory
+from plumbline.model.datatypes import Integrator
 from plumbline.processes.worker_pool import Limits
 from plumbline.scenario import loader
 from tests.helpers import engine_process as worker
 from tests.helpers.nightly_tests import slow
-from tests.helpers.planted_defects import MOTION_DEFECTS, Defect, model_change, plant
+from tests.helpers.planted_defects import MOTION_DEFECTS
+from tests.helpers.planting import Defect, number_change, plant, rows_reordered, sample_change
 
 DEFECTS = {d.name: d for d in MOTION_DEFECTS}
 
@@ -54,7 +52,7 @@ def use_defect(monkeypatch):
     """``use_defect(defect)``: MuJoCo with it, as the engine that `endure` gets."""
 
     def put(defect):
-        engine = plant(Mujoco, defect)
+        engine = plant(defect)
         monkeypatch.setattr(long_run_study, "load_adapter", lambda _: engine)
         return engine
 
@@ -88,35 +86,25 @@ def test_two_steps_below_one_that_is_too_coarse_cannot_disagree():
 
 SMALL_DRAG_DEFECT = Defect(
     "damping-1e-7", "drag of 1e-7 N m s on every body",
-    inputs=model_change(lambda m, _: {"drag_moment": m.drag_moment + 1e-7}),
+    inputs=number_change("drag_moment", ..., by=1e-7),
 )  # fmt: skip
 
 
-def restart_halfway(run):
+def restart_halfway(count):
     """Rows whose second half begins again."""
-    half = len(run.t) // 2
-    return [*range(half), *range(len(run.t) - half)]
+    half = count // 2
+    return [*range(half), *range(count - half)]
 
 
-def simulate_with_reset(simulate, *arguments):
-    run = simulate(*arguments)
-    return Trajectory(
-        run.t, *(getattr(run, k)[restart_halfway(run)] for k in ("r", "p", "v", "pdot")), run.steps
-    )
-
-
-def simulate_with_opening_joints(simulate, *arguments):
-    """Every joint opens by 1e-9 m/s, unseen by the velocities."""
-    run = simulate(*arguments)
-    return replace(run, r=run.r + 1e-9 * run.t[:, None, None])
+OPENING_JOINTS = sample_change(lambda run: {"r": run.r + 1e-9 * run.t[:, None, None]})  # by 1e-9 m/s
 
 
 @pytest.mark.parametrize(
     ("defect", "verdict", "quantities"),
     [
         (SMALL_DRAG_DEFECT, "disagrees", {"energy_drift_long"}),
-        (Defect("creep", "", run=simulate_with_opening_joints), "disagrees", {"joint_gap_long"}),
-        (Defect("reset", "", run=simulate_with_reset), "failed", {"all_long"}),
+        (Defect("creep", "", run=OPENING_JOINTS), "disagrees", {"joint_gap_long"}),
+        (Defect("reset", "", run=rows_reordered(restart_halfway)), "failed", {"all_long"}),
         (DEFECTS["norm-1e-9"], "disagrees", {"norm_drift_long"}),
     ],
     ids=lambda x: x.name if isinstance(x, Defect) else None,
@@ -144,12 +132,7 @@ def test_a_symmetric_method_is_bounded_and_a_leak_is_not():
 
 def growth_row_with_drag():
     """The row on the growth of Exudyn's energy with a drag that takes as much as the steps' error."""
-    from adapters.exudyn_engine import Exudyn
-
-    engine = plant(
-        Exudyn,
-        Defect("", "", inputs=model_change(lambda m, _: {"drag_moment": m.drag_moment + 3e-6})),
-    )
+    engine = plant(Defect("", engine="exudyn", inputs=number_change("drag_moment", ..., by=3e-6)))
     before, long_run_study.load_adapter = long_run_study.load_adapter, lambda _: engine
     try:
         return run_long("spherical", engine, "trapezoidal", 50.0)["energy_drift_long_growth"]

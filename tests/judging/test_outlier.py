@@ -13,7 +13,8 @@ from plumbline.judging.state_level import judge_states
 from plumbline.model.sampling import random_states
 from plumbline.truth.ground_truth import state_truth
 from tests.helpers import pendulums
-from tests.helpers.planted_defects import STATE_DEFECTS, plant
+from tests.helpers.planted_defects import STATE_DEFECTS
+from tests.helpers.planting import plant
 
 ENGINES = "reference", "mujoco", "pinocchio", "exudyn", "exudyn-tree"
 for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
@@ -97,7 +98,7 @@ def rows_of_engines(*defective_engines, defect="mass-1-1e-5", leave_out=()):
             continue
         engine = load_adapter(name)
         if name in defective_engines:
-            engine = plant(type(engine), replace(planted, engine=name))
+            engine = plant(replace(planted, engine=name))
         reported = Evaluation(engine.evaluate(model, right.states), None, None, 0.0)
         found += judge_states(RowContext("s", "f", name, engine.title, "0"), right, reported).rows
     return found

@@ -29,13 +29,8 @@ from plumbline.truth.step_comparison import step_counts
 from tests.helpers import pendulums
 from tests.helpers.nightly_tests import SLOW, some_fast
 from tests.helpers.pendulums import JOINT_PATTERNS
-from tests.helpers.planted_steps import (
-    STEP_DEFECTS,
-    StepDefect,
-    planted_step,
-    stale_velocity,
-    velocity_verlet,
-)
+from tests.helpers.planted_steps import STEP_DEFECTS, stale_velocity, step_defect, velocity_verlet
+from tests.helpers.planting import Defect, planted
 
 for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
     pytest.importorskip(engine)
@@ -108,10 +103,10 @@ def test_honest_engines_take_the_declared_step(engine, joints):
 
 
 @cache
-def defect_report(defect: StepDefect, loop=""):
-    model, states = loop_subject(loop) if loop else subject(defect.joints, defect.has_drag)
+def defect_report(defect, loop=""):
+    model, states = loop_subject(loop) if loop else subject(defect.mechanism, defect.loaded, defect.loaded)
     integrator = load_adapter(defect.engine).integrator(defect.integrator)
-    with planted_step(defect) as adapter:
+    with planted(defect) as adapter:
         return judged(adapter, integrator, model, states)
 
 
@@ -123,15 +118,15 @@ def test_every_other_integrator_is_reported(defect):
 
 def test_the_planting_itself_is_honest():
     """The declared step, taken by the helpers that plant others, is not reported."""
-    from tests.helpers import planted_steps as planted
+    from tests.helpers import planted_steps as steps
 
+    right = partial(steps.runge_kutta, a=steps.CLASSICAL, b=steps.WEIGHTS)
     honest = [
-        StepDefect("rk4", "", engine, name, joints,
-                   step=partial(planted.runge_kutta, a=planted.CLASSICAL, b=planted.WEIGHTS))
-        for engine, name in planted.RK4S for joints in ("balls", "rods")
+        replace(step_defect("rk4", "", engine, name, right), mechanism=joints)
+        for engine, name in steps.RK4S for joints in ("balls", "rods")
     ]  # fmt: skip
-    honest += [StepDefect("implicit", "", "mujoco", "implicit", step=planted.implicit, has_drag=True)]
-    honest += [StepDefect("as-declared", "", "exudyn", i.name) for i in methods("exudyn")]
+    honest += [replace(step_defect("implicit", "", "mujoco", "implicit", steps.implicit), loaded=True)]
+    honest += [Defect("as-declared", engine="exudyn", integrator=i.name) for i in methods("exudyn")]
     for defect in honest:
         rows = defect_report(defect)
         assert not disagreeing(rows), (defect, [row.reason for row in rows])
@@ -408,8 +403,8 @@ def loop_defects():
         )  # fmt: skip
         if is_seen or (is_step and not one.name.startswith(("first-order-quaternion", "last-joint"))):
             yield one
-    yield StepDefect("explicit-for-rk4", "", "pinocchio", "rkmk4", step=stale_velocity)
-    yield StepDefect("verlet-for-rk4", "", "pinocchio", "rkmk4", step=velocity_verlet)
+    yield step_defect("explicit-for-rk4", "", "pinocchio", "rkmk4", stale_velocity)
+    yield step_defect("verlet-for-rk4", "", "pinocchio", "rkmk4", velocity_verlet)
 
 
 @pytest.mark.parametrize("defect", some_fast(list(loop_defects()), 5))

@@ -32,14 +32,8 @@ from plumbline.model.welding import split_bodies, split_body
 from plumbline.truth.rounding_bound import state_rounding_bound
 from tests.helpers import pendulums
 from tests.helpers.pendulums import JOINT_PATTERNS
-from tests.helpers.planted_defects import (
-    STATE_DEFECTS,
-    Defect,
-    answer_change,
-    model_change,
-    parameter_change,
-    plant,
-)
+from tests.helpers.planted_defects import STATE_DEFECTS
+from tests.helpers.planting import Defect, answer_change, model_change, number_change, plant
 from tests.helpers.random_chains import random_chain
 
 for engine in ("mujoco", "pinocchio", "exudyn"):
@@ -120,7 +114,7 @@ DEFECTS_BY_RELATION = {
     ),
     "masses doubled": (
         defect_named("damping-1e-6"),
-        Defect("gram", "mass of body 1 by 1e-3 kg", inputs=parameter_change("mass", 0, by=1e-3)),
+        Defect("gram", "mass of body 1 by 1e-3 kg", inputs=number_change("mass", 0, by=1e-3)),
     ),
     "lengths × 4": (
         defect_named("distal-1e-5"),
@@ -143,7 +137,7 @@ def test_a_defect_of_its_kind_breaks_it(relation):
     model = pendulums.make_model(JOINT_PATTERNS["balls"])
     broken = {}
     for defect in DEFECTS_BY_RELATION[relation]:
-        engine = plant(type(load_adapter(defect.engine)), defect)
+        engine = plant(defect)
         with patch(
             "plumbline.measurements.relations.load_adapter",
             lambda n, e=engine, d=defect: e if n == d.engine else load_adapter(n),
@@ -174,7 +168,7 @@ def test_noise_breaks_what_is_not_bitwise():
     rng = np.random.default_rng(5)
     noisy = Defect("noise", "1e-9", answers=answer_change(
         "acceleration", lambda _, __, a: a * (1 + 1e-9 * rng.normal(size=a.shape))))  # fmt: skip
-    engine = plant(type(load_adapter("mujoco")), noisy)
+    engine = plant(noisy)
     model = pendulums.make_model(JOINT_PATTERNS["balls"])
     with patch("plumbline.measurements.relations.load_adapter", lambda _: engine):
         found = check_relations("mujoco", model, random_states_of(model))
@@ -189,7 +183,7 @@ def test_noise_breaks_what_is_not_bitwise():
 def defect_in_default_formulation(defect):
     """The real engine with a defect in its usual way alone: its other ways and welded bodies are sound."""
     real = type(load_adapter(defect.engine))
-    engine = plant(real, defect)
+    engine = plant(defect)
     engine.with_option = lambda option: real().with_option(option)
     engine.with_welded_halves = lambda: real().with_welded_halves()
     return engine

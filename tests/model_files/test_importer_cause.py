@@ -13,7 +13,7 @@ from plumbline.model_files.model_comparison import model_states
 from plumbline.model_files.model_rows import Answer, state_seed
 from plumbline.model_files.prepared_file import prepare_file
 from tests.helpers.importer_columns import MUJOCO, judge_file
-from tests.helpers.planted_importer_defects import MJCF_DEFECTS, URDF_DEFECTS
+from tests.helpers.planted_files import MJCF_DEFECTS, URDF_DEFECTS
 from tests.helpers.random_robots import random_mjcf, random_urdf
 
 STATES = 4
@@ -60,7 +60,7 @@ def planted(tmp_path, name, seed):
 def is_named(result, expected):
     causes = [c for explanation in result.explanations.values() for c in explanation.causes]
     found = {(c.field, change.joint or change.body) for c in causes for change in c.changes}
-    return {owner for _, owner in found} == {expected.owner} and {f for f, _ in found} <= expected.fields
+    return found == {tuple(expected)}
 
 
 @pytest.mark.parametrize("name", [*URDF_DEFECTS, *MJCF_DEFECTS])
@@ -75,7 +75,6 @@ def test_a_planted_defect_is_reported_and_named(tmp_path, name):
 @pytest.mark.timeout(3000)
 def test_planted_defects_on_many_robots(tmp_path):
     names = [*URDF_DEFECTS, *MJCF_DEFECTS]
-    assert len(names) >= 40
     reported, named, missed = 0, 0, []
     for name in names:
         for seed in range(1, 1 + ROBOTS):

@@ -20,7 +20,8 @@ from plumbline.reproduce.render import render_script
 from plumbline.reproduce.shrink import ReproductionCase, starting_cases
 from plumbline.reproduce.write import make_script
 from plumbline.scenario.loader import find_scenario_file, load_scenario
-from tests.helpers.planted_defects import STATE_DEFECTS, plant
+from tests.helpers.planted_defects import STATE_DEFECTS
+from tests.helpers.planting import plant
 from tests.helpers.reproduction import defective, execute, run_alone, state_case, stored_row
 
 for name in ("mujoco", "pinocchio", "exudyn", "flint"):
@@ -149,7 +150,7 @@ PLANTED = next(d for d in STATE_DEFECTS if d.name == "inertia-xx-1e-6")
 
 
 def with_planted_defect():
-    engine = plant(type(load_adapter(PLANTED.engine)), PLANTED)
+    engine = plant(PLANTED)
     return patch("plumbline.reproduce.engine_client.load_adapter", lambda _: engine)
 
 

@@ -1,7 +1,6 @@
 """Sweeps: what a file makes of a scenario, and how a cell is judged."""
 
 import time
-from contextlib import nullcontext
 from dataclasses import replace
 from functools import cache
 from unittest.mock import patch
@@ -22,10 +21,9 @@ from plumbline.scenario import loader as scenarios
 from plumbline.scenario.line_and_column_errors import ScenarioError
 from plumbline.studies import sweep, sweep_file
 from plumbline.studies.parquet_files import write_table
-from plumbline.truth.ground_truth import motion_truth
-from tests.helpers import pendulums
 from tests.helpers.mutations import limited_time
-from tests.helpers.planted_defects import MOTION_DEFECTS, Defect, plant
+from tests.helpers.planted_defects import MOTION_DEFECTS
+from tests.helpers.planting import Defect, motion_subject, planted
 
 SWEEP_FILE = """\
 schema_version: 1
@@ -106,21 +104,21 @@ def test_values_that_make_no_pendulum_are_a_cell_with_a_reason(tmp_path):
 def cell(loaded=False):
     """A slow tumble whose every mistake shows within two seconds."""
     (s,) = scenarios.load_scenarios(["double-tumbling-balls"])
-    model = pendulums.make_model("bb", loads=loaded, drag=loaded)
-    state = pendulums.state_from_seed(model, seed=2, rate=0.5)
-    s = replace(s, model=model, state=state, duration=2.0, sample_interval=0.125)
-    return s, motion_truth(model, state, s.times, None)
+    model, state, truth = motion_subject("balls", loaded)
+    return replace(s, model=model, state=state, duration=2.0, sample_interval=0.125), truth
 
 
 def judged_by_run_and_sweep(defect):
     """The verdicts of a run and that of a sweep on one cell, by an engine with a planted defect."""
-    (s, truth), engine = cell(defect.loaded), plant(type(load_adapter(defect.engine)), defect)
+    (s, truth), engine = cell(defect.loaded), load_adapter(defect.engine)
     method = engine.integrator(defect.integrator)
     info = EngineInfo("mujoco", "MuJoCo", "0", engine.integrators)
 
     def study(steps):
-        inside = defect.engine_patch() if defect.engine_patch else nullcontext()
-        with inside, patch("plumbline.engines.engine_calls.load_adapter", lambda _: engine):
+        with (
+            planted(defect) as engine,
+            patch("plumbline.engines.engine_calls.load_adapter", lambda _: engine),
+        ):
             return run_refinement("mujoco", method.name, s.model, s.state, s.times, steps)
 
     run_steps = refinement_resolutions(method, s.model.n, s.duration)

@@ -1,0 +1,74 @@
+"""Defects of bodies, joints and elements in trees and loops: each is reported, and named by its place."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from plumbline.diagnosis.joint_diagnosis import diagnose_joints
+from plumbline.engines.registry import load_adapter
+from plumbline.model.kinematics import rotation_matrix
+from plumbline.model.sampling import random_states
+from plumbline.scenario.loader import catalogue, load_scenario
+from plumbline.truth.ground_truth import state_truth
+from tests.helpers.nightly_tests import slow, some_fast
+from tests.helpers.planted_joints import ELEMENT_DEFECTS, JOINT_DEFECTS, LOOP_DEFECTS, LOOPS
+from tests.helpers.planting import (
+    EVERY_JOINT,
+    Defect,
+    assert_named,
+    diagnosis,
+    evaluated,
+)
+from tests.helpers.shared_answers import sharing
+
+for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
+    pytest.importorskip(engine)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def shared_predictions():
+    """The effects of most causes are the same for every defect."""
+    with sharing("plumbline.diagnosis.joint_diagnosis", "_predict"):
+        yield
+
+
+@pytest.mark.parametrize(
+    "defect", [*some_fast(ELEMENT_DEFECTS, 1), *some_fast(JOINT_DEFECTS, 6), *some_fast(LOOP_DEFECTS, 6)]
+)
+def test_every_defect_is_reported(defect):
+    assert evaluated(defect)[1], f"nothing reports {defect.name}"
+
+
+@pytest.mark.parametrize(
+    "defect",
+    [
+        case
+        for defects, step in ((ELEMENT_DEFECTS, 8), (JOINT_DEFECTS, 12), (LOOP_DEFECTS, 14))
+        for case in some_fast([d for d in defects if d.expected], step)
+    ],
+)
+def test_every_defect_with_words_is_named(defect):
+    assert_named(defect)
+
+
+@slow
+@pytest.mark.parametrize("defect", [d for d in LOOP_DEFECTS if not d.expected], ids=lambda d: d.name)
+def test_a_defect_without_words_gets_no_wrong_name(defect):
+    assert "behaves as if" not in diagnosis(defect)
+
+
+@pytest.mark.parametrize("engine", ["reference", "mujoco", "pinocchio", "pinocchio-aba", "exudyn"])
+@pytest.mark.parametrize("mechanism", [EVERY_JOINT, *LOOPS])
+def test_the_engines_without_defect_are_not_reported(engine, mechanism):
+    assert evaluated(Defect("clean", engine=engine, mechanism=mechanism))[1] == []
+
+
+def test_a_misread_velocity_that_only_energies_show_is_named_without_gravity():
+    scenario = load_scenario(catalogue()["free-body-with-rotors"])
+    model, states = scenario.model, random_states(scenario.model, 3, seed=2)
+    truth = state_truth(model, states)
+    assert not np.any(model.gravity) and truth.bounds[0].tolerance("potential_energy") == 0
+    turned = [replace(s, v=np.matvec(rotation_matrix(s.p), s.v)) for s in truth.states]
+    found = load_adapter("pinocchio").evaluate(model, turned)
+    assert "the velocity of body 1 were given in the body frame" in diagnose_joints(model, found, truth)
