@@ -27,7 +27,7 @@ LONGEST_FIRST = (  # begun last, one of these would keep one process busy while 
     "isolation", "planted_defects", "report_browser", "adapter_contract", "exit_codes", "dask_cluster",
     "step_level", "tree_motions", "scripts", "worker_pool", "engines_on_loops", "command_line",
     "engines_on_trees", "relations", "nightly", "smallest_detectable_mistake", "planted_branches",
-    "tree_motion", "sweep", "certificate_proof", "joint_causes", "integrator_search", "importer_cause",
+    "tree_motion", "sweep", "certificate_proof", "planted_joints", "integrator_search", "importer_cause",
     "trajectory_truth", "tree_relations", "selftest", "environments", "model_command", "reference_pages",
     "resume", "diagnose", "collocation", "docs", "rounding_bound", "long_runs", "report",
     "predictability_horizon", "storage_faults",

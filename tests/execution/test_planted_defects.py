@@ -79,12 +79,12 @@ def test_every_motion_defect_is_reported(defect):
 
 def test_the_same_engine_without_defect_is_not_reported():
     clean = Defect("clean", "nothing")
-    for mechanism in ("balls", "sprung-hinge"):
-        for engine, integrator in (
-            ("mujoco", "RK4"), ("pinocchio", "rkmk4"), ("exudyn-tree", "RK44"), ("exudyn", "trapezoidal")
-        ):  # fmt: skip
-            one = replace(clean, engine=engine, integrator=integrator, mechanism=mechanism)
-            assert not motion_report(one), motion_report(one)
+    used = {
+        (d.engine, d.integrator, d.mechanism, d.loaded) for d in (*MOTION_DEFECTS, *ELEMENT_MOTION_DEFECTS)
+    }
+    for engine, integrator, mechanism, loaded in used:
+        one = replace(clean, engine=engine, integrator=integrator, mechanism=mechanism, loaded=loaded)
+        assert not motion_report(one), motion_report(one)
     for joints, loaded in {(d.mechanism, d.loaded) for d in STATE_DEFECTS}:
         for engine in ("mujoco", "pinocchio", "exudyn", "reference"):
             wrong, text = state_report(replace(clean, mechanism=joints, loaded=loaded, engine=engine))

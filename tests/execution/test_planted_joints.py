@@ -12,9 +12,11 @@ from plumbline.model.sampling import random_states
 from plumbline.scenario.loader import catalogue, load_scenario
 from plumbline.truth.ground_truth import state_truth
 from tests.helpers.nightly_tests import slow, some_fast
-from tests.helpers.planted_joints import ELEMENT_DEFECTS, JOINT_DEFECTS, LOOP_DEFECTS, LOOPS
+from tests.helpers.planted_defects import STATE_DEFECTS
+from tests.helpers.planted_joints import ELEMENT_DEFECTS, JOINT_DEFECTS, LOOP_DEFECTS
 from tests.helpers.planting import (
     EVERY_JOINT,
+    RANDOM_LOOP,
     Defect,
     assert_named,
     diagnosis,
@@ -58,8 +60,12 @@ def test_a_defect_without_words_gets_no_wrong_name(defect):
     assert "behaves as if" not in diagnosis(defect)
 
 
-@pytest.mark.parametrize("engine", ["reference", "mujoco", "pinocchio", "pinocchio-aba", "exudyn"])
-@pytest.mark.parametrize("mechanism", [EVERY_JOINT, *LOOPS])
+USED = {(d.engine, d.mechanism) for d in (*ELEMENT_DEFECTS, *JOINT_DEFECTS, *LOOP_DEFECTS)}
+
+
+@pytest.mark.parametrize(
+    ("engine", "mechanism"), sorted(USED | {("reference", EVERY_JOINT), ("pinocchio", RANDOM_LOOP)})
+)
 def test_the_engines_without_defect_are_not_reported(engine, mechanism):
     assert evaluated(Defect("clean", engine=engine, mechanism=mechanism))[1] == []
 
@@ -72,3 +78,36 @@ def test_a_misread_velocity_that_only_energies_show_is_named_without_gravity():
     turned = [replace(s, v=np.matvec(rotation_matrix(s.p), s.v)) for s in truth.states]
     found = load_adapter("pinocchio").evaluate(model, turned)
     assert "the velocity of body 1 were given in the body frame" in diagnose_joints(model, found, truth)
+
+
+def is_applicable(defect, mechanism):
+    """Whether the mechanism has what a defect of chains alters: a rod, a free attitude, a pose at rest."""
+    model, truth = subject(mechanism)
+    if mechanism == RANDOM_LOOP and defect.name in OF_BODIES_NOT_JOINTS:
+        return False
+    given = [defect.inputs(model, s) for s in truth.states] if defect.inputs else []
+    return not defect.inputs or any(
+        not np.array_equal(getattr(x, name), value)
+        for pair, right in zip(given, ((model, state) for state in truth.states), strict=True)
+        for x, own in zip(pair, right, strict=True)
+        for name, value in vars(own).items()
+    )
+
+
+# The formula for the answer has one joint per body.
+OF_BODIES_NOT_JOINTS = (
+    "reaction-in-body-frame", "reaction-1-in-body", "reaction-without-loads", "reaction-without-drag",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(("mechanism", "count"), [(EVERY_JOINT, 115), (RANDOM_LOOP, 118)])
+def test_defects_of_chains_are_reported_in_trees_and_loops(mechanism, count):
+    """Those of numbers, conventions and answers, wherever they make a difference."""
+    chosen = [d for d in STATE_DEFECTS if not d.patch and d.name != "digits-lost-along-chain"]
+    moved = [
+        replace(d, engine="pinocchio", mechanism=mechanism, loaded=False)
+        for d in chosen
+        if is_applicable(d, mechanism)
+    ]
+    assert len(moved) >= count
+    assert not [d.name for d in moved if not evaluated(d)[1]]

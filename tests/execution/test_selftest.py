@@ -1,6 +1,7 @@
 """The nightly runs the self-test, and its result counts."""
 
 import json
+import re
 from types import SimpleNamespace
 
 import pytest
@@ -108,10 +109,9 @@ def test_every_list_of_planted_defects_is_in_the_self_test():
         path
         for folder in folders
         for path in (root / "tests" / folder).glob("test_*.py")
-        if "\nfrom tests.helpers.planted_" in path.read_text(encoding="utf-8")
+        if re.search("^from tests.helpers.plant(ed_|ing )", path.read_text(encoding="utf-8"), re.M)
     }
-    assert len(found) > 6
-    assert found <= named
+    assert found and found <= named
 
 
 @pytest.mark.parametrize("trouble", ["", "half of them"])

@@ -79,7 +79,8 @@ def to_single_precision(x: Array) -> Array:
 
 def inputs_in_single_precision(model: Model, state: State) -> tuple[Model, State]:
     """Everything the engine is given passes through single precision."""
-    wrong = model.changed(**{k: to_single_precision(v) for k, v in model.fields.items()})
+    fields = {k: v for k, v in model.fields.items() if np.asarray(v).dtype == float}
+    wrong = model.changed(**{k: to_single_precision(v) for k, v in fields.items()})
     rounded = {k: to_single_precision(getattr(state, k)) for k in ("omega", "u", "udot")}
     p = normalised(to_single_precision(state.p))
     return wrong, complete_state(wrong, replace(state, p=p, **rounded))
@@ -145,7 +146,7 @@ def short_run(simulate: Any, model: Model, state: State, times: Array, i: Integr
 
 def moment_of_force_at(point: str, force: Callable[[Model, State], Array]) -> Callable[[Model, State], Array]:
     """s × Aᵀ F: the moment of a world force that acts at a point of the body."""
-    return lambda m, s: np.cross(getattr(m, point), to_body(s, force(m, s)))
+    return lambda m, s: np.cross(getattr(m, point)[: m.n], to_body(s, force(m, s)))
 
 
 def relative_attitudes(_: Model, state: State) -> Array:
@@ -184,7 +185,7 @@ def drag_force_from(velocity: Callable[[Model, State], Array]) -> Inputs:
 
 def proximal_velocity(model: Model, state: State) -> Array:
     """Velocity of each body's proximal point."""
-    return state.v + to_world(state, np.cross(state.omega, model.proximal))
+    return state.v + to_world(state, np.cross(state.omega, model.proximal[: model.n]))
 
 
 def stale_state(*names: str) -> Inputs:
@@ -485,10 +486,10 @@ BODY_DEFECTS = (
     Defect("reaction-2-stale", "F of body 2 of the state before", ("of body 2 of the previous state",), P,
            "rods", answers=stale_answers("joint_reaction", body=1)),
     Defect("angular-1-for-2", "ω̇′ of body 1 for that of body 2", ("angular acceleration of body 1 as that",),
-           E, answers=answer_change("angular_acceleration", lambda _, __, a: a[[0, 0]])),
+           E, answers=answer_change("angular_acceleration", lambda _, __, a: a[[0, 0, *range(2, len(a))]])),
     Defect("acceleration-4-for-3", "r̈ of body 4 for that of body 3 of five",
            ("acceleration of body 4 as that of body 3",), P, "mixed",
-           answers=answer_change("acceleration", lambda _, __, a: a[[0, 1, 3, 3, 4]])),
+           answers=answer_change("acceleration", lambda _, __, a: a[[0, 1, 3, *range(3, len(a))]])),
     Defect("reaction-2-sign", "-F of body 2", ("joint reaction of body 2 with the opposite sign",), M,
            answers=body_answer_change(1, "joint_reaction", lambda _, __, f: -f)),
     Defect("angular-2-in-world", "A ω̇′ of body 2", ("angular acceleration of body 2 in the world frame",), P,

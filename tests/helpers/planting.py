@@ -45,7 +45,7 @@ from plumbline.model.kinematics import (
     rotation_matrix,
     with_joint_coordinates,
 )
-from plumbline.model.random_mechanisms import random_tree
+from plumbline.model.random_mechanisms import random_loop_mechanism, random_tree
 from plumbline.model.sampling import compared_states, random_states
 from plumbline.scenario.loader import load_scenarios
 from plumbline.truth.ground_truth import MotionTruth, StateTruth, motion_truth, state_truth
@@ -57,6 +57,8 @@ Answers = Callable[[Model, list[State], list[StateQuantities]], list[StateQuanti
 Run = Callable[[Callable[..., Trajectory], Model, State, Array, Integrator, float], Trajectory]
 Patch = Callable[[], AbstractContextManager[Any]]
 EVERY_JOINT = "every joint"  # the mechanism of `every_joint`
+RANDOM_LOOP = "random loop"  # in space, closed by a universal joint
+ELEMENTS = ("armature", "damping", "stiffness", "effort", "springs")
 
 
 @dataclass(frozen=True)
@@ -67,7 +69,7 @@ class Defect:
     description: str = ""  # with its size
     expected: tuple[str, ...] = ()  # words of the diagnosis, one of which must occur; none: only reported
     engine: str = "mujoco"
-    mechanism: str = "balls"  # key of JOINT_PATTERNS, `EVERY_JOINT` or a scenario of the catalogue
+    mechanism: str = "balls"  # JOINT_PATTERNS, EVERY_JOINT, RANDOM_LOOP, or a scenario
     loaded: bool = False  # a pendulum with applied loads and drag
     integrator: str = "RK4"  # the name that the motion or the step goes by
     inputs: Inputs | None = None
@@ -119,6 +121,9 @@ def subject(mechanism: str, loaded: bool = False) -> tuple[Model, StateTruth]:
     elif mechanism == EVERY_JOINT:
         model = every_joint()
         states = random_states(model, 5, seed=2)
+    elif mechanism == RANDOM_LOOP:
+        model, state = random_loop_mechanism(3, 6, ("universal",), elements=ELEMENTS)
+        states = compared_states(model, state, mechanism, 3)
     else:
         (scenario,) = load_scenarios([mechanism])
         model = scenario.model
@@ -138,7 +143,7 @@ def identity_states(model: Model) -> list[State]:
 def every_joint() -> Model:
     """Five bodies on every joint that moves, in one branch, with elements on every coordinate."""
     rng = np.random.default_rng(11)
-    tree = random_tree(rng, 5, elements=("armature", "damping", "stiffness", "effort", "springs"))
+    tree = random_tree(rng, 5, elements=ELEMENTS)
     kinds = ("ball", "hinge", "universal", "slide", "cylindrical")
     bare = replace(tree, kind=kinds, body=np.array([[-1, 0], [0, 1], [1, 2], [2, 3], [1, 4]]))
     used = np.array([[1, 0], [1, 0], [1, 1], [1, 0], [1, 1]])
