@@ -7,12 +7,13 @@ import pytest
 
 from plumbline.engines.registry import load_adapter
 from plumbline.model.datatypes import Unsupported
-from plumbline.model.invariants import attitude_error, compute_invariants, position_error
+from plumbline.model.invariants import attitude_error, compute_invariants
 from plumbline.model.kinematics import complete_state
 from plumbline.model.random_mechanisms import random_tree
 from plumbline.model.sampling import random_states
 from plumbline.truth.notes_motion import simulate_notes_form
 from tests.helpers.shared_answers import sharing
+from tests.helpers.true_answers import converging_runs
 
 TIMES = np.arange(5) / 32
 ORDER_MARGIN = 0.3  # orders are 1, 2 or 4; the next term of the error moves the slope less
@@ -49,16 +50,13 @@ def test_motions_of_random_trees_converge_to_the_truth(engine, mix):
         for method in adapter.integrators:
             resolutions = (2.0**-9, 2.0**-10) if method.kind == "step" else (1e-8, 1e-11)
             try:
-                runs = [adapter.simulate(model, state, TIMES, method.name, h) for h in resolutions]
+                runs, errors = converging_runs(
+                    adapter, method, model, state, true, resolutions, ORDER_MARGIN, 1e-12
+                )
             except Unsupported as reason:  # angles near their singularity
                 assert engine == "exudyn-tree" and "singularity" in str(reason)
                 continue
             compared += 1
-            errors = [position_error(x.r, true.r)[-1] + attitude_error(x.p, true.p)[-1] for x in runs]
-            if method.kind == "step":
-                assert np.log2(errors[0] / errors[1]) == pytest.approx(method.order, abs=ORDER_MARGIN), (
-                    method.name
-                )
             assert errors[1] < (1e-9 if method.kind == "tolerance" else 2e-7 if method.order == 4 else 5e-2)
             found = compute_invariants(model, runs[1])
             assert np.max(np.abs(found.joint_gap)) < 1e-4, method.name
@@ -75,7 +73,7 @@ ELEMENTS = ("armature", "damping", "stiffness", "effort", "springs")
 @pytest.mark.parametrize("element", ELEMENTS)
 @pytest.mark.parametrize("engine", ENGINES)
 def test_motions_with_elements_converge_to_the_truth_and_conserve_energy(engine, element, kinds):
-    adapter = load_adapter(engine)
+    adapter, compared = load_adapter(engine), 0
     model = random_tree(np.random.default_rng(3), 4, kinds, loads=False, elements=(element,))
     state, times = calm_state(model, 3), np.arange(17) / 128
     true = simulate_notes_form(model, state, times, 1e-12)
@@ -83,19 +81,16 @@ def test_motions_with_elements_converge_to_the_truth_and_conserve_energy(engine,
         coarse = 2.0**-12 if method.order == 1 else 2.0**-9  # dampers have transients of 1e-3 s
         resolutions = (coarse, coarse / 2) if method.kind == "step" else (1e-8, 1e-11)
         try:
-            runs = [adapter.simulate(model, state, times, method.name, h) for h in resolutions]
+            runs, errors = converging_runs(adapter, method, model, state, true, resolutions, ORDER_MARGIN)
         except Unsupported as reason:
             assert engine.startswith("exudyn") and any(x in str(reason) for x in ("rotor", "rotation vector"))
             continue
-        errors = [position_error(x.r, true.r)[-1] + attitude_error(x.p, true.p)[-1] for x in runs]
-        if method.kind == "step" and errors[1] > 1e-12:
-            assert np.log2(errors[0] / errors[1]) == pytest.approx(method.order, abs=ORDER_MARGIN), (
-                method.name
-            )
+        compared += 1
         assert errors[1] < (1e-8 if method.kind == "tolerance" or method.order == 4 else 5e-2)
         found = [compute_invariants(model, run) for run in runs]
         drift = [np.max(np.abs(x.energy_drift)) for x in found]
         assert drift[1] < 0.6 * drift[0] or drift[1] < 1e-6 + found[1].work_uncertainty, (method.name, drift)
+    assert compared or engine.startswith("exudyn")  # which build no rotors, or no elements of balls
 
 
 INERTIA, STIFFNESS, AMPLITUDE = 0.02, 0.7, 8.0  # kg m², N m/rad, rad
