@@ -31,7 +31,7 @@ def release_notes(changelog: str, version: str) -> str:
     return found[1].strip() if found else ""
 
 
-def problem(status: str, tags: str, notes: str, version: str) -> str:
+def problem(status: str, tags: str, changelog: str, version: str) -> str:
     """Find what prevents a release.
 
     Args:
@@ -46,7 +46,9 @@ def problem(status: str, tags: str, notes: str, version: str) -> str:
         return f"files differ from the commit: {', '.join(line[3:] for line in status.splitlines()[:5])}"
     if f"v{version}" in tags.split():
         return f"v{version} is a tag already; the version is in plumbline/__init__.py"
-    return "" if notes else f"CHANGELOG.md has no section `## {version}`"
+    if release_notes(changelog, "Unreleased"):
+        return f"CHANGELOG.md has changes under `## Unreleased`, which belong under `## {version}`"
+    return "" if release_notes(changelog, version) else f"CHANGELOG.md has no section `## {version}`"
 
 
 def main() -> int:
@@ -56,13 +58,13 @@ def main() -> int:
         The exit code.
 
     """
-    notes = release_notes((ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), __version__)
-    if reason := problem(_git("status", "--porcelain"), _git("tag", "--list"), notes, __version__):
+    changelog = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    if reason := problem(_git("status", "--porcelain"), _git("tag", "--list"), changelog, __version__):
         print(f"no release: {reason}", file=sys.stderr)
         return 2
     for command in (["-m", "hatchling", "build", "-t", "wheel", "-d", "dist"], ["-m", "pytest", *CHECKS]):
         subprocess.run([sys.executable, *command], cwd=ROOT, check=True)
-    (ROOT / "dist" / "notes.md").write_text(f"{notes}\n", encoding="utf-8")
+    (ROOT / "dist" / "notes.md").write_text(f"{release_notes(changelog, __version__)}\n", encoding="utf-8")
     _git("tag", "--annotate", f"v{__version__}", "--file", "dist/notes.md")
     print(f"tagged v{__version__}; dist has the wheel and its notes; next: git push origin v{__version__}")
     return 0

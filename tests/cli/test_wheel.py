@@ -117,10 +117,12 @@ def test_two_lines_in_an_empty_environment_lead_to_a_verdict(wheel, tmp_path):
 
 
 def test_a_release_needs_a_clean_commit_a_new_tag_and_notes():
-    changelog = "# Changelog\n\n## Unreleased\n\n- x\n\n## 1.2.0 (2027)\n\n- New: y.\n\n## 1.1.0\n\n- z\n"
+    changelog = "# Changelog\n\n## Unreleased\n\n## 1.2.0 (2027)\n\n- New: y.\n\n## 1.1.0\n\n- z\n"
     assert release_notes(changelog, "1.2.0") == "- New: y."
     assert release_notes(changelog, "1.2") == "" and release_notes(changelog, "1.1.0") == "- z"
-    assert problem("", "v1.1.0\n", "- y", "1.2.0") == ""
-    assert "differ" in problem(" M README.md\n", "", "- y", "1.2.0")
-    assert "is a tag already" in problem("", "v1.1.0\nv1.2.0\n", "- y", "1.2.0")
-    assert "no section" in problem("", "", "", "1.2.0")
+    assert problem("", "v1.1.0\n", changelog, "1.2.0") == ""
+    assert "differ" in problem(" M README.md\n", "", changelog, "1.2.0")
+    assert "is a tag already" in problem("", "v1.1.0\nv1.2.0\n", changelog, "1.2.0")
+    assert "no section" in problem("", "", changelog, "1.3.0")
+    changelog = changelog.replace("## Unreleased\n", "## Unreleased\n\n- x\n")
+    assert "belong under `## 1.2.0`" in problem("", "", changelog, "1.2.0")
