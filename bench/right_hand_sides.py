@@ -21,7 +21,6 @@ from plumbline.model.sampling import random_states
 from reference_impl.direct import DirectSystem, solve_dense
 from reference_impl.fast.chain_elimination import StructuredSystem, component_first
 from reference_impl.fast.tree_elimination import TreeSystem
-from tests.helpers.random_chains import random_chain
 
 Call = Callable[[], object]
 
@@ -36,7 +35,12 @@ def random_pendulum(bodies: int, rods: bool = False, seed: int = 1) -> tuple[Mod
         The model and a state on its manifold.
 
     """
-    return random_chain(np.random.default_rng(seed), [rods] * bodies)
+    drawn = random_tree(np.random.default_rng(seed), bodies, ("rod" if rods else "ball",), loads=False)
+    body, point = np.arange(bodies)[:, None] + [-1, 0], drawn.point.copy()
+    point[0, 0] = 0.0
+    model = drawn.changed(body=body, point=point)
+    (state,) = random_states(model, 1, seed)
+    return model, state
 
 
 def hinge_tree(shape: Literal["chain", "binary tree", "star"], bodies: int) -> tuple[Model, State]:

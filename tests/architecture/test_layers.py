@@ -32,6 +32,20 @@ def test_a_package_imports_only_packages_below_it(name):
             assert imported.split(".")[0] in allowed, f"{name} imports {imported}"
 
 
+@pytest.mark.parametrize("folder", ["bench", "tools"])
+def test_benchmarks_and_tools_import_no_tests(folder):
+    files = list((ROOT / folder).rglob("*.py"))
+    trees = {path: ast.walk(ast.parse(path.read_text(encoding="utf-8"))) for path in files}
+    names = [
+        (path, getattr(node, "module", None) or alias.name)
+        for path, nodes in trees.items()
+        for node in nodes
+        if isinstance(node, ast.Import | ast.ImportFrom)
+        for alias in node.names
+    ]
+    assert names and not [pair for pair in names if pair[1].split(".")[0] == "tests"]
+
+
 @pytest.mark.parametrize("name", sorted(m for m in MODULES if m.split(".")[0] in OUTSIDE))
 def test_a_package_beside_the_core_imports_only_what_it_may(name):
     allowed = OUTSIDE[name.split(".")[0]]
