@@ -12,7 +12,7 @@ import exudyn
 import numpy as np
 
 from plumbline.engines.metamorphic_hooks import MetamorphicHooks
-from plumbline.model.datatypes import Array, EngineFailure, Model
+from plumbline.model.datatypes import Array, EngineFailure, Float, Model
 
 Sample = TypeVar("Sample")
 items: Any = exudyn.itemInterface  # its constructors are untyped
@@ -56,14 +56,14 @@ def make_settings() -> Any:
     return settings
 
 
-def add_loads(mbs: Any, model: Model, k: int, marker: Any, ground: Any, moment: Array) -> None:
+def add_loads(mbs: Any, model: Model, k: int, marker: Any, ground: Any, moment: Float[Array, "3"]) -> None:
     """Apply the loads of a body at its centre of mass, evaluated wherever the integrator evaluates forces.
 
     Drag is a damper to the ground with isotropic damping: F = -c_t ṙ, and -c_r ω in the world is -c_r ω′ in
     the body.
 
     Args:
-        moment: the applied moment (3,) [N m] in the marker's frame, with which it turns.
+        moment: the applied moment [N m] in the marker's frame, with which it turns.
 
     """
     if np.any(model.force[k]):
@@ -114,13 +114,8 @@ def initialized_solver(solver: Any, mbs: Any, settings: Any) -> Iterator[None]:
         solver.FinalizeSolver(mbs, settings)
 
 
-def mass_matrix_and_force(solver: Any, mbs: Any) -> tuple[Array, Array]:
-    """Evaluate M and f of M q̈ = f, without constraints.
-
-    Returns:
-        M (nq, nq) and f (nq,).
-
-    """
+def mass_matrix_and_force(solver: Any, mbs: Any) -> tuple[Float[Array, "nq nq"], Float[Array, "nq"]]:
+    """Evaluate M and f of M q̈ = f, without constraints."""
     solver.ComputeMassMatrix(mbs)
     M = np.array(solver.GetSystemMassMatrix())
     solver.ComputeODE2RHS(mbs)
@@ -156,7 +151,7 @@ def run_solver(
     solver: Any,
     mbs: Any,
     settings: Any,
-    times: Array,
+    times: Float[Array, "samples"],
     step: float,
     read_sample: Callable[[], Sample],
     check_step: Callable[[float], None] = lambda _: None,
@@ -167,7 +162,7 @@ def run_solver(
         solver: a solver with ``SolveSystem``.
         mbs: the assembled system.
         settings: its settings; the number of steps and the end time are set here.
-        times: sample times (T,) [s], multiples of the step from 0.
+        times: sample times [s], multiples of the step from 0.
         step: step [s].
         check_step: called with the time after every step; may raise.
 
@@ -245,13 +240,13 @@ def _write_no_files(settings: Any) -> None:
         settings.solutionSettings.sensorsStoreAndWriteFiles = False
 
 
-def make_rigid_body(node: Any, mass: float, J: Array) -> Any:
+def make_rigid_body(node: Any, mass: float, J: Float[Array, "3 3"]) -> Any:
     """Describe a body with six degrees of freedom to Exudyn.
 
     Args:
         node: the node that holds its coordinates.
         mass: mass [kg].
-        J: inertia (3, 3) [kg m²] about its centre of mass, in its own axes.
+        J: inertia [kg m²] about its centre of mass, in its own axes.
 
     Returns:
         The item, to be added to a system.

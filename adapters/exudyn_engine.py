@@ -47,6 +47,7 @@ from adapters.exudyn_common import (
 )
 from plumbline.model.datatypes import (
     Array,
+    Float,
     Integrator,
     JointKind,
     Model,
@@ -222,41 +223,32 @@ class ExudynChain:
         body = self.piece_bodies[piece]
         return self.mbs.AddMarker(items.MarkerBodyRigid(bodyNumber=body, localPosition=local))
 
-    def output_at(self, piece: int, output_type: Any, point: Array) -> Array:
+    def output_at(self, piece: int, output_type: Any, point: Float[Array, "3"]) -> Float[Array, "3"]:
         """Read an output of a piece at a point of its body.
 
         Args:
             piece: index of the piece.
             output_type: a member of ``exudyn.OutputVariableType``.
-            point: the point (3,) [m] from the body's centre of mass, body frame.
-
-        Returns:
-            The output (3,).
+            point: the point [m] from the body's centre of mass, body frame.
 
         """
         local = (point - self.piece_centre[piece]).tolist()
         return np.array(self.mbs.GetObjectOutputBody(self.piece_bodies[piece], output_type, local))
 
-    def body_outputs(self, output_type: Any) -> Array:
+    def body_outputs(self, output_type: Any) -> Float[Array, "bodies 3"]:
         """Read an output at every body's centre of mass.
 
         Args:
             output_type: a member of ``exudyn.OutputVariableType``.
 
-        Returns:
-            The outputs (N, 3).
-
         """
         return np.array([self.output_at(i, output_type, np.zeros(3)) for i in self.first_piece])
 
-    def joint_output(self, k: int, output_type: Any) -> Array:
+    def joint_output(self, k: int, output_type: Any) -> Float[Array, "3"]:
         """Read an output of joint k: at its near point, less that at its far point.
 
         Args:
             output_type: a member of ``exudyn.OutputVariableType``.
-
-        Returns:
-            The difference (3,).
 
         """
         far, near = self.model.body[k]
@@ -265,11 +257,11 @@ class ExudynChain:
             return np.asarray(here - self.model.point[k, 0] * (output_type == Output.Position))
         return here - self.output_at(self.last_piece[far], output_type, self.model.point[k, 0])
 
-    def multipliers(self) -> Array:
+    def multipliers(self) -> Float[Array, "bodies 4"]:
         """Read the constraints' multipliers.
 
         Returns:
-            (N, 4): of joint k three (of a rod's distance one, then zeros), then that of the node's |p| = 1;
+            Of joint k three (of a rod's distance one, then zeros), then that of the node's |p| = 1;
             zeros where there are other joints.
 
         """

@@ -51,6 +51,7 @@ from adapters.exudyn_common import (
 )
 from plumbline.model.datatypes import (
     Array,
+    Float,
     Integrator,
     Model,
     State,
@@ -89,8 +90,10 @@ class _RevoluteGroup:
 
     first_angle: int  # index of the first angle
     angle_count: int  # 2 for a rod, 3 for a ball
-    axes: Array  # (3, 3) world axes of the link at the start, columns x, y, z
-    body_axes: Array  # (3, 3) the same in the frame of the body that it turns (of the one before, for a rod)
+    axes: Float[Array, "3 3"]  # world axes of the link at the start, columns x, y, z
+    body_axes: Float[
+        Array, "3 3"
+    ]  # the same in the frame of the body that it turns (of the one before, for a rod)
     body: int  # the body that hangs by it, for messages
 
 
@@ -100,9 +103,9 @@ class _Link:
 
     joint: Any
     parent: int  # −1: the world
-    axes_in_parent: Array  # (3, 3)
-    offset: Array  # (3,) m, in the parent
-    axis: Array  # (3,) of the joint at the start, world frame
+    axes_in_parent: Float[Array, "3 3"]
+    offset: Float[Array, "3"]  # m, in the parent
+    axis: Float[Array, "3"]  # of the joint at the start, world frame
     centre: Array = field(default_factory=lambda: np.zeros(3))  # of mass, m
     inertia: Array = field(default_factory=lambda: np.zeros((3, 3)))  # kg m², about the centre of mass
     mass: float = 0.0  # kg

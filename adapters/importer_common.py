@@ -24,7 +24,7 @@ from plumbline.importers.neutral_model import (
     NeutralBody,
     NeutralModel,
 )
-from plumbline.model.datatypes import Array
+from plumbline.model.datatypes import Array, Float
 from plumbline.model.kinematics import quaternion_product, rotation_matrix
 
 MAX_WARNINGS = 20
@@ -33,15 +33,15 @@ _COLOURS = re.compile(r"\x1b\[[0-9;]*m")
 _ROTATION_EPSILON = 1e-12  # |ω| of a unit screw below which the motion is a displacement
 
 
-def to_canonical(quantities: ModelQuantities, T: Array, Tdot_v: Array) -> ModelQuantities:
+def to_canonical(
+    quantities: ModelQuantities, T: Float[Array, "n n"], Tdot_v: Float[Array, "n"]
+) -> ModelQuantities:
     """Transform quantities in an engine's velocities v_e = T v to canonical velocities v.
 
     M = TᵀM_eT,  h = Tᵀ(M_e Ṫv + h_e),  f = Tᵀf_e,  v̇ = T⁻¹(v̇_e − Ṫv).
 
     Args:
         quantities: in the engine's velocities.
-        T: the map (n, n).
-        Tdot_v: Ṫv (n,).
 
     Returns:
         The quantities in canonical velocities; those that are None stay so.
@@ -63,12 +63,14 @@ def to_canonical(quantities: ModelQuantities, T: Array, Tdot_v: Array) -> ModelQ
     )
 
 
-def joint_from_screw(name: str, angular: Array, linear: Array, **numbers: float) -> ElementaryJoint:
+def joint_from_screw(
+    name: str, angular: Float[Array, "3"], linear: Float[Array, "3"], **numbers: float
+) -> ElementaryJoint:
     """Describe a joint of one degree of freedom by its motion at the reference.
 
     Args:
-        angular: angular velocity (3,) of the body at unit rate, body axes.
-        linear: velocity (3,) of the body frame's origin at unit rate, body axes [m].
+        angular: angular velocity of the body at unit rate, body axes.
+        linear: velocity of the body frame's origin at unit rate, body axes [m].
         **numbers: armature, damping and the like.
 
     Returns:
@@ -97,12 +99,18 @@ def make_joint(
 
 
 def make_body(
-    name: str, parent: int, X: Array, joints: Iterable[ElementaryJoint], mass: Any, center: Any, inertia: Any
+    name: str,
+    parent: int,
+    X: Float[Array, "3 4"],
+    joints: Iterable[ElementaryJoint],
+    mass: Any,
+    center: Any,
+    inertia: Any,
 ) -> NeutralBody:
     """Make a body with arrays of its own.
 
     Args:
-        X: pose (3, 4) or (4, 4) in the parent, where the joints are at their reference.
+        X: pose or (4, 4) in the parent, where the joints are at their reference.
         center: centre of mass (3,) [m], body frame.
         inertia: about the centre of mass (3, 3) [kg m²], body axes.
 
@@ -120,12 +128,12 @@ def depth_first(roots: Iterable[Node], children: Callable[[Node], Iterable[Node]
         pending += list(children(node))[::-1]
 
 
-def pose(rotation: Array, origin: Array) -> Array:
-    """Return the matrix (3, 4) of a pose.
+def pose(rotation: Float[Array, "3 3"], origin: Float[Array, "3"]) -> Float[Array, "3 4"]:
+    """Return the matrix of a pose.
 
     Args:
-        rotation: body → world (3, 3).
-        origin: of the body frame (3,) [m], world.
+        rotation: body → world.
+        origin: of the body frame [m], world.
 
     Returns:
         Rotation and origin side by side.
@@ -134,14 +142,14 @@ def pose(rotation: Array, origin: Array) -> Array:
     return np.hstack([np.asarray(rotation, float), np.asarray(origin, float).reshape(3, 1)])
 
 
-def pose_of_coordinates(x: Array) -> Array:
+def pose_of_coordinates(x: Float[Array, "7"]) -> Float[Array, "4 4"]:
     """Return the pose that the canonical coordinates of a free joint give.
 
     Args:
-        x: position [m] and unit quaternion (7,).
+        x: position [m] and unit quaternion.
 
     Returns:
-        The pose (4, 4) of the body frame in the world.
+        The pose of the body frame in the world.
 
     """
     matrix = np.eye(4)
@@ -149,14 +157,14 @@ def pose_of_coordinates(x: Array) -> Array:
     return matrix
 
 
-def quaternion_of(rotation: Array) -> Array:
+def quaternion_of(rotation: Float[Array, "3 3"]) -> Float[Array, "4"]:
     """Return the unit quaternion of a rotation matrix.
 
     Args:
-        rotation: a proper rotation (3, 3).
+        rotation: a proper rotation.
 
     Returns:
-        The quaternion (4,), scalar first and not negative.
+        The quaternion, scalar first and not negative.
 
     """
     R = np.asarray(rotation, float)

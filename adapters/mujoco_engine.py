@@ -62,6 +62,9 @@ from plumbline.model.datatypes import (
     ROD,
     Array,
     EngineFailure,
+    Float,
+    Indices,
+    Int,
     Integrator,
     Model,
     State,
@@ -237,8 +240,8 @@ class Mujoco(MetamorphicHooks):
 class _Tie:
     """A rod in the shape of a tendon of constant length."""
 
-    bodies: NDArray[np.intp]  # (2,) that it holds, −1 the world
-    points: Array  # (2, 3) m, in these bodies
+    bodies: Int[Indices, "2"]  # that it holds, −1 the world
+    points: Float[Array, "2 3"]  # m, in these bodies
     length: float  # m
     softness: float  # 1/kg, what its R is proportional to
 

@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 
 from plumbline.engines.metamorphic_hooks import MetamorphicHooks
-from plumbline.model.datatypes import Array, Unsupported
+from plumbline.model.datatypes import Array, Float, Unsupported
 from plumbline.model.kinematics import quaternion_rate
 from plumbline.model.welding import RigidPart
 
@@ -29,11 +29,11 @@ class PinocchioAdapter(MetamorphicHooks):
         return str(pin.__version__)
 
 
-def translation(point: Array) -> pin.SE3:
+def translation(point: Float[Array, "3"]) -> pin.SE3:
     """Return the placement of a frame without rotation.
 
     Args:
-        point: its origin (3,) [m] in the parent frame.
+        point: its origin [m] in the parent frame.
 
     """
     return pin.SE3(np.eye(3), point)
@@ -66,20 +66,20 @@ def composite(*joints: Any) -> pin.JointModelComposite:
     return joint
 
 
-def add_frame(pin_model: pin.Model, name: str, joint: int, point: Array) -> int:
+def add_frame(pin_model: pin.Model, name: str, joint: int, point: Float[Array, "3"]) -> int:
     """Add an operational frame with the axes of a joint.
 
     Args:
         name: a name that no other frame has.
         joint: index of the joint that carries the frame.
-        point: its origin (3,) [m] in the joint's frame.
+        point: its origin [m] in the joint's frame.
 
     """
     frame = pin.Frame(name, joint, translation(point), pin.FrameType.OP_FRAME)
     return int(pin_model.addFrame(frame))
 
 
-def point_acceleration(pin_model: pin.Model, data: pin.Data, frame: int) -> Array:
+def point_acceleration(pin_model: pin.Model, data: pin.Data, frame: int) -> Float[Array, "3"]:
     """Read the acceleration of a frame's origin from the last forward kinematics.
 
     Args:
@@ -87,14 +87,14 @@ def point_acceleration(pin_model: pin.Model, data: pin.Data, frame: int) -> Arra
         frame: index of the frame.
 
     Returns:
-        Second time derivative (3,) [m/s²] of the origin's position, world frame.
+        Second time derivative [m/s²] of the origin's position, world frame.
 
     """
     return np.asarray(pin.getFrameClassicalAcceleration(pin_model, data, frame, WORLD_ALIGNED).linear)
 
 
 def energies_and_momentum(
-    pin_model: pin.Model, data: pin.Data, q: Array, v: Array, elastic: float = 0.0
+    pin_model: pin.Model, data: pin.Data, q: Float[Array, "nq"], v: Float[Array, "nv"], elastic: float = 0.0
 ) -> dict[str, Any]:
     """Evaluate the quantities of the whole mechanism.
 
@@ -150,16 +150,16 @@ def set_corrector(contact: Any, rate: float) -> None:
     )
 
 
-def configuration_rate(pin_model: pin.Model, q: Array, v: Array) -> Array:
+def configuration_rate(
+    pin_model: pin.Model, q: Float[Array, "nq"], v: Float[Array, "nv"]
+) -> Float[Array, "nq"]:
     """Map a velocity to the rate of the configuration.
 
     Args:
         pin_model: of any joints; before version 4 of spherical ones.
-        q: configuration (nq,).
-        v: velocity (nv,).
 
     Returns:
-        q̇ (nq,); version 3 has no tangent map, and q̇ = ½ q v of spherical joints is evaluated here.
+        q̇; version 3 has no tangent map, and q̇ = ½ q v of spherical joints is evaluated here.
 
     Raises:
         Unsupported: version 3, and joints other than spherical ones.

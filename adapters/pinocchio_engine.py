@@ -58,7 +58,7 @@ from adapters.pinocchio_common import (
     translation,
 )
 from plumbline.engines.integrators import dop853, rkmk4, sample_steps, semi_implicit_euler
-from plumbline.model.datatypes import Array, Integrator, Model, State, StateQuantities, Trajectory
+from plumbline.model.datatypes import Array, Float, Integrator, Model, State, StateQuantities, Trajectory
 from plumbline.model.kinematics import (
     elastic_energy,
     own_rates,
@@ -228,13 +228,10 @@ class PinocchioChain:
             self.fext[j] = self.fext[j] + load if j in taken else load
             taken.add(j)
 
-    def coordinates(self, state: State) -> tuple[Array, Array]:
-        """Map a state to Pinocchio's coordinates.
-
-        Returns:
-            q (4 nj,) and v (3 nj,).
-
-        """
+    def coordinates(
+        self, state: State
+    ) -> tuple[Float[Array, "quaternion_entries"], Float[Array, "angle_entries"]]:
+        """Map a state to Pinocchio's coordinates q and v."""
         model = self.source_model
         attitude, spin = np.zeros((self.joint_count, 4)), np.zeros((self.joint_count, 3))
         for k, row in enumerate(self.body_rows):
@@ -300,14 +297,8 @@ class PinocchioChain:
             turn = quaternion_product(quaternion_conjugate(model.turn[k, 1]), turn)
         return turn
 
-    def update_loads(self, q: Array, v: Array) -> None:
-        """Set `fext` to the loads at a state.
-
-        Args:
-            q: configuration (4 nj,).
-            v: velocity (3 nj,).
-
-        """
+    def update_loads(self, q: Float[Array, "quaternion_entries"], v: Float[Array, "angle_entries"]) -> None:
+        """Set `fext` to the loads at a state."""
         if not self.bodies_with_varying_loads:
             return
         data, model = self.data, self.source_model
@@ -344,17 +335,8 @@ class PinocchioChain:
                 force = pin.Force(sign * pull.dot(frame.rotation), np.zeros(3))
                 self.loads[b] = self.loads[b] + place.act(force)
 
-    def joint_torque(self, q: Array, v: Array) -> Array:
-        """Evaluate springs, dampers and efforts of the joints.
-
-        Args:
-            q: configuration (nq,).
-            v: velocity (nv,).
-
-        Returns:
-            τ (nv,).
-
-        """
+    def joint_torque(self, q: Float[Array, "nq"], v: Float[Array, "nv"]) -> Float[Array, "nv"]:
+        """Evaluate springs, dampers and efforts of the joints."""
         if not self.source_model.has_joint_elements:
             return self.zero_torque
         torque: Array = self.effort - self.damping * v
@@ -365,17 +347,10 @@ class PinocchioChain:
             torque[own] -= self.stiffness[own] * stretch
         return torque
 
-    def acceleration(self, q: Array, v: Array) -> Array:
-        """Evaluate the accelerations under gravity and loads, by the chosen algorithm.
-
-        Args:
-            q: configuration (4 nj,).
-            v: velocity (3 nj,).
-
-        Returns:
-            v̇ (3 nj,).
-
-        """
+    def acceleration(
+        self, q: Float[Array, "quaternion_entries"], v: Float[Array, "angle_entries"]
+    ) -> Float[Array, "angle_entries"]:
+        """Evaluate the accelerations under gravity and loads, by the chosen algorithm."""
         if self.ends:
             self.loads = list(self.constant_loads)
             self._add_up_loads()
@@ -411,16 +386,19 @@ class PinocchioChain:
         self._add_up_loads()
         return np.asarray(a)
 
-    def exponential_coordinate_rate(self, q: Array, theta: Array, v: Array) -> Array:
+    def exponential_coordinate_rate(
+        self,
+        q: Float[Array, "quaternion_entries"],
+        theta: Float[Array, "angle_entries"],
+        v: Float[Array, "angle_entries"],
+    ) -> Float[Array, "angle_entries"]:
         """Apply dexp⁻¹ of θ to a velocity, joint by joint.
 
         Args:
-            q: configuration (4 nj,).
-            theta: exponential coordinates θ (3 nj,) of a configuration near q.
-            v: velocity (3 nj,) there.
+            theta: exponential coordinates θ of a configuration near q.
 
         Returns:
-            θ̇ (3 nj,) with d/dt integrate(q, θ) = v.
+            θ̇ with d/dt integrate(q, θ) = v.
 
         """
         dexp = pin.dIntegrate(self.pin_model, q, theta, pin.ArgumentPosition.ARG1)
@@ -430,42 +408,28 @@ class PinocchioChain:
         blocks = dexp.reshape(self.joint_count, 3, self.joint_count, 3)[each, :, each, :]  # the rest is zero
         return np.linalg.solve(blocks, v.reshape(-1, 3, 1)).ravel()
 
-    def integrate(self, q: Array, displacement: Array) -> Array:
+    def integrate(
+        self, q: Float[Array, "quaternion_entries"], displacement: Float[Array, "angle_entries"]
+    ) -> Float[Array, "quaternion_entries"]:
         """Move a configuration along a tangent vector, by the engine's `integrate`.
 
         Args:
-            q: configuration (4 nj,).
-            displacement: tangent vector (3 nj,) [rad].
+            displacement: tangent vector [rad].
 
         Returns:
-            The configuration reached (4 nj,).
+            The configuration reached.
 
         """
         return np.asarray(pin.integrate(self.pin_model, q, displacement))
 
-    def configuration_rate(self, q: Array, v: Array) -> Array:
-        """Map a velocity to the rate of the configuration.
-
-        Args:
-            q: configuration (4 nj,).
-            v: velocity (3 nj,).
-
-        Returns:
-            q̇ (4 nj,).
-
-        """
+    def configuration_rate(
+        self, q: Float[Array, "quaternion_entries"], v: Float[Array, "angle_entries"]
+    ) -> Float[Array, "quaternion_entries"]:
+        """Map a velocity to the rate of the configuration."""
         return configuration_rate(self.pin_model, q, v)
 
-    def normalize(self, q: Array) -> Array:
-        """Normalise the quaternions of a configuration; `aba` takes any quaternion for a unit one.
-
-        Args:
-            q: configuration (4 nj,).
-
-        Returns:
-            The same with quaternions of unit length.
-
-        """
+    def normalize(self, q: Float[Array, "quaternion_entries"]) -> Float[Array, "quaternion_entries"]:
+        """Normalise the quaternions of a configuration; `aba` takes any quaternion for a unit one."""
         return np.asarray(pin.normalize(self.pin_model, q))
 
     def quantities(self, state: State) -> StateQuantities:
@@ -562,13 +526,17 @@ class PinocchioChain:
             wrench, child = self.data.liMi[child].act(wrench), self.pin_model.parents[child]
         return wrench
 
-    def trajectory(self, times: Array, q: Array, v: Array, steps: int) -> Trajectory:
+    def trajectory(
+        self,
+        times: Float[Array, "samples"],
+        q: Float[Array, "samples quaternion_entries"],
+        v: Float[Array, "samples angle_entries"],
+        steps: int,
+    ) -> Trajectory:
         """Map samples to the bodies' positions, attitudes and rates.
 
         Args:
-            times: sample times (T,) [s].
-            q: configurations (T, 4 nj).
-            v: velocities (T, 3 nj).
+            times: sample times [s].
 
         Returns:
             The trajectory in the project's frames.
@@ -606,16 +574,16 @@ def _joint_turns(model: Model, k: int, x: Array) -> Array:
     return turn
 
 
-def rod_quaternion(u: Array) -> Array:
+def rod_quaternion(u: Float[Array, "3"]) -> Float[Array, "4"]:
     """Choose an attitude for a rod: half a turn about e_z + u, which takes e_z to u.
 
     Where u points down it is the shortest turn from -e_z after half a turn about x, to stay away from 0/0.
 
     Args:
-        u: unit vector (3,), world frame.
+        u: unit vector, world frame.
 
     Returns:
-        A unit quaternion (4,), scalar first, that turns e_z into u.
+        A unit quaternion, scalar first, that turns e_z into u.
 
     """
     if u[2] >= 0:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from plumbline.model.datatypes import Array, Integrator, Model, State, StateQuantities, Trajectory
+from plumbline.model.datatypes import Array, Float, Integrator, Model, State, StateQuantities, Trajectory
 from plumbline.model.kinematics import velocity_jacobian
 from reference_impl.euler_parameters import A, L, euler_parameter_rate
 from reference_impl.integrate import IntegrationResult
@@ -24,11 +24,18 @@ DOP853 = Integrator(
 )
 
 
-def notes_state(state: State) -> tuple[Array, Array, Array, Array]:
+def notes_state(
+    state: State,
+) -> tuple[
+    Float[Array, "... bodies 3"],
+    Float[Array, "... bodies 4"],
+    Float[Array, "... bodies 3"],
+    Float[Array, "... bodies 4"],
+]:
     """Convert a state to the notes' variables.
 
     Returns:
-        r (N, 3) [m], p (N, 4), ṙ (N, 3) [m/s] and ṗ (N, 4) [1/s].
+        r [m], p, ṙ [m/s] and ṗ [1/s].
 
     """
     return state.r, state.p, state.v, euler_parameter_rate(state.p, state.omega)
@@ -37,11 +44,11 @@ def notes_state(state: State) -> tuple[Array, Array, Array, Array]:
 def state_quantities(
     model: Model,
     state: State,
-    acceleration: Array,
-    pddot: Array,
-    reaction: Array,
-    S: Array,
-    moment: Array | None = None,
+    acceleration: Float[Array, "bodies 3"],
+    pddot: Float[Array, "bodies 4"],
+    reaction: Float[Array, "joints 3"],
+    S: Float[Array, "unknowns unknowns"],
+    moment: Float[Array, "joints 3"] | None = None,
     rotor_count: int = 0,
     spring_energy: float = 0.0,
 ) -> StateQuantities:
@@ -49,11 +56,11 @@ def state_quantities(
 
     Args:
         state: one on the constraint manifold.
-        acceleration: r̈ (N, 3) [m/s²], world frame.
-        pddot: p̈ (N, 4) [1/s²].
-        reaction: forces on the bodies at their joints' near points (N, 3) [N], world frame (E5).
+        acceleration: r̈ [m/s²], world frame.
+        pddot: p̈ [1/s²].
+        reaction: forces on the bodies at their joints' near points [N], world frame (E5).
         S: the matrix of (N5), of which rows and columns of r̈ and p̈ are used.
-        moment: moments on the bodies about these points (N, 3) [N m], world frame; absent for chains of rods
+        moment: moments on the bodies about these points [N m], world frame; absent for chains of rods
             and balls, where it is 0.
         rotor_count: rows of rotors in S, behind those of the constraints.
         spring_energy: potential energy of springs [J].

@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 from reference_impl.elements import ElementForces, Elements
 from reference_impl.euler_parameters import A, L, angular_velocity, dot
 from reference_impl.joints import ConstraintRows, constraint_rows, joint_of_rows, of_far_body
-from reference_impl.mechanism import Array, Mechanism
+from reference_impl.mechanism import Array, Bool, Flags, Float, Indices, Int, Mechanism
 from reference_impl.singular_system import SingularSystem
 
 EPS = float(np.finfo(float).eps)
@@ -31,17 +31,21 @@ RUN_RANK_TOLERANCE = 1e-6  # the same along a run, whose drift makes dependent r
 class Solution:
     """The unknowns x of (N5) and what they mean (E5)."""
 
-    acceleration: Array  # (N, 3) m/s², r̈, world frame
-    pddot: Array  # (N, 4) 1/s², p̈
-    # (c,) λ by row of `joint`: N/m for a rod's row, N for a ball's three, a φ̈ for a rotor's at the end
-    multiplier: Array
-    norm_multiplier: Array  # (N,) λ_E: no physical meaning, not comparable across formulations (E2)
-    joint: NDArray[np.intp]  # (c,) the joint of each row
-    tension: Array  # (J,) N, 2 ℓ λ of the rods, positive in tension; NaN at ball joints
-    # (J, 3) N, force on the near body at the near point, world frame: −C_rᵀ λ, with elements
-    joint_reaction: Array
-    joint_moment: Array | None = None  # (J, 3) N m, moment on that body about that point, world frame
-    kept: NDArray[np.bool_] | None = None  # (c,) of loops: False where a row depends on others, left out
+    acceleration: Float[Array, "bodies 3"]  # m/s², r̈, world frame
+    pddot: Float[Array, "bodies 4"]  # 1/s², p̈
+    # λ by row of `joint`: N/m for a rod's row, N for a ball's three, a φ̈ for a rotor's at the end
+    multiplier: Float[Array, "c"]
+    norm_multiplier: Float[
+        Array, "bodies"
+    ]  # λ_E: no physical meaning, not comparable across formulations (E2)
+    joint: Int[Indices, "c"]  # the joint of each row
+    tension: Float[Array, "joints"]  # N, 2 ℓ λ of the rods, positive in tension; NaN at ball joints
+    # N, force on the near body at the near point, world frame: −C_rᵀ λ, with elements
+    joint_reaction: Float[Array, "joints 3"]
+    joint_moment: Float[Array, "joints 3"] | None = (
+        None  # N m, moment on that body about that point, world frame
+    )
+    kept: Bool[Flags, "c"] | None = None  # of loops: False where a row depends on others, left out
 
 
 class DirectSystem:
@@ -101,15 +105,19 @@ class DirectSystem:
         self._unsort = np.argsort(by_row)
 
     def assemble(
-        self, r: Array, p: Array, v: Array, pdot: Array, x: Array | None = None
-    ) -> tuple[Array, Array]:
+        self,
+        r: Float[Array, "bodies 3"],
+        p: Float[Array, "bodies 4"],
+        v: Float[Array, "bodies 3"],
+        pdot: Float[Array, "bodies 4"],
+        x: Float[Array, "joints coordinates"] | None = None,
+    ) -> tuple[Float[Array, "unknowns unknowns"], Float[Array, "unknowns"]]:
         """Assemble S and b of (N5), on or off the constraints.
 
         Args:
-            r: positions (N, 3) [m], world frame.
-            p: Euler parameters (N, 4).
-            v: velocities ṙ (N, 3) [m/s], world frame.
-            pdot: rates ṗ (N, 4) [1/s].
+            r: positions [m], world frame.
+            v: velocities ṙ [m/s], world frame.
+            pdot: rates ṗ [1/s].
             x: as for `solve`.
 
         Returns:
@@ -121,22 +129,21 @@ class DirectSystem:
 
     def solve(
         self,
-        r: Array,
-        p: Array,
-        v: Array,
-        pdot: Array,
-        gamma_defect: float | Array = 0.0,
-        x: Array | None = None,
+        r: Float[Array, "bodies 3"],
+        p: Float[Array, "bodies 4"],
+        v: Float[Array, "bodies 3"],
+        pdot: Float[Array, "bodies 4"],
+        gamma_defect: float | Float[Array, "c"] = 0.0,
+        x: Float[Array, "bodies 2"] | None = None,
     ) -> Solution:
         """Solve (N5).
 
         Args:
-            r: positions (N, 3) [m], world frame.
-            p: Euler parameters (N, 4).
-            v: velocities ṙ (N, 3) [m/s], world frame.
-            pdot: rates ṗ (N, 4) [1/s].
-            gamma_defect: added to γ, one number or one per row (c,): a planted fault of known growth (E4).
-            x: joint coordinates (N, 2) near which angles of springs are taken; absent: principal values.
+            r: positions [m], world frame.
+            v: velocities ṙ [m/s], world frame.
+            pdot: rates ṗ [1/s].
+            gamma_defect: added to γ, one number or one per row: a planted fault of known growth (E4).
+            x: joint coordinates near which angles of springs are taken; absent: principal values.
 
         Returns:
             r̈, p̈, λ, λ_E and the forces at the joints.
@@ -152,13 +159,13 @@ class DirectSystem:
 
     def solve_unknowns(
         self,
-        r: Array,
-        p: Array,
-        v: Array,
-        pdot: Array,
-        gamma_defect: float | Array = 0.0,
-        x: Array | None = None,
-    ) -> tuple[Array, ConstraintRows, ElementForces | None]:
+        r: Float[Array, "bodies 3"],
+        p: Float[Array, "bodies 4"],
+        v: Float[Array, "bodies 3"],
+        pdot: Float[Array, "bodies 4"],
+        gamma_defect: float | Float[Array, "c"] = 0.0,
+        x: Float[Array, "joints coordinates"] | None = None,
+    ) -> tuple[Float[Array, "unknowns"], ConstraintRows, ElementForces | None]:
         """Solve (N5) for its unknowns alone; in loops 0 for multipliers of rows that depend on others.
 
         S is equilibrated symmetrically by powers of two (its blocks have the units kg, kg m² and m,
@@ -167,11 +174,10 @@ class DirectSystem:
         830 ε without the refinement; more passes of equilibration change nothing.
 
         Args:
-            r: positions (N, 3) [m], world frame.
-            p: Euler parameters (N, 4).
-            v: velocities ṙ (N, 3) [m/s], world frame.
-            pdot: rates ṗ (N, 4) [1/s].
-            gamma_defect: added to γ, one number or one per row (c,): a planted fault of known growth (E4).
+            r: positions [m], world frame.
+            v: velocities ṙ [m/s], world frame.
+            pdot: rates ṗ [1/s].
+            gamma_defect: added to γ, one number or one per row: a planted fault of known growth (E4).
             x: as for `solve`.
 
         Returns:
@@ -205,15 +211,20 @@ class DirectSystem:
         return solution, joints, elements
 
     def solve_with_dense_factors(
-        self, r: Array, p: Array, v: Array, pdot: Array, *, x: Array | None = None
+        self,
+        r: Float[Array, "bodies 3"],
+        p: Float[Array, "bodies 4"],
+        v: Float[Array, "bodies 3"],
+        pdot: Float[Array, "bodies 4"],
+        *,
+        x: Float[Array, "joints coordinates"] | None = None,
     ) -> Solution:
         """Solve (N5) by dense factors of the assembled S, an independent way to the x of `solve`.
 
         Args:
-            r: positions (N, 3) [m], world frame.
-            p: Euler parameters (N, 4).
-            v: velocities ṙ (N, 3) [m/s], world frame.
-            pdot: rates ṗ (N, 4) [1/s].
+            r: positions [m], world frame.
+            v: velocities ṙ [m/s], world frame.
+            pdot: rates ṗ [1/s].
             x: as for `solve`.
 
         Returns:
@@ -225,24 +236,23 @@ class DirectSystem:
 
     def corrected(
         self,
-        r: Array,
-        p: Array,
-        v: Array,
-        pdot: Array,
-        x: Array | None,
-        unknowns: Array,
+        r: Float[Array, "bodies 3"],
+        p: Float[Array, "bodies 4"],
+        v: Float[Array, "bodies 3"],
+        pdot: Float[Array, "bodies 4"],
+        x: Float[Array, "joints coordinates"] | None,
+        unknowns: Float[Array, "m"],
         correction: Callable[[Array], Array],
     ) -> tuple[Solution, ElementForces | None]:
         """Correct unknowns that nearly solve (N5): x + S₀⁻¹ (b − S x), with the S₀ of a system nearby.
 
         Args:
-            r: positions (N, 3) [m], world frame.
-            p: Euler parameters (N, 4).
-            v: velocities ṙ (N, 3) [m/s], world frame.
-            pdot: rates ṗ (N, 4) [1/s].
+            r: positions [m], world frame.
+            v: velocities ṙ [m/s], world frame.
+            pdot: rates ṗ [1/s].
             x: as for `solve`.
-            unknowns: (m,) in the printed order.
-            correction: from b − S x (m,) to S₀⁻¹ (b − S x) (m,).
+            unknowns: in the printed order.
+            correction: from b − S x to S₀⁻¹ (b − S x).
 
         Returns:
             The corrected solution, and what elements there are.
@@ -258,7 +268,7 @@ class DirectSystem:
         p: Array,
         v: Array,
         pdot: Array,
-        gamma_defect: float | Array,
+        gamma_defect: float | Float[Array, "c"],
         x: Array | None,
         is_run: bool,
     ) -> tuple[tuple[Array, ConstraintRows, ElementForces | None], NDArray[np.bool_]]:
@@ -306,7 +316,7 @@ class DirectSystem:
         return S
 
     def _entries(
-        self, r: Array, p: Array, v: Array, pdot: Array, x: Array | None = None
+        self, r: Array, p: Array, v: Array, pdot: Array, x: Float[Array, "joints coordinates"] | None = None
     ) -> tuple[Array, Array, ConstraintRows, ElementForces | None]:
         """The entries of S in the order of `_i`, `_j`, then b, and the rows and elements they come from."""
         chain, elements, rotors = self.chain, None, np.zeros(0)
@@ -365,18 +375,22 @@ class DirectSystem:
         )
 
 
-def joint_moments(chain: Mechanism, p: Array, force: Array, of_p: Array) -> Array:
+def joint_moments(
+    chain: Mechanism,
+    p: Float[Array, "bodies 4"],
+    force: Float[Array, "joints 3"],
+    of_p: Float[Array, "joints 4"],
+) -> Float[Array, "joints 3"]:
     """Compute the moments about the near points of wrenches given by force and generalised force on p.
 
     A ½ L Q_p is the moment about the centre of mass; L p = 0 takes the normalisation's share out (E2).
 
     Args:
-        p: Euler parameters (N, 4).
-        force: (J, 3) [N], on the near bodies, world frame.
-        of_p: Q_p (J, 4) [N m].
+        force: [N], on the near bodies, world frame.
+        of_p: Q_p [N m].
 
     Returns:
-        (J, 3) [N m], world frame.
+        [N m], world frame.
 
     """
     p = p[chain.body[:, 1]]
@@ -395,13 +409,15 @@ def _band_order(chain: Mechanism) -> NDArray[np.intp]:
     return np.argsort(order)
 
 
-def independent_rows(rows: Array, tolerance: float, count: int | None = None) -> NDArray[np.intp]:
+def independent_rows(
+    rows: Float[Array, "c m"], tolerance: float, count: int | None = None
+) -> Int[Indices, "kept"]:
     """Find rows that do not depend on others, by a pivoted QR; of rows that do equally well the first.
 
     Without that order rounding would choose among them, another set from step to step of a run.
 
     Args:
-        rows: (c, m), of any scale.
+        rows: of any scale.
         tolerance: part of the largest pivot below which a row depends on others.
         count: how many at most.
 
@@ -425,15 +441,8 @@ def _independence(rows: Array) -> float:
     return float(np.linalg.svd(rows, compute_uv=False)[-1])
 
 
-def solve_dense(S: Array, b: Array) -> Array:
+def solve_dense(S: Float[Array, "m m"], b: Float[Array, "m"]) -> Float[Array, "m"]:
     """Solve S x = b by dense factors, equilibrated and refined once like `DirectSystem.solve_unknowns`.
-
-    Args:
-        S: symmetric matrix (m, m).
-        b: right-hand side (m,).
-
-    Returns:
-        x (m,).
 
     Raises:
         SingularSystem: S is singular to rounding.
@@ -449,24 +458,24 @@ def solve_dense(S: Array, b: Array) -> Array:
     return np.asarray(x * scale)
 
 
-def power_of_two_scale(largest: Array) -> Array:
+def power_of_two_scale(largest: Float[Array, "..."]) -> Float[Array, "..."]:
     """Return the powers of two nearest below 1/√largest; scaling by them rounds nothing.
 
     Args:
-        largest: largest magnitude in each row (m,).
+        largest: largest magnitude in each row.
 
     Returns:
-        (m,); 1 where ``largest`` is 0.
+        ; 1 where ``largest`` is 0.
 
     """
     return np.where(largest > 0, np.ldexp(1.0, -(np.frexp(largest)[1] // 2)), 1.0)
 
 
-def is_singular(pivots: Array) -> bool:
+def is_singular(pivots: Float[Array, "m"]) -> bool:
     """Return whether an equilibrated matrix is singular to rounding.
 
     Args:
-        pivots: diagonal of its triangular factor (m,).
+        pivots: diagonal of its triangular factor.
 
     Returns:
         True where the smallest is within m ε of the largest.
@@ -477,16 +486,20 @@ def is_singular(pivots: Array) -> bool:
 
 
 def check_state_solvable(
-    chain: Mechanism, r: Array, p: Array, d: Array, rods: NDArray[np.bool_], entries: tuple[Array, ...]
+    chain: Mechanism,
+    r: Float[Array, "bodies 3"],
+    p: Float[Array, "bodies 4"],
+    d: Float[Array, "joints 3"],
+    rods: Bool[Flags, "joints"],
+    entries: tuple[Float[Array, "..."], ...],
 ) -> None:
     """Check that the state alone does not make S singular (E1, E7).
 
     Args:
-        r: positions (N, 3) [m], world frame.
-        p: Euler parameters (N, 4).
-        d: vectors along the rods (N, 3) [m].  One below its own rounding (16 ε of the vectors that it is the
+        r: positions [m], world frame.
+        d: vectors along the rods [m].  One below its own rounding (16 ε of the vectors that it is the
             sum of) counts as zero, because a row made of it would be noise.
-        rods: (J,) True where joint k is a rod.
+        rods: True where joint k is a rod.
         entries: arrays that must be finite: entries of S and b, and ṙ.
 
     Raises:

@@ -26,22 +26,22 @@ from dataclasses import dataclass
 import numpy as np
 
 from reference_impl.euler_parameters import A, G, L, cross, dot
-from reference_impl.mechanism import Array, Mechanism
+from reference_impl.mechanism import Array, Float, Mechanism
 
 
 @dataclass(frozen=True, eq=False)
 class ElementForces:
     """The elements of a mechanism at one state; e joint coordinates that have some, in the joints' order."""
 
-    r_near: Array  # (e, 3) J_φ of r of the near body; of the far body it is −r_near
-    p_near: Array  # (e, 4) J_φ of p of the near body
-    p_far: Array  # (e, 4) J_φ of p of the far body
-    bias: Array  # (e,) φ̈₀
-    stretch: Array  # (e,) rad or m, φ − φ₀
-    rate: Array  # (e,) rad/s or m/s, φ̇
-    torque: Array  # (e,) N m or N, τ
-    force: Array  # (N, 3) N, of all elements but rotors, world frame
-    p_force: Array  # (N, 4) N m, the generalised force on p of the same
+    r_near: Float[Array, "e 3"]  # J_φ of r of the near body; of the far body it is −r_near
+    p_near: Float[Array, "e 4"]  # J_φ of p of the near body
+    p_far: Float[Array, "e 4"]  # J_φ of p of the far body
+    bias: Float[Array, "e"]  # φ̈₀
+    stretch: Float[Array, "e"]  # rad or m, φ − φ₀
+    rate: Float[Array, "e"]  # rad/s or m/s, φ̇
+    torque: Float[Array, "e"]  # N m or N, τ
+    force: Float[Array, "bodies 3"]  # N, of all elements but rotors, world frame
+    p_force: Float[Array, "bodies 4"]  # N m, the generalised force on p of the same
     potential: float  # J, of the springs
     dissipation: float  # W, of the dampers
 
@@ -78,34 +78,44 @@ class Elements:
         self.has_winding_angles = bool(np.any((self.stiffness != 0) & ~self.is_slide & ~self.is_ball))
 
     def coordinates(
-        self, r: Array, p: Array, v: Array, pdot: Array, x: Array | None = None
-    ) -> tuple[Array, Array]:
+        self,
+        r: Float[Array, "bodies 3"],
+        p: Float[Array, "bodies 4"],
+        v: Float[Array, "bodies 3"],
+        pdot: Float[Array, "bodies 4"],
+        x: Float[Array, "joints coordinates"] | None = None,
+    ) -> tuple[Float[Array, "joints coordinates"], Float[Array, "joints coordinates"]]:
         """Return the joint coordinates that have elements, and their rates.
 
         Args:
-            r: positions (N, 3) [m], world frame.
-            p: Euler parameters (N, 4).
-            v: velocities ṙ (N, 3) [m/s], world frame.
-            pdot: rates ṗ (N, 4) [1/s].
+            r: positions [m], world frame.
+            v: velocities ṙ [m/s], world frame.
+            pdot: rates ṗ [1/s].
             x: as for `evaluate`.
 
         Returns:
-            (J, 2) each [rad or m, and 1/s of it]; zeros where there are no elements.
+            [rad or m, and 1/s of it]; zeros where there are no elements.
 
         """
         found, values = self.evaluate(r, p, v, pdot, x), np.zeros((2, *self.mechanism.armature.shape))
         values[:, self.joint, self.column] = found.stretch + self.rest, found.rate
         return values[0], values[1]
 
-    def evaluate(self, r: Array, p: Array, v: Array, pdot: Array, x: Array | None = None) -> ElementForces:
+    def evaluate(
+        self,
+        r: Float[Array, "bodies 3"],
+        p: Float[Array, "bodies 4"],
+        v: Float[Array, "bodies 3"],
+        pdot: Float[Array, "bodies 4"],
+        x: Float[Array, "joints coordinates"] | None = None,
+    ) -> ElementForces:
         """Evaluate all elements.
 
         Args:
-            r: positions (N, 3) [m], world frame.
-            p: Euler parameters (N, 4).
-            v: velocities ṙ (N, 3) [m/s], world frame.
-            pdot: rates ṗ (N, 4) [1/s].
-            x: joint coordinates (J, 2) near which angles are taken [rad]; absent: principal values.
+            r: positions [m], world frame.
+            v: velocities ṙ [m/s], world frame.
+            pdot: rates ṗ [1/s].
+            x: joint coordinates near which angles are taken [rad]; absent: principal values.
 
         """
         state = _with_world(r, p, v, pdot)

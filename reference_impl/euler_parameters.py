@@ -11,12 +11,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import wraps
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-AnyArray = NDArray[Any]  # float, complex or exact entries
+from reference_impl.arrays import AnyArray as AnyArray
+from reference_impl.arrays import Shaped
 
 I3 = np.eye(3, dtype=int)  # integers: exact in every field
 
@@ -38,16 +37,8 @@ def _linear(size: int) -> Callable[[Callable[[AnyArray], AnyArray]], Callable[[A
 
 
 @_linear(3)
-def tilde(v: AnyArray) -> AnyArray:
-    """Return the cross-product matrix ṽ, ṽ w = v × w.
-
-    Args:
-        v: vectors (..., 3).
-
-    Returns:
-        ṽ (..., 3, 3).
-
-    """
+def tilde(v: Shaped[AnyArray, "... 3"]) -> Shaped[AnyArray, "... 3 3"]:
+    """Return the cross-product matrix ṽ, ṽ w = v × w."""
     x, y, z = v
     return np.array(
         [
@@ -58,57 +49,27 @@ def tilde(v: AnyArray) -> AnyArray:
     )
 
 
-def outer(a: AnyArray, b: AnyArray) -> AnyArray:
-    """Return the outer product a bᵀ.
-
-    Args:
-        a: vectors (..., i).
-        b: vectors (..., j).
-
-    Returns:
-        (..., i, j).
-
-    """
+def outer(a: Shaped[AnyArray, "... i"], b: Shaped[AnyArray, "... j"]) -> Shaped[AnyArray, "... i j"]:
+    """Return the outer product a bᵀ."""
     return a[..., :, None] * b[..., None, :]
 
 
-def dot(a: AnyArray, b: AnyArray) -> AnyArray:
-    """Return the inner product aᵀb without complex conjugation, as complex steps need it.
-
-    Args:
-        a: vectors (..., i).
-        b: vectors (..., i).
-
-    Returns:
-        (...).
-
-    """
+def dot(a: Shaped[AnyArray, "... i"], b: Shaped[AnyArray, "... i"]) -> Shaped[AnyArray, "..."]:
+    """Return the inner product aᵀb without complex conjugation, as complex steps need it."""
     return np.asarray((a * b).sum(-1))
 
 
-def cross(a: AnyArray, b: AnyArray) -> AnyArray:
-    """Return a × b, in a fifth of the time that `numpy.cross` takes on a few vectors.
-
-    Args:
-        a: vectors (..., 3).
-        b: vectors (..., 3).
-
-    Returns:
-        (..., 3).
-
-    """
+def cross(a: Shaped[AnyArray, "... 3"], b: Shaped[AnyArray, "... 3"]) -> Shaped[AnyArray, "... 3"]:
+    """Return a × b, in a fifth of the time that `numpy.cross` takes on a few vectors."""
     i, j = (1, 2, 0), (2, 0, 1)
     return np.asarray(a.take(i, -1) * b.take(j, -1) - a.take(j, -1) * b.take(i, -1))
 
 
-def A(p: AnyArray) -> AnyArray:
+def A(p: Shaped[AnyArray, "... 4"]) -> Shaped[AnyArray, "... 3 3"]:
     """Return A = (2 p0² − 1) I + 2 (e eᵀ + p0 ẽ) (N7).
 
-    Args:
-        p: Euler parameters (..., 4).
-
     Returns:
-        A (..., 3, 3): a rotation, body → world, where pᵀp = 1.
+        A: a rotation, body → world, where pᵀp = 1.
 
     """
     p0, e = p[..., 0, None, None], p[..., 1:]
@@ -116,14 +77,11 @@ def A(p: AnyArray) -> AnyArray:
 
 
 @_linear(4)
-def L(p: AnyArray) -> AnyArray:
+def L(p: Shaped[AnyArray, "... 4"]) -> Shaped[AnyArray, "... 3 4"]:
     """Return L = [−e, p0 I − ẽ], with which ω′ = 2 L ṗ.
 
     Args:
-        p: Euler parameters or their rates (..., 4).
-
-    Returns:
-        L (..., 3, 4).
+        p: Euler parameters or their rates.
 
     """
     p0, e = p[0], p[1:]
@@ -131,14 +89,11 @@ def L(p: AnyArray) -> AnyArray:
 
 
 @_linear(4)
-def G(p: AnyArray) -> AnyArray:
+def G(p: Shaped[AnyArray, "... 4"]) -> Shaped[AnyArray, "... 3 4"]:
     """Return G = [−e, p0 I + ẽ], with which A = G Lᵀ + (pᵀp − 1) I (N10).
 
     Args:
-        p: Euler parameters or their rates (..., 4).
-
-    Returns:
-        G (..., 3, 4).
+        p: Euler parameters or their rates.
 
     """
     p0, e = p[0], p[1:]
@@ -146,84 +101,84 @@ def G(p: AnyArray) -> AnyArray:
 
 
 @_linear(3)
-def B(s: AnyArray) -> AnyArray:
+def B(s: Shaped[AnyArray, "... 3"]) -> Shaped[AnyArray, "... 4 4"]:
     """Return B = [[0, −sᵀ], [s, −s̃]] (N8).
 
     Args:
-        s: points of the body (..., 3) [m], body frame.
+        s: points of the body [m], body frame.
 
     Returns:
-        B (..., 4, 4) [m].
+        B [m].
 
     """
     return np.block([[np.zeros((1, 1), int), -s[None, :]], [s[:, None], -tilde(s)]])
 
 
-def H(p: AnyArray, s: AnyArray) -> AnyArray:
+def H(p: Shaped[AnyArray, "... 4"], s: Shaped[AnyArray, "... 3"]) -> Shaped[AnyArray, "... 3 4"]:
     """Return H = G(p) B(s) + s pᵀ, half of ∂(A s)/∂p (D4).
 
     Args:
-        p: Euler parameters or their rates (..., 4).
-        s: points of the body (..., 3) [m], body frame.
+        p: Euler parameters or their rates.
+        s: points of the body [m], body frame.
 
     Returns:
-        H (..., 3, 4) [m].
+        H [m].
 
     """
     return G(p) @ B(s) + outer(s, p)
 
 
-def dAs_dp(p: AnyArray, s: AnyArray) -> AnyArray:
+def dAs_dp(p: Shaped[AnyArray, "... 4"], s: Shaped[AnyArray, "... 3"]) -> Shaped[AnyArray, "... 3 4"]:
     """Return ∂(A s)/∂p = 2 G(p) B(s) + 2 s pᵀ, for every p (N8).
 
     Args:
-        p: Euler parameters (..., 4).
-        s: points of the body (..., 3) [m], body frame.
+        s: points of the body [m], body frame.
 
     Returns:
-        (..., 3, 4) [m].
+        [m].
 
     """
     return np.asarray(2 * G(p) @ B(s) + 2 * outer(s, p))
 
 
-def A_rate(p: AnyArray, pdot: AnyArray) -> AnyArray:
+def A_rate(p: Shaped[AnyArray, "... 4"], pdot: Shaped[AnyArray, "... 4"]) -> Shaped[AnyArray, "... 3 3"]:
     """Return Ȧ = 2 G L̇ᵀ as the notes use it (N10); off pᵀṗ = 0 the rate of (N7) is 2 (pᵀṗ) I more (E3).
 
     Args:
-        p: Euler parameters (..., 4).
-        pdot: their rates ṗ (..., 4) [1/s].
+        pdot: their rates ṗ [1/s].
 
     Returns:
-        Ȧ (..., 3, 3) [1/s].
+        Ȧ [1/s].
 
     """
     return 2 * G(p) @ L(pdot).swapaxes(-1, -2)
 
 
-def angular_velocity(p: AnyArray, pdot: AnyArray) -> AnyArray:
+def angular_velocity(
+    p: Shaped[AnyArray, "... 4"], pdot: Shaped[AnyArray, "... 4"]
+) -> Shaped[AnyArray, "... 3"]:
     """Return ω′ = 2 L(p) ṗ.
 
     Args:
-        p: Euler parameters (..., 4).
-        pdot: their rates ṗ (..., 4) [1/s].
+        pdot: their rates ṗ [1/s].
 
     Returns:
-        ω′ (..., 3) [rad/s], body frame.
+        ω′ [rad/s], body frame.
 
     """
     return np.asarray(2 * (L(p) @ pdot[..., None])[..., 0])
 
 
-def euler_parameter_rate(p: AnyArray, omega: AnyArray) -> AnyArray:
+def euler_parameter_rate(
+    p: Shaped[AnyArray, "... 4"], omega: Shaped[AnyArray, "... 3"]
+) -> Shaped[AnyArray, "... 4"]:
     """Return ṗ = ½ L(p)ᵀ ω′, the inverse of ω′ = 2 L ṗ where pᵀp = 1; then pᵀṗ = 0.
 
     Args:
-        p: Euler parameters (..., 4).
-        omega: angular velocities ω′ (..., 3) [rad/s], body frame.
+        omega: angular velocities ω′ [rad/s], body frame.
 
     Returns:
-        ṗ (..., 4) [1/s].
+        ṗ [1/s].
 
     """
     return np.asarray((L(p).swapaxes(-1, -2) @ omega[..., None])[..., 0] / 2)

@@ -12,7 +12,7 @@ from reference_impl import notes
 from reference_impl.direct import DirectSystem
 from reference_impl.elements import Elements
 from reference_impl.euler_parameters import angular_velocity
-from reference_impl.mechanism import Array, Mechanism
+from reference_impl.mechanism import Array, Float, Mechanism
 
 # r̈ and p̈, (7 N,), at r, p, ṙ, ṗ (N, ·) and joint coordinates (N, 2), near which angles of springs are taken
 Acceleration = Callable[[Array, Array, Array, Array, Array | None], Array]
@@ -22,36 +22,38 @@ Acceleration = Callable[[Array, Array, Array, Array, Array | None], Array]
 class IntegrationResult:
     """Samples of a motion as integrated: p is neither normalised nor projected."""
 
-    t: Array  # (T,) s
-    r: Array  # (T, N, 3) m
-    p: Array  # (T, N, 4) –
-    v: Array  # (T, N, 3) m/s, ṙ
-    pdot: Array  # (T, N, 4) 1/s
+    t: Float[Array, "samples"]  # s
+    r: Float[Array, "samples bodies 3"]  # m
+    p: Float[Array, "samples bodies 4"]
+    v: Float[Array, "samples bodies 3"]  # m/s, ṙ
+    pdot: Float[Array, "samples bodies 4"]  # 1/s
     steps: int  # steps taken
     evaluations: int  # of the right-hand side
 
 
-def pack_state(r: Array, p: Array, v: Array, pdot: Array) -> Array:
+def pack_state(
+    r: Float[Array, "bodies 3"],
+    p: Float[Array, "bodies 4"],
+    v: Float[Array, "bodies 3"],
+    pdot: Float[Array, "bodies 4"],
+) -> Float[Array, "14*bodies"]:
     """Concatenate y = (r, p, ṙ, ṗ) (N6).
 
     Args:
-        r: positions (N, 3) [m].
-        p: Euler parameters (N, 4).
-        v: velocities ṙ (N, 3) [m/s].
-        pdot: rates ṗ (N, 4) [1/s].
-
-    Returns:
-        y (14 N,).
+        r: positions [m].
+        v: velocities ṙ [m/s].
+        pdot: rates ṗ [1/s].
 
     """
     return np.concatenate([x.ravel() for x in (r, p, v, pdot)])
 
 
-def unpack_state(y: Array, n: int) -> tuple[Array, Array, Array, Array]:
+def unpack_state(
+    y: Float[Array, "... entries"], n: int
+) -> tuple[
+    Float[Array, "... n 3"], Float[Array, "... n 4"], Float[Array, "... n 3"], Float[Array, "... n 4"]
+]:
     """Split y = (r, p, ṙ, ṗ) (N6) into its parts.
-
-    Args:
-        y: states (..., 14 N).
 
     Returns:
         r (..., N, 3), p (..., N, 4), ṙ (..., N, 3) and ṗ (..., N, 4).
@@ -62,11 +64,11 @@ def unpack_state(y: Array, n: int) -> tuple[Array, Array, Array, Array]:
     return r, p, v, pdot
 
 
-def direct_acceleration(chain: Mechanism, gamma_defect: float | Array = 0.0) -> Acceleration:
+def direct_acceleration(chain: Mechanism, gamma_defect: float | Float[Array, "c"] = 0.0) -> Acceleration:
     """Return the right-hand side of the direct form.
 
     Args:
-        gamma_defect: added to γ, one number or one per row (c,): a planted fault of known growth (E4).
+        gamma_defect: added to γ, one number or one per row: a planted fault of known growth (E4).
 
     Returns:
         r̈ and p̈ (7 N,) as a function of r, p, ṙ, ṗ.
@@ -97,7 +99,13 @@ def notes_acceleration(chain: Mechanism) -> Acceleration:
     return acceleration
 
 
-def state_scales(chain: Mechanism, r: Array, p: Array, v: Array, pdot: Array) -> Array:
+def state_scales(
+    chain: Mechanism,
+    r: Float[Array, "bodies 3"],
+    p: Float[Array, "bodies 4"],
+    v: Float[Array, "bodies 3"],
+    pdot: Float[Array, "bodies 4"],
+) -> Float[Array, "14*bodies"]:
     """Return the size that each part of y has in this motion, for absolute tolerances.
 
     A coordinate that passes through zero needs no more digits there than the motion as a whole: the
@@ -105,13 +113,13 @@ def state_scales(chain: Mechanism, r: Array, p: Array, v: Array, pdot: Array) ->
     falling through the chain's own length reaches.
 
     Args:
-        r: initial positions (N, 3) [m].
-        p: initial Euler parameters (N, 4).
-        v: initial velocities ṙ (N, 3) [m/s].
-        pdot: initial rates ṗ (N, 4) [1/s].
+        r: initial positions [m].
+        p: initial Euler parameters.
+        v: initial velocities ṙ [m/s].
+        pdot: initial rates ṗ [1/s].
 
     Returns:
-        (14 N,) in the units of y.
+        In the units of y.
 
     """
     span = float(np.sum(chain.length + np.linalg.norm(chain.proximal, axis=1)))
@@ -126,27 +134,27 @@ def state_scales(chain: Mechanism, r: Array, p: Array, v: Array, pdot: Array) ->
 
 def integrate_dop853(
     chain: Mechanism,
-    r: Array,
-    p: Array,
-    v: Array,
-    pdot: Array,
-    times: Array,
+    r: Float[Array, "bodies 3"],
+    p: Float[Array, "bodies 4"],
+    v: Float[Array, "bodies 3"],
+    pdot: Float[Array, "bodies 4"],
+    times: Float[Array, "samples"],
     rtol: float,
     acceleration: Acceleration | None = None,
-    x: Array | None = None,
+    x: Float[Array, "joints 2"] | None = None,
     atol: float | None = None,
 ) -> IntegrationResult:
     """Integrate (N6) by scipy's DOP853; with springs on angles, beside it the angles by their rates.
 
     Args:
-        r: initial positions (N, 3) [m].
-        p: initial Euler parameters (N, 4).
-        v: initial velocities ṙ (N, 3) [m/s].
-        pdot: initial rates ṗ (N, 4) [1/s].
-        times: sample times (T,) [s], ascending from the initial time; samples are dense output.
+        r: initial positions [m].
+        p: initial Euler parameters.
+        v: initial velocities ṙ [m/s].
+        pdot: initial rates ṗ [1/s].
+        times: sample times [s], ascending from the initial time; samples are dense output.
         rtol: relative tolerance, 2.2e-14 at least.
         acceleration: the right-hand side; the direct form by default.
-        x: initial joint coordinates (J, 2) near which the angles of springs are taken; absent: principal
+        x: initial joint coordinates near which the angles of springs are taken; absent: principal
             values.
         atol: absolute tolerance, in the units of y; ``rtol`` times `state_scales` by default.
 

@@ -28,8 +28,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from reference_impl.euler_parameters import I3, A, AnyArray, B, G, L, dot, outer
-from reference_impl.mechanism import Mechanism
+from reference_impl.euler_parameters import I3, A, B, G, L, dot, outer
+from reference_impl.mechanism import AnyArray, Indices, Int, Mechanism, Shaped
 
 VECTORS = "ijkxyzXYZd"  # what rows are products of
 
@@ -38,21 +38,20 @@ VECTORS = "ijkxyzXYZd"  # what rows are products of
 class ConstraintRows:
     """The joints' rows in the order of the joints, c in all."""
 
-    joint: NDArray[np.intp]  # (c,) the joint of the row
-    near: NDArray[np.intp]  # (c,) the near body of the row
-    far: NDArray[np.intp]  # (c,) the far body of the row, −1 the world
-    C: AnyArray  # (c,) m² of a rod, m or 1 of the others
-    r_near: AnyArray  # (c, 3) ∂C/∂r of the near body; of the far body it is −r_near
-    p_near: AnyArray  # (c, 4) ∂C/∂p of the near body
-    p_far: AnyArray  # (c, 4) ∂C/∂p of the far body; 0 for the world
-    gamma: AnyArray  # (c,) C̈ = C_r r̈ + C_p p̈ − γ
-    d: AnyArray  # (J, 3) m, world frame, from the far to the near point of joint k
+    joint: Int[Indices, "c"]  # the joint of the row
+    near: Int[Indices, "c"]  # the near body of the row
+    far: Int[Indices, "c"]  # the far body of the row, −1 the world
+    C: Shaped[AnyArray, "c"]  # m² of a rod, m or 1 of the others
+    r_near: Shaped[AnyArray, "c 3"]  # ∂C/∂r of the near body; of the far body it is −r_near
+    p_near: Shaped[AnyArray, "c 4"]  # ∂C/∂p of the near body
+    p_far: Shaped[AnyArray, "c 4"]  # ∂C/∂p of the far body; 0 for the world
+    gamma: Shaped[AnyArray, "c"]  # C̈ = C_r r̈ + C_p p̈ − γ
+    d: Shaped[AnyArray, "joints 3"]  # m, world frame, from the far to the near point of joint k
 
-    def followed_by(self, joint: NDArray[np.intp], *rows: AnyArray) -> ConstraintRows:
+    def followed_by(self, joint: Int[Indices, "m"], *rows: AnyArray) -> ConstraintRows:
         """Append rows that hold nothing: those of rotors, whose C counts as 0.
 
         Args:
-            joint: (m,) their joints.
             *rows: their near and far bodies (m,), and ∂/∂r near, ∂/∂p near, ∂/∂p far and γ.
 
         """
@@ -60,15 +59,17 @@ class ConstraintRows:
         more = zip(names, (joint, *rows, np.zeros(len(joint))), strict=True)
         return replace(self, **{name: np.concatenate([getattr(self, name), x]) for name, x in more})
 
-    def constraint_rate(self, v: AnyArray, pdot: AnyArray) -> AnyArray:
+    def constraint_rate(
+        self, v: Shaped[AnyArray, "bodies 3"], pdot: Shaped[AnyArray, "bodies 4"]
+    ) -> Shaped[AnyArray, "c"]:
         """Return Ċ = C_r ṙ + C_p ṗ.
 
         Args:
-            v: velocities ṙ (N, 3) [m/s], world frame.
-            pdot: rates ṗ (N, 4) [1/s].
+            v: velocities ṙ [m/s], world frame.
+            pdot: rates ṗ [1/s].
 
         Returns:
-            Ċ (c,): m²/s of a rod, m/s or 1/s of the others.
+            Ċ: m²/s of a rod, m/s or 1/s of the others.
 
         """
         k = self.near
@@ -76,15 +77,15 @@ class ConstraintRows:
         return np.asarray(moved + dot(self.p_near, pdot[k]) + dot(self.p_far, of_far_body(pdot, self.far)))
 
 
-def of_far_body(x: AnyArray, far: NDArray[np.intp]) -> AnyArray:
+def of_far_body(x: Shaped[AnyArray, "bodies ..."], far: Int[Indices, "j"]) -> Shaped[AnyArray, "j ..."]:
     """Return the far bodies' values.
 
     Args:
-        x: values of the bodies (N, ...).
-        far: (j,) bodies, −1 the world.
+        x: values of the bodies.
+        far: bodies, −1 the world.
 
     Returns:
-        (j, ...): zeros for the world.
+        : zeros for the world.
 
     """
     values = x[far]
@@ -92,14 +93,14 @@ def of_far_body(x: AnyArray, far: NDArray[np.intp]) -> AnyArray:
     return values
 
 
-def joint_of_rows(mechanism: Mechanism) -> NDArray[np.intp]:
+def joint_of_rows(mechanism: Mechanism) -> Int[Indices, "c"]:
     """Number the rows of C by their joints.
 
     Args:
         mechanism: bodies and joints; a rod has one row, a ball joint three.
 
     Returns:
-        (c,) the joint of each row, ascending.
+        The joint of each row, ascending.
 
     """
     return np.repeat(np.arange(len(mechanism.kind)), [len(kind.rows) for kind in mechanism.kinds])
@@ -109,22 +110,22 @@ def joint_of_rows(mechanism: Mechanism) -> NDArray[np.intp]:
 class _RowLayout:
     """What the rows of a mechanism have in common at every state."""
 
-    bodies: NDArray[np.intp]  # (2, J) near and far body of each joint; for the world body 0, see `s`
-    s: AnyArray  # (2, J, 3) m, their points; 0 for the world, which takes body 0 out: H(p, 0) = 0
-    B: AnyArray  # (2, J, 4, 4) B(s)
-    world_point: AnyArray  # (J, 3) m, the far point where the far body is the world, else 0
-    point_squares: AnyArray  # (J,) m²: sᵀs of both points less ℓ²
+    bodies: Int[Indices, "2 joints"]  # near and far body of each joint; for the world body 0, see `s`
+    s: Shaped[AnyArray, "2 joints 3"]  # m, their points; 0 for the world, which takes body 0 out: H(p, 0) = 0
+    B: Shaped[AnyArray, "2 joints 4 4"]  # B(s)
+    world_point: Shaped[AnyArray, "joints 3"]  # m, the far point where the far body is the world, else 0
+    point_squares: Shaped[AnyArray, "joints"]  # m²: sᵀs of both points less ℓ²
     rods: NDArray[np.intp] | slice  # joints that are rods; all of them as a slice, which copies nothing
     rod_rows: NDArray[np.intp]  # their rows
-    joint: NDArray[np.intp]  # (c,) the joint of each row
-    near: NDArray[np.intp]  # (c,) its near body
-    far: NDArray[np.intp]  # (c,) its far body, −1 the world
-    product_rows: NDArray[np.intp]  # (k,) the rows that are products of `factors`
-    factors: NDArray[np.intp]  # (2, k) u and w of these rows, places in VECTORS
-    turned: NDArray[np.intp]  # (t,) joints that have axes
-    axes: AnyArray  # (2, t, 3, 3) h and f in the near and far body, rows; 0 for the world
-    B_of_axes: AnyArray  # (2, t, 3, 4, 4) B of the axes
-    world_axes: AnyArray  # (t, 3, 3) f where the far body is the world, else 0
+    joint: Int[Indices, "c"]  # the joint of each row
+    near: Int[Indices, "c"]  # its near body
+    far: Int[Indices, "c"]  # its far body, −1 the world
+    product_rows: Int[Indices, "k"]  # the rows that are products of `factors`
+    factors: Int[Indices, "2 k"]  # u and w of these rows, places in VECTORS
+    turned: Int[Indices, "t"]  # joints that have axes
+    axes: Shaped[AnyArray, "2 t 3 3"]  # h and f in the near and far body, rows; 0 for the world
+    B_of_axes: Shaped[AnyArray, "2 t 3 4 4"]  # B of the axes
+    world_axes: Shaped[AnyArray, "t 3 3"]  # f where the far body is the world, else 0
 
 
 @lru_cache(maxsize=64)  # mechanisms are never changed, and a run uses the same one ten thousand times
@@ -162,15 +163,18 @@ def _row_layout(mechanism: Mechanism) -> _RowLayout:
 
 
 def constraint_rows(
-    mechanism: Mechanism, r: AnyArray, p: AnyArray, v: AnyArray, pdot: AnyArray
+    mechanism: Mechanism,
+    r: Shaped[AnyArray, "bodies 3"],
+    p: Shaped[AnyArray, "bodies 4"],
+    v: Shaped[AnyArray, "bodies 3"],
+    pdot: Shaped[AnyArray, "bodies 4"],
 ) -> ConstraintRows:
     """Evaluate C, C_r, C_p and γ of every joint (S1–S4, D2–D6 for rods; L1–L3 for the others).
 
     Args:
-        r: positions (N, 3) [m], world frame.
-        p: Euler parameters (N, 4).
-        v: velocities ṙ (N, 3) [m/s], world frame.
-        pdot: rates ṗ (N, 4) [1/s].
+        r: positions [m], world frame.
+        v: velocities ṙ [m/s], world frame.
+        pdot: rates ṗ [1/s].
 
     Returns:
         The rows in the order of the joints, on or off the constraints.

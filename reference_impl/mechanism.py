@@ -7,11 +7,17 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from reference_impl.arrays import AnyArray as AnyArray
+from reference_impl.arrays import Array as Array
+from reference_impl.arrays import Bool as Bool
+from reference_impl.arrays import Flags as Flags
+from reference_impl.arrays import Float as Float
+from reference_impl.arrays import Indices as Indices
+from reference_impl.arrays import Int as Int
+from reference_impl.arrays import Shaped as Shaped
 from reference_impl.joint_kinds import BALL, KINDS, ROD, JointKind, Kind
 
-Array = NDArray[np.float64]
 ZERO_INERTIA = 1e-14  # a principal moment that is this part of the largest is the rounding of 0
 CHAIN_FIELDS = (
     "mass", "inertia", "proximal", "distal", "length",
@@ -41,38 +47,40 @@ class Mechanism:
     first).  Joints k ≥ N close loops, between any two bodies or a body and the world; J joints in all, as
     many as bodies in a tree.  A "rod" is the notes' massless rigid rod with a ball joint at both ends, a
     "ball" its limit ℓ → 0 (E1).  A chain, each body on the one before and the first on the world's origin, is
-    made by `chain`; N = 1 and N = 2 on rods are the notes' own pendulums.
+    made by `chain`; N = 1 and N = 2 on rods are the notes' own pendulums.  Leading axes are a batch.
     """
 
-    mass: Array  # (N,) kg
-    inertia: Array  # (N, 3, 3) kg m², J about the centre of mass, body frame
+    mass: Float[Array, "*#batch bodies"]  # kg
+    inertia: Float[Array, "*#batch bodies 3 3"]  # kg m², J about the centre of mass, body frame
     kind: tuple[Kind, ...]  # (J,) of the joints
-    body: NDArray[np.intp]  # (J, 2) far and near body of each joint; body[k, 0] < body[k, 1] = k in the tree
-    point: Array  # (J, 2, 3) m, far and near point of each joint, each in the frame of its body
-    turn: Array  # (J, 2, 4) unit quaternions: the joint's axes in the far and the near body
-    length: Array  # (J,) m, ℓ of a rod, 0 for other joints
-    gravity: Array  # (3,) m/s², world frame
-    force: Array  # (N, 3) N, constant applied force at the centre of mass, world frame
-    moment: Array  # (N, 3) N m, constant applied moment n′, body frame
-    drag_force: Array  # (N,) N s/m, c_t: F = −c_t ṙ at the centre of mass
-    drag_moment: Array  # (N,) N m s, c_r: n′ = −c_r ω′
+    body: Int[Indices, "joints 2"]  # far and near; in the tree body[k, 0] < body[k, 1] = k
+    point: Float[Array, "*#batch joints 2 3"]  # m, far and near, each in the frame of its body
+    turn: Float[Array, "*#batch joints 2 4"]  # unit quaternions: the joint's axes in both bodies
+    length: Float[Array, "*#batch joints"]  # m, ℓ of a rod, 0 for other joints
+    gravity: Float[Array, "*#batch 3"]  # m/s², world frame
+    force: Float[Array, "*#batch bodies 3"]  # N, constant applied force at the centre of mass, world frame
+    moment: Float[Array, "*#batch bodies 3"]  # N m, constant applied moment n′, body frame
+    drag_force: Float[Array, "*#batch bodies"]  # N s/m, c_t: F = −c_t ṙ at the centre of mass
+    drag_moment: Float[Array, "*#batch bodies"]  # N m s, c_r: n′ = −c_r ω′
     # Passive elements of the scalar coordinates φ of each joint, zeros where there are none; of a ball joint
     # the first number holds about every axis, and φ is the rotation vector of the near body in the far one.
-    armature: Array = field(
-        default_factory=_no_pairs
-    )  # (N, 2) kg m² or kg, a: rotors that turn with φ̇, ½ a φ̇²
-    damping: Array = field(default_factory=_no_pairs)  # N m s or N s/m, c: −c φ̇
-    stiffness: Array = field(default_factory=_no_pairs)  # N m or N/m, k: −k (φ − φ₀)
-    rest: Array = field(default_factory=_no_pairs)  # rad or m, φ₀
-    effort: Array = field(default_factory=_no_pairs)  # N m or N, constant, on the near body along φ
-    # K springs and dampers between two points: tension k (l − l₀) + c l̇ at the distance l
-    spring_body: NDArray[np.intp] = field(default_factory=lambda: np.zeros((0, 2), np.intp))  # (K, 2), −1
-    spring_point: Array = field(
-        default_factory=lambda: np.zeros((0, 2, 3))
-    )  # (K, 2, 3) m, each in the frame of its body, or of the world
-    spring_stiffness: Array = field(default_factory=_no_numbers)  # (K,) N/m
-    spring_damping: Array = field(default_factory=_no_numbers)  # (K,) N s/m
-    spring_length: Array = field(default_factory=_no_numbers)  # (K,) m, l₀
+    # kg m² or kg, a: rotors that turn with φ̇, ½ a φ̇²
+    armature: Float[Array, "*#batch joints coordinates"] = field(default_factory=_no_pairs)
+    # N m s or N s/m, c: −c φ̇
+    damping: Float[Array, "*#batch joints coordinates"] = field(default_factory=_no_pairs)
+    # N m or N/m, k: −k (φ − φ₀)
+    stiffness: Float[Array, "*#batch joints coordinates"] = field(default_factory=_no_pairs)
+    rest: Float[Array, "*#batch joints coordinates"] = field(default_factory=_no_pairs)  # rad or m, φ₀
+    # N m or N, constant, on the near body along φ
+    effort: Float[Array, "*#batch joints coordinates"] = field(default_factory=_no_pairs)
+    # springs and dampers between two points, each of a body or of the world (−1): tension k (l − l₀) + c l̇ at
+    # the distance l
+    spring_body: Int[Indices, "springs 2"] = field(default_factory=lambda: np.zeros((0, 2), np.intp))
+    # m, each in the frame of its body, or of the world
+    spring_point: Float[Array, "*#batch springs 2 3"] = field(default_factory=lambda: np.zeros((0, 2, 3)))
+    spring_stiffness: Float[Array, "*#batch springs"] = field(default_factory=_no_numbers)  # N/m
+    spring_damping: Float[Array, "*#batch springs"] = field(default_factory=_no_numbers)  # N s/m
+    spring_length: Float[Array, "*#batch springs"] = field(default_factory=_no_numbers)  # m, l₀
 
     def __post_init__(self) -> None:
         """Give joints without passive elements zeros, and all elements a column per coordinate."""
@@ -88,30 +96,30 @@ class Mechanism:
     @classmethod
     def chain(
         cls,
-        mass: Array,
-        inertia: Array,
-        proximal: Array,
-        distal: Array,
-        length: Array,
-        gravity: Array,
-        force: Array,
-        moment: Array,
-        drag_force: Array,
-        drag_moment: Array,
+        mass: Float[Array, "bodies"],
+        inertia: Float[Array, "bodies 3 3"],
+        proximal: Float[Array, "bodies 3"],
+        distal: Float[Array, "bodies 3"],
+        length: Float[Array, "bodies"],
+        gravity: Float[Array, "3"],
+        force: Float[Array, "bodies 3"],
+        moment: Float[Array, "bodies 3"],
+        drag_force: Float[Array, "bodies"],
+        drag_moment: Float[Array, "bodies"],
     ) -> Mechanism:
         """Make an open chain on rods and ball joints, hung from the world's origin.
 
         Args:
-            mass: (N,) [kg].
-            inertia: (N, 3, 3) about the centres of mass, body frames [kg m²].
-            proximal: (N, 3) the joint of body k: the notes' s_1 of body 1, s_3 of body 2; body frame [m].
-            distal: (N, 3) the joint of body k+1 on body k: s_2; body frame, unused for the last body [m].
-            length: (N,) of the rods, 0 for a ball joint [m].
-            gravity: (3,) world frame [m/s²].
-            force: (N, 3) constant applied forces at the centres of mass, world frame [N].
-            moment: (N, 3) constant applied moments n′, body frame [N m].
-            drag_force: (N,) c_t [N s/m].
-            drag_moment: (N,) c_r [N m s].
+            mass: [kg].
+            inertia: about the centres of mass, body frames [kg m²].
+            proximal: the joint of body k: the notes' s_1 of body 1, s_3 of body 2; body frame [m].
+            distal: the joint of body k+1 on body k: s_2; body frame, unused for the last body [m].
+            length: of the rods, 0 for a ball joint [m].
+            gravity: world frame [m/s²].
+            force: constant applied forces at the centres of mass, world frame [N].
+            moment: constant applied moments n′, body frame [N m].
+            drag_force: c_t [N s/m].
+            drag_moment: c_r [N m s].
 
         """
         k = np.arange(len(length))
@@ -212,13 +220,13 @@ class Mechanism:
         return _tree_of(self) if self.has_loops else self
 
     @property
-    def proximal(self) -> Array:
-        """(J, 3) m, body frame: the point by which body k hangs, the near point of joint k."""
+    def proximal(self) -> Float[Array, "... 3"]:
+        """The point by which body k hangs, the near point of joint k [m], body frame."""
         return self.point[:, 1]
 
     @property
-    def distal(self) -> Array:
-        """(N, 3) m, body frame: the point of body k on which body k+1 of a chain hangs; 0 for the last."""
+    def distal(self) -> Float[Array, "... 3"]:
+        """The point of body k on which body k+1 of a chain hangs [m], body frame; 0 for the last."""
         return np.concatenate([self.point[1:, 0], np.zeros_like(self.point[:1, 0])])
 
     @property
@@ -227,13 +235,13 @@ class Mechanism:
         return int(self.armature.shape[1])
 
     @property
-    def rods(self) -> NDArray[np.bool_]:
-        """(J,) True where joint k is a rod."""
+    def rods(self) -> Bool[Flags, "joints"]:
+        """True where joint k is a rod."""
         return np.array([kind.holds_distance for kind in self.kinds], bool)
 
     @property
-    def free(self) -> NDArray[np.bool_]:
-        """(J,) True where joint k leaves its body free."""
+    def free(self) -> Bool[Flags, "joints"]:
+        """True where joint k leaves its body free."""
         return np.array([kind.holds_nothing for kind in self.kinds], bool)
 
     @property

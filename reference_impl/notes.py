@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from reference_impl.direct import check_state_solvable, solve_dense
-from reference_impl.euler_parameters import A, A_rate, AnyArray, B, G, H, L, outer
-from reference_impl.mechanism import Array, Mechanism
+from reference_impl.euler_parameters import A, A_rate, B, G, H, L, outer
+from reference_impl.mechanism import AnyArray, Array, Float, Mechanism, Shaped
 
 Number = Any  # float, complex or exact
 
@@ -22,11 +22,11 @@ Number = Any  # float, complex or exact
 class SinglePendulum(NamedTuple):
     """One state of the single pendulum, on or off the constraints, and its equations (S1–S5)."""
 
-    r: AnyArray  # (3,) m, centre of mass, world frame
-    p: AnyArray  # (4,) Euler parameters
-    rdot: AnyArray  # (3,) m/s
-    pdot: AnyArray  # (4,) 1/s
-    s1: AnyArray  # (3,) m, attachment of the rod, body frame
+    r: Shaped[AnyArray, "3"]  # m, centre of mass, world frame
+    p: Shaped[AnyArray, "4"]  # Euler parameters
+    rdot: Shaped[AnyArray, "3"]  # m/s
+    pdot: Shaped[AnyArray, "4"]  # 1/s
+    s1: Shaped[AnyArray, "3"]  # m, attachment of the rod, body frame
     ell: Number  # m, length of the rod; 0 makes S singular (E1)
 
     @property
@@ -36,14 +36,14 @@ class SinglePendulum(NamedTuple):
         return r @ r + 2 * (r @ A(p) @ s1) + s1 @ s1 - ell * ell
 
     @property
-    def C_r(self) -> AnyArray:
-        """(S2) C_r = 2 rᵀ + 2 s₁ᵀAᵀ, (3,) [m]."""
+    def C_r(self) -> Shaped[AnyArray, "3"]:
+        """(S2) C_r = 2 rᵀ + 2 s₁ᵀAᵀ [m]."""
         r, p, _, _, s1, _ = self
         return np.asarray(2 * r + 2 * (s1 @ A(p).T))
 
     @property
-    def C_p(self) -> AnyArray:
-        """(S3) C_p = 4 rᵀ (G B(s₁) + s₁ pᵀ), (4,) [m²]."""
+    def C_p(self) -> Shaped[AnyArray, "4"]:
+        """(S3) C_p = 4 rᵀ (G B(s₁) + s₁ pᵀ) [m²]."""
         r, p, _, _, s1, _ = self
         return np.asarray(4 * (r @ (G(p) @ B(s1) + outer(s1, p))))
 
@@ -61,8 +61,8 @@ class SinglePendulum(NamedTuple):
         return self.p @ self.p - 1
 
     @property
-    def C_Ep(self) -> AnyArray:
-        """(S5) C_{E,p} = 2 pᵀ, (4,)."""
+    def C_Ep(self) -> Shaped[AnyArray, "4"]:
+        """(S5) C_{E,p} = 2 pᵀ."""
         return np.asarray(2 * self.p)
 
     @property
@@ -74,12 +74,12 @@ class SinglePendulum(NamedTuple):
 class DoublePendulum(NamedTuple):
     """One state of the double pendulum, on or off the constraints, and its equations (D2–D6)."""
 
-    r: AnyArray  # (2, 3) m, centres of mass, world frame
-    p: AnyArray  # (2, 4) Euler parameters
-    rdot: AnyArray  # (2, 3) m/s
-    pdot: AnyArray  # (2, 4) 1/s
-    s: AnyArray  # (3, 3) m, s₁, s₂, s₃, body frames
-    ell: AnyArray  # (2,) m, lengths of the rods
+    r: Shaped[AnyArray, "2 3"]  # m, centres of mass, world frame
+    p: Shaped[AnyArray, "2 4"]  # Euler parameters
+    rdot: Shaped[AnyArray, "2 3"]  # m/s
+    pdot: Shaped[AnyArray, "2 4"]  # 1/s
+    s: Shaped[AnyArray, "3 3"]  # m, s₁, s₂, s₃, body frames
+    ell: Shaped[AnyArray, "2"]  # m, lengths of the rods
 
     @property
     def bodies(self) -> list[SinglePendulum]:
@@ -88,8 +88,8 @@ class DoublePendulum(NamedTuple):
         return [SinglePendulum(*of_body) for of_body in zip(*self[:4], attachments, self.ell, strict=True)]
 
     @property
-    def C(self) -> AnyArray:
-        """(S1, D2) C, (2,) [m²]: C₂ = dᵀd − ℓ₂² expanded, with s₂ᵀs₂ and s₃ᵀs₃ (E2)."""
+    def C(self) -> Shaped[AnyArray, "2"]:
+        """(S1, D2) C [m²]: C₂ = dᵀd − ℓ₂² expanded, with s₂ᵀs₂ and s₃ᵀs₃ (E2)."""
         (r1, r2), (p1, p2), _, _, (_, s2, s3), (_, ell2) = self
         A1, A2 = A(p1), A(p2)
         C2 = r1 @ r1 - 2 * (r1 @ r2) + r2 @ r2 + 2 * ((r1 - r2) @ (A1 @ s2 - A2 @ s3))
@@ -97,30 +97,30 @@ class DoublePendulum(NamedTuple):
         return np.array([self.bodies[0].C, C2])
 
     @property
-    def C_r(self) -> AnyArray:
-        """(S2, D3) C_r, (2, 6) [m]: ∂C₂/∂r₁ = 2 (r₁ − r₂)ᵀ + 2 (A₁s₂ − A₂s₃)ᵀ = −∂C₂/∂r₂."""
+    def C_r(self) -> Shaped[AnyArray, "2 6"]:
+        """(S2, D3) C_r [m]: ∂C₂/∂r₁ = 2 (r₁ − r₂)ᵀ + 2 (A₁s₂ − A₂s₃)ᵀ = −∂C₂/∂r₂."""
         (r1, r2), (p1, p2), _, _, (_, s2, s3), _ = self
         C2_r1 = 2 * (r1 - r2) + 2 * (A(p1) @ s2 - A(p2) @ s3)
         return np.block([[self.bodies[0].C_r, 0 * r2], [C2_r1, -C2_r1]])
 
     @property
-    def C_p(self) -> AnyArray:
-        """(S3, D4) C_p, (2, 8) [m²], with H(p, s) = G(p) B(s) + s pᵀ."""
+    def C_p(self) -> Shaped[AnyArray, "2 8"]:
+        """(S3, D4) C_p [m²], with H(p, s) = G(p) B(s) + s pᵀ."""
         (r1, r2), (p1, p2), _, _, (_, s2, s3), _ = self
         C2_p1 = +4 * ((r1 - r2) @ H(p1, s2)) - 4 * (s3 @ A(p2).T @ H(p1, s2))
         C2_p2 = -4 * ((r1 - r2) @ H(p2, s3)) - 4 * (s2 @ A(p1).T @ H(p2, s3))
         return np.block([[self.bodies[0].C_p, 0 * p2], [C2_p1, C2_p2]])
 
     @property
-    def C2_r_rate(self) -> AnyArray:
-        """(D5) d_t(∂C₂/∂r), (6,) [m/s]: 2 (ṙ₁ − ṙ₂)ᵀ + 4 (s₂ᵀL̇₁G₁ᵀ − s₃ᵀL̇₂G₂ᵀ) = −d_t(∂C₂/∂r₂)."""
+    def C2_r_rate(self) -> Shaped[AnyArray, "6"]:
+        """(D5) d_t(∂C₂/∂r) [m/s]: 2 (ṙ₁ − ṙ₂)ᵀ + 4 (s₂ᵀL̇₁G₁ᵀ − s₃ᵀL̇₂G₂ᵀ) = −d_t(∂C₂/∂r₂)."""
         _, (p1, p2), (rdot1, rdot2), (pdot1, pdot2), (_, s2, s3), _ = self
         C2_r1_rate = 2 * (rdot1 - rdot2) + 4 * (s2 @ L(pdot1) @ G(p1).T - s3 @ L(pdot2) @ G(p2).T)
         return np.concatenate([C2_r1_rate, -C2_r1_rate])
 
     @property
-    def C2_p_rate(self) -> AnyArray:
-        """(D6) d_t(∂C₂/∂p), (8,) [m²/s], with Ḣ(p, s) = H(ṗ, s) and Ȧᵀ = 2 L̇ Gᵀ (E3)."""
+    def C2_p_rate(self) -> Shaped[AnyArray, "8"]:
+        """(D6) d_t(∂C₂/∂p) [m²/s], with Ḣ(p, s) = H(ṗ, s) and Ȧᵀ = 2 L̇ Gᵀ (E3)."""
         (r1, r2), (p1, p2), (rdot1, rdot2), (pdot1, pdot2), (_, s2, s3), _ = self
         A1, A2, A1dot, A2dot = A(p1), A(p2), A_rate(p1, pdot1), A_rate(p2, pdot2)
         H1, H2, H1dot, H2dot = H(p1, s2), H(p2, s3), H(pdot1, s2), H(pdot2, s3)
@@ -131,40 +131,37 @@ class DoublePendulum(NamedTuple):
         return np.concatenate([C2_p1_rate, C2_p2_rate])
 
     @property
-    def gamma(self) -> AnyArray:
-        """(N3) γ = −d_t(C_r) ṙ − d_t(C_p) ṗ, (2,) [m²/s²]: γ₁ by (S4), γ₂ by (D5, D6)."""
+    def gamma(self) -> Shaped[AnyArray, "2"]:
+        """(N3) γ = −d_t(C_r) ṙ − d_t(C_p) ṗ [m²/s²]: γ₁ by (S4), γ₂ by (D5, D6)."""
         gamma_2 = -self.C2_r_rate @ self.rdot.ravel() - self.C2_p_rate @ self.pdot.ravel()
         return np.array([self.bodies[0].gamma, gamma_2])
 
 
-def block_diagonal(blocks: Array) -> Array:
-    """Put matrices on the diagonal of one; scipy's block_diag would take two fifths of `solve_system`.
-
-    Args:
-        blocks: (n, i, j).
-
-    Returns:
-        (n i, n j), zero beside the blocks.
-
-    """
+def block_diagonal(blocks: Shaped[AnyArray, "n i j"]) -> Shaped[AnyArray, "n*i n*j"]:
+    """Put matrices on the diagonal of one; scipy's block_diag would take two fifths of `solve_system`."""
     n, i, j = blocks.shape
     matrix = np.zeros((n, i, n, j), blocks.dtype)
     matrix[np.arange(n), :, np.arange(n)] = blocks
     return matrix.reshape(n * i, n * j)
 
 
-def assemble_system(chain: Mechanism, r: Array, p: Array, v: Array, pdot: Array) -> tuple[Array, Array]:
+def assemble_system(
+    chain: Mechanism,
+    r: Shaped[AnyArray, "bodies 3"],
+    p: Shaped[AnyArray, "bodies 4"],
+    v: Shaped[AnyArray, "bodies 3"],
+    pdot: Shaped[AnyArray, "bodies 4"],
+) -> tuple[Shaped[AnyArray, "9*bodies 9*bodies"], Shaped[AnyArray, "9*bodies"]]:
     """Assemble S and b of (N5) for one body (S1–S5) or two (D1–D6); every joint is read as a rod.
 
     Args:
         chain: the pendulum, N = 1 or 2.
-        r: positions (N, 3) [m], world frame.
-        p: Euler parameters (N, 4).
-        v: velocities ṙ (N, 3) [m/s], world frame.
-        pdot: rates ṗ (N, 4) [1/s].
+        r: positions [m], world frame.
+        v: velocities ṙ [m/s], world frame.
+        pdot: rates ṗ [1/s].
 
     Returns:
-        S (9 N, 9 N) and b (9 N,), for x = (r̈, p̈, λ, λ_E).
+        S and b, for x = (r̈, p̈, λ, λ_E).
 
     Raises:
         ValueError: the chain has more than two bodies.
@@ -204,18 +201,23 @@ def assemble_system(chain: Mechanism, r: Array, p: Array, v: Array, pdot: Array)
     return S, np.concatenate(b)
 
 
-def solve_system(chain: Mechanism, r: Array, p: Array, v: Array, pdot: Array) -> Array:
+def solve_system(
+    chain: Mechanism,
+    r: Float[Array, "bodies 3"],
+    p: Float[Array, "bodies 4"],
+    v: Float[Array, "bodies 3"],
+    pdot: Float[Array, "bodies 4"],
+) -> Float[Array, "9*bodies"]:
     """Solve (N5) for x = (r̈, p̈, λ, λ_E).
 
     Args:
         chain: the pendulum, N = 1 or 2.
-        r: positions (N, 3) [m], world frame.
-        p: Euler parameters (N, 4).
-        v: velocities ṙ (N, 3) [m/s], world frame.
-        pdot: rates ṗ (N, 4) [1/s].
+        r: positions [m], world frame.
+        v: velocities ṙ [m/s], world frame.
+        pdot: rates ṗ [1/s].
 
     Returns:
-        (9 N,) r̈ [m/s²], p̈ [1/s²], λ [N/m] and λ_E.
+        r̈ [m/s²], p̈ [1/s²], λ [N/m] and λ_E.
 
     Raises:
         SingularSystem: S is singular; the message names the body and the cause (E1, E7).

@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from plumbline.model.datatypes import Array
+from plumbline.model.datatypes import AnyArray, Array, Float, Indices, Int, Shaped
 
 STEPS_PER_DECADE = 500  # log-scale curves are rounded to 10^(1/500), 0.46 %
 LOWEST_DECADE = -40.0  # decade of code 2; code 0 is "no number", code 1 an exact zero
 
 
-def bucket_edges(count: int, points: int) -> np.ndarray:
+def bucket_edges(count: int, points: int) -> Int[Indices, "edges"]:
     """Divide samples into buckets of consecutive ones.
 
     Args:
@@ -35,30 +35,29 @@ def bucket_edges(count: int, points: int) -> np.ndarray:
     return np.unique(np.linspace(0, count, points // 2 + 1).astype(int))
 
 
-def decimate_times(t: Array, points: int) -> Array:
+def decimate_times(t: Float[Array, "n"], points: int) -> Float[Array, "m"]:
     """Return the times that go with the values of `decimate`: first and last of each bucket.
 
     Args:
-        t: (n,) times [s].
+        t: times [s].
         points: number of values that may remain.
 
     Returns:
-        (m,) times [s], m at most ``points``.
+        Times [s], m at most ``points``.
 
     """
     edges = bucket_edges(len(t), points)
     return t if len(edges) == len(t) + 1 else np.stack([t[edges[:-1]], t[edges[1:] - 1]], 1).ravel()
 
 
-def decimate(y: Array, points: int) -> Array:
+def decimate(y: Float[Array, "n"], points: int) -> Float[Array, "m"]:
     """Keep the minimum and maximum of each bucket, in the order they occur, so that no peak is lost.
 
     Args:
-        y: (n,) values.
         points: number of values that may remain.
 
     Returns:
-        (m,) values, m at most ``points``; a bucket with a value that is not finite ends in NaN.
+        Values, m at most ``points``; a bucket with a value that is not finite ends in NaN.
 
     """
     edges = bucket_edges(len(y), points)
@@ -76,14 +75,11 @@ def decimate(y: Array, points: int) -> Array:
     return out.ravel()
 
 
-def log_scale_codes(y: Array) -> np.ndarray:
+def log_scale_codes(y: Float[Array, "n"]) -> Shaped[AnyArray, "n"]:
     """Encode magnitudes on a log scale, with a relative error of at most 0.24 %.
 
-    Args:
-        y: (n,) values.
-
     Returns:
-        (n,) uint16: 0 for not finite, 1 for exactly zero, else 2 + 500 (log10 |y| + 40).
+        uint16: 0 for not finite, 1 for exactly zero, else 2 + 500 (log10 |y| + 40).
 
     """
     size = np.abs(np.asarray(y, dtype=float))
@@ -101,7 +97,7 @@ class ChunkBuilder:
         self._parts: list[bytes] = []
         self._size = 0
 
-    def add(self, array: np.ndarray) -> dict[str, list[Any]]:
+    def add(self, array: Shaped[AnyArray, "..."]) -> dict[str, list[Any]]:
         """Store an array.
 
         Args:

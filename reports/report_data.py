@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from plumbline.judging.rows import RUN_FAMILY, SHOWN_STYLES
-from plumbline.model.datatypes import KINDS, Array, Model, State
+from plumbline.model.datatypes import KINDS, Array, Float, Model, State
 from plumbline.model.invariants import DEPARTURE, first_departure
 from plumbline.model.kinematics import quaternion_conjugate, quaternion_product, rotation_matrix
 from plumbline.model.loops import cut_open, determinate_projectors, singular_values
@@ -377,15 +377,15 @@ def _run_poses(poses: Columns, rows: np.ndarray, n: int) -> tuple[Array, Array, 
         return r, p / np.linalg.norm(p, axis=-1, keepdims=True), poses["t"][order][::n].astype(float)
 
 
-def rotation_vector(p: Array, p0: Array) -> Array:
+def rotation_vector(p: Float[Array, "... 4"], p0: Float[Array, "... 4"]) -> Float[Array, "... 3"]:
     """Return the rotation between two attitudes, exact for tiny angles.
 
     Args:
-        p: (..., 4) unit quaternions, body to world.
-        p0: (..., 4) unit quaternions from which the rotation starts.
+        p: unit quaternions, body to world.
+        p0: unit quaternions from which the rotation starts.
 
     Returns:
-        (..., 3) rotation vectors in the world frame [rad]: p = exp(vector / 2) p0.
+        Rotation vectors in the world frame [rad]: p = exp(vector / 2) p0.
 
     """
     q = quaternion_product(p, quaternion_conjugate(p0))

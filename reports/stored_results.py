@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from plumbline.model.datatypes import Indices, Int
 from plumbline.storage.results_store import read_results, read_table
 from plumbline.storage.script_index import read_script_index, scripts_folder
 
@@ -139,11 +140,11 @@ def _clean_texts(values: np.ndarray) -> np.ndarray:
     return np.array([clean[text] for text in texts], dtype=object)
 
 
-def group_rows(columns: Columns, *by: str) -> Iterator[tuple[tuple[str, ...], np.ndarray]]:
+def group_rows(columns: Columns, *by: str) -> Iterator[tuple[tuple[str, ...], Int[Indices, "records"]]]:
     """Group the records of a table by some of its columns.
 
     Args:
-        columns: (n,) arrays by column.
+        columns: arrays by column.
 
     Yields:
         Each distinct combination of values, in order of first appearance, and the indices of its records.

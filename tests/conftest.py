@@ -12,8 +12,12 @@ import re
 
 import pytest
 
-from plumbline.processes.user_cache import user_cache_folder
-from tests.helpers.nightly_tests import SLOW, is_nightly, stale_entries
+from tests.helpers import array_checks
+
+array_checks.install()
+
+from plumbline.processes.user_cache import user_cache_folder  # noqa: E402 (after the checks)
+from tests.helpers.nightly_tests import SLOW, is_nightly, stale_entries  # noqa: E402
 
 os.environ.pop("COLUMNS", None)  # GNU readline sets it for processes of pytest-xdist; lines would wrap
 
@@ -79,6 +83,12 @@ def own_cells(cache_folders, monkeypatch):
     (folder / "engines").symlink_to(user_cache_folder() / "engines")
     monkeypatch.setenv("PLUMBLINE_CACHE", str(folder))
     return folder / "cells"
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item):
+    array_checks.activate(item.path.parent.name)
+    return (yield)
 
 
 def _is_unexpected(report):

@@ -22,6 +22,7 @@ from plumbline.model.datatypes import (
     Array,
     BadInput,
     EngineFailure,
+    Float,
     Integrator,
     JointKind,
     Model,
@@ -184,12 +185,12 @@ class Adapter(ABC):
         return answers
 
     def simulate(
-        self, model: Model, state: State, times: Array, integrator: str, resolution: float
+        self, model: Model, state: State, times: Float[Array, "samples"], integrator: str, resolution: float
     ) -> Trajectory:
         """Simulate from a state and sample at given times; errors are those of `evaluate`.
 
         Args:
-            times: sample times (T,) [s], ascending from 0; multiples of the step for fixed-step methods.
+            times: sample times [s], ascending from 0; multiples of the step for fixed-step methods.
             integrator: name of one of `integrators`.
             resolution: step [s], or relative tolerance, by the integrator's ``kind``.
 
@@ -308,11 +309,11 @@ def check_state(model: Model, state: State) -> None:
             raise BadInput(f"model.{array_name} is not finite")
 
 
-def check_times(times: Array, step: float) -> None:
+def check_times(times: Float[Array, "samples"], step: float) -> None:
     """Check that every sample time is a whole number of steps, to rounding.
 
     Args:
-        times: sample times (T,) [s].
+        times: sample times [s].
         step: step [s].
 
     Raises:
@@ -328,11 +329,11 @@ def check_times(times: Array, step: float) -> None:
         raise BadInput(f"sample times are not multiples of the step {step}")
 
 
-def check_samples(model: Model, times: Array, run: Trajectory, label: str) -> None:
+def check_samples(model: Model, times: Float[Array, "samples"], run: Trajectory, label: str) -> None:
     """Check that a run was sampled at the given times, with finite rows of the right shapes.
 
     Args:
-        times: sample times (T,) [s] that the engine was given.
+        times: sample times [s] that the engine was given.
         run: the trajectory that the engine returned.
         label: engine and integrator, for the message.
 

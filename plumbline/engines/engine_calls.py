@@ -18,6 +18,7 @@ from plumbline.engines.environments import BASE_REQUIREMENTS, declared_attribute
 from plumbline.engines.registry import load_adapter
 from plumbline.model.datatypes import (
     Array,
+    Float,
     Integrator,
     Model,
     State,
@@ -157,14 +158,14 @@ def run_refinement(
     integrator: str,
     model: Model,
     state: State,
-    times: Array,
+    times: Float[Array, "samples"],
     resolutions: Sequence[float],
     is_enough: Callable[[Model, Integrator, Sequence[RefinementRun]], bool] | None = None,
 ) -> RefinementStudy:
     """Simulate the same motion at each resolution; a run that fails is kept with its reason.
 
     Args:
-        times: sample times (T,) [s].
+        times: sample times [s].
         resolutions: steps [s] or relative tolerances, coarse to fine.
         is_enough: asked after every run whether those so far will do; None to run at all resolutions.
 

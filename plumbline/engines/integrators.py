@@ -13,7 +13,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 from scipy.integrate import DOP853
 
-from plumbline.model.datatypes import Array, EngineFailure
+from plumbline.model.datatypes import Array, EngineFailure, Float
 
 Sample = TypeVar("Sample")
 
@@ -21,73 +21,51 @@ Sample = TypeVar("Sample")
 class LieGroupSystem(Protocol):
     """A mechanical system with configurations q (nq,) and velocities v (nv,)."""
 
-    def acceleration(self, q: Array, v: Array) -> Array:
-        """Evaluate the accelerations.
+    def acceleration(self, q: Float[Array, "nq"], v: Float[Array, "nv"]) -> Float[Array, "nv"]:
+        """Evaluate the accelerations."""
 
-        Args:
-            q: configuration (nq,).
-            v: velocity (nv,).
-
-        Returns:
-            v̇ (nv,).
-
-        """
-
-    def integrate(self, q: Array, displacement: Array) -> Array:
+    def integrate(self, q: Float[Array, "nq"], displacement: Float[Array, "nv"]) -> Float[Array, "nq"]:
         """Move a configuration along a tangent vector.
 
-        Args:
-            q: configuration (nq,).
-            displacement: tangent vector (nv,).
-
         Returns:
-            q ⊕ displacement (nq,).
+            q ⊕ displacement.
 
         """
 
-    def exponential_coordinate_rate(self, q: Array, theta: Array, v: Array) -> Array:
+    def exponential_coordinate_rate(
+        self, q: Float[Array, "nq"], theta: Float[Array, "nv"], v: Float[Array, "nv"]
+    ) -> Float[Array, "nv"]:
         """Apply dexp⁻¹ of θ to a velocity.
 
         Args:
-            q: configuration (nq,).
-            theta: exponential coordinates θ (nv,) of a configuration near q.
-            v: velocity (nv,) there.
+            theta: exponential coordinates θ of a configuration near q.
 
         Returns:
-            θ̇ (nv,), with which q ⊕ θ moves at the velocity v.
+            θ̇, with which q ⊕ θ moves at the velocity v.
 
         """
 
-    def configuration_rate(self, q: Array, v: Array) -> Array:
-        """Map a velocity to the rate of the ambient coordinates.
+    def configuration_rate(self, q: Float[Array, "nq"], v: Float[Array, "nv"]) -> Float[Array, "nq"]:
+        """Map a velocity to the rate of the ambient coordinates."""
 
-        Args:
-            q: configuration (nq,).
-            v: velocity (nv,).
-
-        Returns:
-            q̇ (nq,).
-
-        """
-
-    def normalize(self, q: Array) -> Array:
+    def normalize(self, q: Float[Array, "nq"]) -> Float[Array, "nq"]:
         """Project ambient coordinates onto the group.
 
         Args:
-            q: coordinates (nq,) near the group.
+            q: coordinates near the group.
 
         Returns:
-            The point (nq,) of the group nearest to q.
+            The point of the group nearest to q.
 
         """
 
 
-def semi_implicit_euler(system: LieGroupSystem, q: Array, v: Array, h: float) -> tuple[Array, Array]:
+def semi_implicit_euler(
+    system: LieGroupSystem, q: Float[Array, "nq"], v: Float[Array, "nv"], h: float
+) -> tuple[Float[Array, "nq"], Float[Array, "nv"]]:
     """Take one step of v₁ = v + h a(q, v), q₁ = q ⊕ h v₁.
 
     Args:
-        q: configuration (nq,).
-        v: velocity (nv,).
         h: step [s].
 
     """
@@ -95,15 +73,15 @@ def semi_implicit_euler(system: LieGroupSystem, q: Array, v: Array, h: float) ->
     return system.integrate(q, h * v), v
 
 
-def rkmk4(system: LieGroupSystem, q: Array, v: Array, h: float) -> tuple[Array, Array]:
+def rkmk4(
+    system: LieGroupSystem, q: Float[Array, "nq"], v: Float[Array, "nv"], h: float
+) -> tuple[Float[Array, "nq"], Float[Array, "nv"]]:
     """Take one step of the classical Runge–Kutta method in exponential coordinates.
 
     It solves θ̇ = dexp⁻¹(θ) v, v̇ = a(q ⊕ θ, v) from θ = 0 (Munthe-Kaas, Appl. Numer. Math. 29 (1999)
     115–127).  With θ̇ = v instead the order would be 2.
 
     Args:
-        q: configuration (nq,).
-        v: velocity (nv,).
         h: step [s].
 
     Returns:
@@ -121,7 +99,7 @@ def rkmk4(system: LieGroupSystem, q: Array, v: Array, h: float) -> tuple[Array, 
     return move(q, h / 6 * (v + 2 * w2 + 2 * w3 + w4)), v + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
 
 
-def runge_kutta_4(slope: Callable[[Array], Array], y: Array, h: float) -> Array:
+def runge_kutta_4(slope: Callable[[Array], Array], y: Float[Array, "..."], h: float) -> Float[Array, "..."]:
     """Take one step of the classical Runge–Kutta method for ẏ = slope(y).
 
     Args:
@@ -137,13 +115,15 @@ def runge_kutta_4(slope: Callable[[Array], Array], y: Array, h: float) -> Array:
     return np.asarray(y + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4))
 
 
-def sample_steps(step: Callable[[Sample], Sample], start: Sample, times: Array, h: float) -> list[Sample]:
+def sample_steps(
+    step: Callable[[Sample], Sample], start: Sample, times: Float[Array, "samples"], h: float
+) -> list[Sample]:
     """Take steps of fixed size and keep the samples.
 
     Args:
         step: advances a sample (for example q and v) by one step.
         start: the sample at time 0.
-        times: sample times (T,) [s], multiples of ``h`` from 0.
+        times: sample times [s], multiples of ``h`` from 0.
         h: step [s].
 
     Returns:
@@ -159,19 +139,23 @@ def sample_steps(step: Callable[[Sample], Sample], start: Sample, times: Array, 
     return samples
 
 
-def dop853(system: LieGroupSystem, q: Array, v: Array, times: Array, rtol: float) -> tuple[Array, Array, int]:
+def dop853(
+    system: LieGroupSystem,
+    q: Float[Array, "nq"],
+    v: Float[Array, "nv"],
+    times: Float[Array, "samples"],
+    rtol: float,
+) -> tuple[Float[Array, "samples nq"], Float[Array, "samples nv"], int]:
     """Integrate q̇, v̇ in ambient coordinates by SciPy's DOP853, with a step that ends at every sample time.
 
     The integrated q is not normalised; accelerations are evaluated at the normalised q.
 
     Args:
-        q: initial configuration (nq,).
-        v: initial velocity (nv,).
-        times: sample times (T,) [s], ascending from 0.
+        times: sample times [s], ascending from 0.
         rtol: relative tolerance, and the absolute one.
 
     Returns:
-        Configurations (T, nq), velocities (T, nv) and the number of steps.
+        Configurations, velocities and the number of steps.
 
     Raises:
         EngineFailure: the step size became too small; the message is SciPy's.

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from plumbline.importers.neutral_model import NeutralBody, NeutralModel
-from plumbline.model.datatypes import Array
+from plumbline.model.datatypes import Array, Float
 from plumbline.model.kinematics import quaternion_product, rotation_matrix
 
 
@@ -63,13 +63,15 @@ def _lumped(model: NeutralModel) -> tuple[NeutralModel, dict[str, list[tuple[Neu
     return replace(model, bodies=tuple(bodies)), parts
 
 
-def merge_bodies(body: NeutralBody, added: NeutralBody, position: Array, A: Array) -> NeutralBody:
+def merge_bodies(
+    body: NeutralBody, added: NeutralBody, position: Float[Array, "3"], A: Float[Array, "3 3"]
+) -> NeutralBody:
     """Give a body the mass of another one that is fixed to it.
 
     Args:
         added: the body that is fixed to it.
-        position: of the added body's frame (3,) [m] in the carrier's.
-        A: rotation matrix (3, 3), added body → carrier.
+        position: of the added body's frame [m] in the carrier's.
+        A: rotation matrix, added body → carrier.
 
     Returns:
         The carrier with the mass, centre of mass and inertia of both.

@@ -27,7 +27,7 @@ from typing import Literal
 
 import numpy as np
 
-from plumbline.model.datatypes import Array
+from plumbline.model.datatypes import Array, Float
 
 MAX_MAGNITUDE = 1e30  # of a file's SI numbers: beyond it products leave the range where engines can compute
 MIN_INERTIA = 1e-100  # kg, kg m²: below it products lose digits, or vanish
@@ -63,8 +63,8 @@ class ElementaryJoint:
 
     name: str  # unique in the model; a free joint without a name is called "<body>/free"
     kind: JointKind
-    axis: Array  # (3,) – unit, body frame before this joint's motion; zero for ball and free
-    anchor: Array  # (3,) m, body frame; zero for slide and free
+    axis: Float[Array, "3"]  # unit, body frame before this joint's motion; zero for ball and free
+    anchor: Float[Array, "3"]  # m, body frame; zero for slide and free
     reference: float = 0.0  # rad or m: coordinate at which the joint does not move the body
     armature: float = 0.0  # kg m² or kg, added to the diagonal of the mass matrix
     damping: float = 0.0  # N m s/rad or N s/m
@@ -81,12 +81,12 @@ class NeutralBody:
 
     name: str  # unique in the model
     parent: int  # index of the parent, always smaller; −1: the world
-    position: Array  # (3,) m, origin of the body frame in the parent's frame
-    attitude: Array  # (4,) – unit quaternion, scalar first, body frame → parent's frame
+    position: Float[Array, "3"]  # m, origin of the body frame in the parent's frame
+    attitude: Float[Array, "4"]  # unit quaternion, scalar first, body frame → parent's frame
     joints: tuple[ElementaryJoint, ...]
     mass: float  # kg
-    center: Array  # (3,) m, centre of mass in the body frame
-    inertia: Array  # (3, 3) kg m², about the centre of mass, body axes
+    center: Float[Array, "3"]  # m, centre of mass in the body frame
+    inertia: Float[Array, "3 3"]  # kg m², about the centre of mass, body axes
     source: Source = Source("", 0)
     fields: Mapping[str, Source] = field(default_factory=dict)
 
@@ -106,7 +106,7 @@ class NeutralModel:
 
     name: str
     bodies: tuple[NeutralBody, ...]  # depth first: a parent precedes its children
-    gravity: Array  # (3,) m/s², world frame
+    gravity: Float[Array, "3"]  # m/s², world frame
     not_compared: tuple[Feature, ...] = ()
     ambiguous: tuple[Feature, ...] = ()  # what the format leaves open, as links without <inertial>
     gravity_source: Source = Source("", 0)
@@ -139,8 +139,8 @@ class NeutralModel:
 class CanonicalState:
     """Canonical coordinates and velocities of a neutral model."""
 
-    coordinates: Array  # (number of coordinates,)
-    velocities: Array  # (number of velocities,)
+    coordinates: Float[Array, "coordinates"]
+    velocities: Float[Array, "velocities"]
 
 
 MODEL_UNITS = {  # of what is compared, by the name of its row
@@ -168,11 +168,11 @@ class ModelQuantities:
     """
 
     poses: Mapping[str, Array]  # body name → (3, 4): rotation body → world, and origin [m]
-    mass_matrix: Array | None = None  # (n, n) with armature
-    bias_force: Array | None = None  # (n,) h: Coriolis, centrifugal and gravity, on the left
-    gravity_force: Array | None = None  # (n,) h at v = 0
-    passive_force: Array | None = None  # (n,) of dampers and springs, as on the right
-    acceleration: Array | None = None  # (n,) v̇ without friction loss, contacts, limits, actuators
+    mass_matrix: Float[Array, "n n"] | None = None  # with armature
+    bias_force: Float[Array, "n"] | None = None  # h: Coriolis, centrifugal and gravity, on the left
+    gravity_force: Float[Array, "n"] | None = None  # h at v = 0
+    passive_force: Float[Array, "n"] | None = None  # of dampers and springs, as on the right
+    acceleration: Float[Array, "n"] | None = None  # v̇ without friction loss, contacts, limits, actuators
     kinetic_energy: float | None = None  # J: ½ vᵀMv, with armature
     potential_energy: float | None = None  # J: −Σ m g·c of gravity alone, zero at the world's origin
 

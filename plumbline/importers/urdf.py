@@ -25,7 +25,7 @@ from plumbline.importers.neutral_model import (
     Source,
 )
 from plumbline.importers.xml_tree import Element, ModelFileError, parse_numbers
-from plumbline.model.datatypes import Array
+from plumbline.model.datatypes import Array, Float
 from plumbline.model.kinematics import quaternion_product, rotation_matrix
 from plumbline.scenario.line_and_column_errors import Problem, did_you_mean, shorten
 
@@ -315,11 +315,11 @@ def _joint(name: str, kind: JointKind, axis: Array, source: Source, **more: Any)
     return ElementaryJoint(name, kind, axis, np.zeros(3), source=source, **more)
 
 
-def _perpendicular_axes(axis: Array) -> tuple[Array, Array]:
+def _perpendicular_axes(axis: Float[Array, "3"]) -> tuple[Array, Array]:
     """Return two unit vectors that form a right-handed frame with an axis; x and y where it is z.
 
     Args:
-        axis: (3,) a unit vector.
+        axis: a unit vector.
 
     Returns:
         The two vectors (3,).
@@ -331,14 +331,14 @@ def _perpendicular_axes(axis: Array) -> tuple[Array, Array]:
     return first, np.cross(axis, first)
 
 
-def quaternion_from_rpy(rpy: Sequence[float]) -> Array:
+def quaternion_from_rpy(rpy: Sequence[float]) -> Float[Array, "4"]:
     """Turn roll, pitch and yaw about fixed axes into a quaternion: Rz(yaw) Ry(pitch) Rx(roll).
 
     Args:
         rpy: three angles [rad].
 
     Returns:
-        A unit quaternion (4,), scalar first.
+        A unit quaternion, scalar first.
 
     """
     q = np.array([1.0, 0.0, 0.0, 0.0])

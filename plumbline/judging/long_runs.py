@@ -29,7 +29,7 @@ from plumbline.measurements.long_run_study import (
 )
 from plumbline.measurements.order_and_limit import ORDER_MARGIN
 from plumbline.measurements.refinement_study import ROUNDING_PER_STEP
-from plumbline.model.datatypes import Array, Integrator, Model
+from plumbline.model.datatypes import Array, Float, Integrator, Model
 from plumbline.model.invariants import INVARIANT_UNITS
 from plumbline.truth.ground_truth import DETECTABLE_PARAMETER_ERROR
 
@@ -304,14 +304,16 @@ class DriftOrder:
     order_error: float  # standard error of the order
 
     @classmethod
-    def from_blocks(cls, coarse: Array, fine: Array, halvings: float) -> DriftOrder:
+    def from_blocks(
+        cls, coarse: Float[Array, "blocks"], fine: Float[Array, "blocks"], halvings: float
+    ) -> DriftOrder:
         """Fit the order to the drifts of paired blocks.
 
         Its error is the jackknife's: small where the runs follow one motion and their blocks agree.
 
         Args:
-            coarse: (BLOCK_COUNT,) drifts of the coarse run's blocks.
-            fine: (BLOCK_COUNT,) drifts of the fine run's blocks, same unit.
+            coarse: drifts of the coarse run's blocks.
+            fine: drifts of the fine run's blocks, same unit.
             halvings: how many times the resolution halves from one to the other.
 
         Returns:

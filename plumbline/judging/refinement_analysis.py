@@ -19,7 +19,7 @@ from plumbline.measurements.order_and_limit import (
     tightest_tolerance_limit,
 )
 from plumbline.measurements.refinement_study import run_samples
-from plumbline.model.datatypes import Array, Integrator, Model, Trajectory
+from plumbline.model.datatypes import Array, Float, Integrator, Model, Trajectory
 from plumbline.model.invariants import (
     MOTION_UNITS,
     Invariants,
@@ -45,10 +45,13 @@ class RefinementAnalysis:
     # by the names of `MOTION_UNITS`, per run (T, N, ·); NaN where the run failed
     samples: dict[str, list[Array]] = field(init=False)
     motion_scales: dict[str, float] = field(init=False)  # of rounding in them
-    scaled_states: list[Array] = field(init=False)  # per run (T, N, 6): r and ṙ over their scales
+    scaled_states: list[Float[Array, "samples bodies 6"]] = field(
+        init=False
+    )  # per run: r and ṙ over their scales
     invariant_drifts: list[Invariants | None] = field(init=False)
     invariant_scales: dict[str, float] = field(init=False)  # of the true motion, units as `INVARIANT_UNITS`
-    rounding: Array = field(init=False)  # (T,) of a run and its steps' solver, grown, for a scale of 1
+    # of a run and its steps' solver, grown, for a scale of 1
+    rounding: Float[Array, "samples"] = field(init=False)
     observed: ObservedOrder = field(init=False)
     observed_until: float = field(init=False)  # s, end of the window in which the order was observed
 
@@ -78,7 +81,7 @@ class RefinementAnalysis:
         self.observed, self.observed_until = self._observe_order()
 
     @property
-    def times(self) -> Array:
+    def times(self) -> Float[Array, "samples"]:
         """(T,) sample times [s]."""
         return self.truth.trajectory.t
 
@@ -106,11 +109,13 @@ class RefinementAnalysis:
             return "10³ ε G(t)"
         return f"(10³ ε + {self.integrator.solver_rtol:g} of the step's solver × √{self.finest.steps}) G(t)"
 
-    def extrapolated_limit(self, samples: Sequence[Array]) -> ExtrapolatedLimit:
+    def extrapolated_limit(
+        self, samples: Sequence[Float[Array, "samples bodies width"]]
+    ) -> ExtrapolatedLimit:
         """Return the limit at step zero, or the run with the tightest tolerance.
 
         Args:
-            samples: per run (T, N, width) of one quantity.
+            samples: per run of one quantity.
 
         Raises:
             ValueError: fewer than two runs are finite.

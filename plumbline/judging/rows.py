@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
-from plumbline.model.datatypes import Array
+from plumbline.model.datatypes import Array, Float
 
 Level = Literal["state", "step", "invariants", "trajectory", "relations", "model"]
 # hash of an answer's bits, by integrator ("-" at states), quantity and resolution ("" at states)
@@ -296,8 +296,8 @@ def first_decided(candidates: Iterable[_DecidableT]) -> _DecidableT:
 class Deviation:
     """By how much an answer that disagrees is off the truth, state by state or sample by sample."""
 
-    vectors: Array  # (S, n, d) answer − truth, in the quantity's unit
-    tolerance: Array  # (S, n), same unit
+    vectors: Float[Array, "states n d"]  # answer − truth, in the quantity's unit
+    tolerance: Float[Array, "states n"]  # same unit
 
     def is_like(self, other: Deviation) -> bool:
         """Return whether the two answers agree with each other within the sum of their tolerances.

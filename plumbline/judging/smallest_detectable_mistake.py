@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from plumbline.judging.rows import Level, Row, Verdict
 from plumbline.judging.state_level import STATE_UNITS
 from plumbline.measurements.single_steps import MAX_STEP_BODIES, STEP_STATES, step_sizes
-from plumbline.model.datatypes import Array, Model, State, Trajectory
+from plumbline.model.datatypes import Array, Float, Model, State, Trajectory
 from plumbline.model.invariants import (
     INVARIANT_UNITS,
     MOTION_UNITS,
@@ -115,7 +115,7 @@ def scenario_coverage(
     name: str,
     model: Model,
     state: State,
-    times: Array,
+    times: Float[Array, "samples"],
     states: Sequence[State],
     rows: Iterable[Row],
     levels: Sequence[Level] = COVERED_LEVELS,
@@ -124,7 +124,7 @@ def scenario_coverage(
     """Compute the coverage table of one scenario.
 
     Args:
-        times: (T,) its sample times [s].
+        times: its sample times [s].
         states: the states of the levels state and step, the initial one first unless its pose is singular.
         rows: judged rows of the scenario, of correct engines; those that agree count, and only their engines,
             quantities and tolerances.

@@ -29,7 +29,7 @@ from plumbline.judging.rows import (
 )
 from plumbline.judging.state_level import SINGULAR_POSE
 from plumbline.measurements.order_and_limit import ORDER_CHANGE_FACTOR, ORDER_MARGIN
-from plumbline.model.datatypes import Array, Integrator, Model, Trajectory
+from plumbline.model.datatypes import Array, Float, Integrator, Model, Trajectory
 from plumbline.model.invariants import (
     INVARIANT_UNITS,
     MOTION_UNITS,
@@ -197,8 +197,8 @@ class _ComparedQuantity:
     unit: str
     samples: Sequence[Array]  # per run (T, N, ·)
     true: Array
-    truth_uncertainty: Array  # (T,) in ``unit``
-    detectable: Array  # (T,) in ``unit``: effect of the smallest mistake that must be detected
+    truth_uncertainty: Float[Array, "samples"]  # in ``unit``
+    detectable: Float[Array, "samples"]  # in ``unit``: effect of the smallest mistake that must be detected
     limit_error: float  # in ``unit``: of runs that are themselves the limit of softer ones
     scale: float  # of rounding, in ``unit``
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from plumbline.engines.registry import load_adapter
 from plumbline.measurements.order_and_limit import step_unit
-from plumbline.model.datatypes import Array, Integrator, Model, State, Trajectory, Unsupported
+from plumbline.model.datatypes import Array, Float, Integrator, Model, State, Trajectory, Unsupported
 from plumbline.model.invariants import (
     INVARIANT_UNITS,
     compute_invariants,
@@ -65,7 +65,7 @@ class DriftWindow:
 
     max_drift: float
     max_drift_first_half: float  # largest in the first half of the window
-    block_drifts: Array  # (BLOCK_COUNT,) largest distance from the value at the block's beginning
+    block_drifts: Float[Array, "blocks"]  # largest distance from the value at the block's beginning
 
 
 @dataclass(frozen=True, eq=False)

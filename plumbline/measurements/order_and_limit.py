@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from plumbline.model.datatypes import Array, Integrator
+from plumbline.model.datatypes import Array, Float, Integrator
 
 ORDER_MARGIN = 0.1  # two consecutive orders this near to the declared one show it (verification.md)
 ORDER_CHANGE_FACTOR = 3.0  # three consecutive orders this many of their changes away show another order
@@ -71,11 +71,8 @@ def refinement_resolutions(
     return [unit * 2.0**-k for k in range(coarse, fine + 1)]
 
 
-def max_norm(y: Array) -> float:
+def max_norm(y: Float[Array, "... width"]) -> float:
     """Return the largest Euclidean norm over all leading axes.
-
-    Args:
-        y: (…, width) vectors.
 
     Returns:
         The norm; inf where any component is not finite.
@@ -96,14 +93,16 @@ class ObservedOrder:
     differences: tuple[float, ...]  # between consecutive steps
 
 
-def observed_order(ys: Sequence[Array], floor: float, declared: int) -> ObservedOrder:
+def observed_order(
+    ys: Sequence[Float[Array, "samples bodies width"]], floor: float, declared: int
+) -> ObservedOrder:
     """Observe the order from consecutive differences D_k = max |y_k - y_{k+1}|, as log2(D_k / D_{k+1}).
 
     The finest pair of consecutive orders that are both within `ORDER_MARGIN` of the declared one shows that
     order; else the finest three may show one (`extrapolated_order`).
 
     Args:
-        ys: (T, N, width) samples of each run, coarse to fine, steps halving.
+        ys: samples of each run, coarse to fine, steps halving.
         floor: rounding, in the unit of the samples. Only differences above `ROUNDING_FLOOR_FACTOR` times it
             count: rounding changes their order by less than half the margin.
         declared: the method's theoretical order.
@@ -161,12 +160,12 @@ def extrapolated_order(last: Sequence[float], declared: int) -> float | None:
 class ExtrapolatedLimit:
     """The motion at step zero, extrapolated from all runs."""
 
-    y: Array  # (T, N, width)
-    uncertainty: Array  # (T,) running maximum over time, same unit
+    y: Float[Array, "samples bodies width"]
+    uncertainty: Float[Array, "samples"]  # running maximum over time, same unit
     eliminated_powers: int  # how many powers were eliminated
 
 
-def romberg(ys: Sequence[Array], powers: Sequence[int]) -> ExtrapolatedLimit:
+def romberg(ys: Sequence[Float[Array, "samples bodies width"]], powers: Sequence[int]) -> ExtrapolatedLimit:
     """Extrapolate to step zero (Romberg), for errors with known powers of h.
 
     Column m of the scheme has the first m powers eliminated.  Its uncertainty is the larger of its distances
@@ -175,7 +174,7 @@ def romberg(ys: Sequence[Array], powers: Sequence[int]) -> ExtrapolatedLimit:
     takes twice the first distance).  The column with the smallest uncertainty is the limit.
 
     Args:
-        ys: (T, N, width) samples of each run, coarse to fine, steps halving; runs before the last one that is
+        ys: samples of each run, coarse to fine, steps halving; runs before the last one that is
             not finite are left out.
         powers: exponents of h in the error expansion, ascending.
 
@@ -204,11 +203,11 @@ def _column_limit(column: Sequence[Array], m: int, before: Array) -> Extrapolate
     return ExtrapolatedLimit(column[-1], np.maximum.accumulate(np.maximum(*gaps)), m)
 
 
-def tightest_tolerance_limit(ys: Sequence[Array]) -> ExtrapolatedLimit:
+def tightest_tolerance_limit(ys: Sequence[Float[Array, "samples bodies width"]]) -> ExtrapolatedLimit:
     """Return the run with the tightest tolerance as the limit of a method with step control.
 
     Args:
-        ys: (T, N, width) samples of each run, loose to tight.
+        ys: samples of each run, loose to tight.
 
     Returns:
         The tightest run; its uncertainty is the distance to the run before it.

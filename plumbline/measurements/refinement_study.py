@@ -23,7 +23,7 @@ import numpy as np
 from plumbline.engines import engine_calls
 from plumbline.engines.engine_calls import RefinementRun, RefinementStudy
 from plumbline.measurements.order_and_limit import ORDER_MARGIN, max_norm, observed_order, romberg
-from plumbline.model.datatypes import Array, Integrator, Model, State
+from plumbline.model.datatypes import Array, Float, Integrator, Model, State
 from plumbline.model.invariants import INVARIANT_UNITS, compute_invariants, invariant_scales
 from plumbline.truth.ground_truth import RUN_ROUNDING, stretched_length  # constants, no truth
 
@@ -33,12 +33,17 @@ MIN_RUNS = 4  # three differences between consecutive runs, two orders
 
 
 def run_refinement_study(
-    engine: str, integrator: str, model: Model, state: State, times: Array, steps: Sequence[float]
+    engine: str,
+    integrator: str,
+    model: Model,
+    state: State,
+    times: Float[Array, "samples"],
+    steps: Sequence[float],
 ) -> RefinementStudy:
     """Simulate the same motion at each step until the study is resolved.
 
     Args:
-        times: sample times (T,) [s].
+        times: sample times [s].
         steps: steps [s] or relative tolerances, coarse to fine.
 
     Returns:
@@ -91,7 +96,7 @@ def is_resolved(model: Model, integrator: Integrator, runs: Sequence[RefinementR
     return True
 
 
-def run_samples(runs: Sequence[RefinementRun], name: str) -> list[Array]:
+def run_samples(runs: Sequence[RefinementRun], name: str) -> list[Float[Array, "samples bodies width"]]:
     """Collect one field of all runs of a study.
 
     Args:
@@ -99,7 +104,7 @@ def run_samples(runs: Sequence[RefinementRun], name: str) -> list[Array]:
         name: of a field of `Trajectory`.
 
     Returns:
-        Per run (T, N, width); NaN where the run failed. Quaternions and their rates have the signs of the
+        Per run; NaN where the run failed. Quaternions and their rates have the signs of the
         finest run's.
 
     """

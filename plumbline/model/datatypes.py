@@ -17,6 +17,14 @@ import numpy as np
 
 from plumbline.model.step_methods import StepMethod
 from plumbline.processes.exceptions import PlumblineError
+from reference_impl.arrays import AnyArray as AnyArray
+from reference_impl.arrays import Array as Array
+from reference_impl.arrays import Bool as Bool
+from reference_impl.arrays import Flags as Flags
+from reference_impl.arrays import Float as Float
+from reference_impl.arrays import Indices as Indices
+from reference_impl.arrays import Int as Int
+from reference_impl.arrays import Shaped as Shaped
 from reference_impl.joint_kinds import BALL as BALL
 from reference_impl.joint_kinds import CYLINDRICAL as CYLINDRICAL
 from reference_impl.joint_kinds import FREE as FREE
@@ -33,7 +41,6 @@ from reference_impl.mechanism import JOINT_ELEMENTS as JOINT_ELEMENTS
 from reference_impl.mechanism import JOINT_FIELDS as JOINT_FIELDS
 from reference_impl.mechanism import SPRING_FIELDS as SPRING_FIELDS
 from reference_impl.mechanism import ZERO_INERTIA as ZERO_INERTIA
-from reference_impl.mechanism import Array as Array
 from reference_impl.mechanism import Mechanism
 
 Model = Mechanism
@@ -71,15 +78,15 @@ class State:
     `plumbline.model.kinematics.state_from_minimal` makes states.
     """
 
-    p: Array  # (N, 4) –
-    omega: Array  # (N, 3) rad/s, body frame
-    u: Array  # (N, 3) –, world frame
-    udot: Array  # (N, 3) 1/s, world frame
-    r: Array  # (N, 3) m, world frame
-    v: Array  # (N, 3) m/s, world frame: ṙ
-    # (N, 2) rad or m: coordinates of joint k in the order of its kind's motions, angles unwrapped; rates
-    x: Array = field(default_factory=_no_coordinates)
-    xdot: Array = field(default_factory=_no_coordinates)
+    p: Float[Array, "*#batch bodies 4"]
+    omega: Float[Array, "*#batch bodies 3"]  # rad/s, body frame
+    u: Float[Array, "*#batch bodies 3"]  # world frame
+    udot: Float[Array, "*#batch bodies 3"]  # 1/s, world frame
+    r: Float[Array, "*#batch bodies 3"]  # m, world frame
+    v: Float[Array, "*#batch bodies 3"]  # m/s, world frame: ṙ
+    # rad or m: coordinates of joint k in the order of its kind's motions, angles unwrapped; rates
+    x: Float[Array, "*#batch bodies coordinates"] = field(default_factory=_no_coordinates)
+    xdot: Float[Array, "*#batch bodies coordinates"] = field(default_factory=_no_coordinates)
 
     def __post_init__(self) -> None:
         """Give mechanisms without such coordinates zeros of the right shape."""
@@ -92,17 +99,19 @@ class State:
 class StateQuantities:
     """What an engine computes at one state; quantities that it does not offer are None."""
 
-    acceleration: Array  # (N, 3) m/s², r̈ of the centres of mass, world frame
-    angular_acceleration: Array  # (N, 3) rad/s², ω̇′, body frame
-    # (J, 3) N, force on the near body at the joint's near point, world frame; in loops the determinate part
-    joint_reaction: Array | None = None
+    acceleration: Float[Array, "bodies 3"]  # m/s², r̈ of the centres of mass, world frame
+    angular_acceleration: Float[Array, "bodies 3"]  # rad/s², ω̇′, body frame
+    # N, force on the near body at the joint's near point, world frame; in loops the determinate part
+    joint_reaction: Float[Array, "joints 3"] | None = None
     kinetic_energy: float | None = None  # J
     potential_energy: float | None = None  # J, zero at the pivot: -Σ m g·r
-    angular_momentum: Array | None = None  # (3,) kg m²/s about the pivot, world frame
-    # (nu, nu), kinetic energy = ½ νᵀ M ν with ν = (udot of the rods in order, then body by body omega, or
+    angular_momentum: Float[Array, "3"] | None = None  # kg m²/s about the pivot, world frame
+    # kinetic energy = ½ νᵀ M ν with ν = (udot of the rods in order, then body by body omega, or
     # (v, omega) of a free body, or the xdot of its joint); a rod's 3×3 part acts on udot through u × udot.
-    mass_matrix: Array | None = None
-    joint_moment: Array | None = None  # (J, 3) N m, moment on that body about that point, world frame
+    mass_matrix: Float[Array, "nu nu"] | None = None
+    joint_moment: Float[Array, "joints 3"] | None = (
+        None  # N m, moment on that body about that point, world frame
+    )
     # by quantity the uncertainty of a limit that the engine's answers were extrapolated to, in its unit
     limit_error: Mapping[str, float] | None = None
 
@@ -114,17 +123,17 @@ class Trajectory:
     ``p`` and ``pdot`` are the engine's own values: not normalised, not projected.
     """
 
-    t: Array  # (T,) s
-    r: Array  # (T, N, 3) m
-    p: Array  # (T, N, 4) –
-    v: Array  # (T, N, 3) m/s, ṙ
-    pdot: Array  # (T, N, 4) 1/s; ½ L(p)ᵀ ω′ where the engine holds ω′
+    t: Float[Array, "samples"]  # s
+    r: Float[Array, "samples bodies 3"]  # m
+    p: Float[Array, "samples bodies 4"]
+    v: Float[Array, "samples bodies 3"]  # m/s, ṙ
+    pdot: Float[Array, "samples bodies 4"]  # 1/s; ½ L(p)ᵀ ω′ where the engine holds ω′
     steps: int  # steps the integrator took
-    # (N, 2) rad or m: joint coordinates at t[0], angles unwrapped; None: angles are principal values there
-    initial_x: Array | None = None
-    # (4,) m, rad, m/s, rad/s: uncertainty of positions, attitudes, ṙ and ω′, where the run is the limit of
+    # rad or m: joint coordinates at t[0], angles unwrapped; None: angles are principal values there
+    initial_x: Float[Array, "bodies coordinates"] | None = None
+    # m, rad, m/s, rad/s: uncertainty of positions, attitudes, ṙ and ω′, where the run is the limit of
     # softer ones
-    limit_error: Array | None = None
+    limit_error: Float[Array, "4"] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,12 +141,12 @@ class StepRun:
     """Consecutive steps of one integrator, and what its formula needs besides the motion."""
 
     trajectory: Trajectory  # T samples at 0, h, 2 h, …
-    coordinate_acceleration: Array | None = None  # (T, N, 7) m/s² and 1/s², second derivatives of (r, p)
-    # (T, N, 4): multipliers of joint k, three [N], world axes (a rod's first is its tension), and of |p| = 1
-    multipliers: Array | None = None
-    angle_axes: Array | None = (
-        None  # (angles, 3) world axes of revolute joints at the start, from the pivot on
-    )
+    # m/s² and 1/s², second derivatives of (r, p)
+    coordinate_acceleration: Float[Array, "samples bodies 7"] | None = None
+    # multipliers of joint k, three [N], world axes (a rod's first is its tension), and of |p| = 1
+    multipliers: Float[Array, "samples bodies 4"] | None = None
+    # world axes of revolute joints at the start, from the pivot on
+    angle_axes: Float[Array, "angles 3"] | None = None
 
 
 @dataclass(frozen=True)

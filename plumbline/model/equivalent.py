@@ -6,9 +6,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from plumbline.model.datatypes import BODY_FIELDS, JOINT_FIELDS, Array, Model, State
+from plumbline.model.datatypes import BODY_FIELDS, JOINT_FIELDS, Array, Float, Indices, Int, Model, State
 from plumbline.model.kinematics import (
     complete_state,
     quaternion_conjugate,
@@ -25,11 +24,11 @@ WORLD_VECTORS = (
 BODY_VECTORS = ("angular_acceleration",)  # … in body axes
 
 
-def rotate_world(model: Model, state: State, q: Array) -> tuple[Model, State]:
+def rotate_world(model: Model, state: State, q: Float[Array, "4"]) -> tuple[Model, State]:
     """Rotate everything in world axes: gravity, applied forces, attitudes and rod directions.
 
     Args:
-        q: (4,) unit quaternion of the rotation, scalar first.
+        q: unit quaternion of the rotation, scalar first.
 
     Returns:
         The rotated mechanism and its state; attitudes are unit quaternions again.
@@ -50,11 +49,11 @@ def rotate_world(model: Model, state: State, q: Array) -> tuple[Model, State]:
     return rotated, complete_state(rotated, replace(state, p=p, **vectors))
 
 
-def rotate_body_frames(model: Model, state: State, q: Array) -> tuple[Model, State]:
+def rotate_body_frames(model: Model, state: State, q: Float[Array, "4"]) -> tuple[Model, State]:
     """Describe every body in other axes of its own: a body vector x becomes Q x.
 
     Args:
-        q: (4,) unit quaternion of the rotation Q, scalar first.
+        q: unit quaternion of the rotation Q, scalar first.
 
     Returns:
         The same mechanism in these axes and its state; attitudes are unit quaternions again.
@@ -75,13 +74,13 @@ def rotate_body_frames(model: Model, state: State, q: Array) -> tuple[Model, Sta
     return rotated, complete_state(rotated, replace(state, p=p, omega=state.omega @ turn.T))
 
 
-def unrotate(answers: dict[str, Array], vectors: Sequence[str], q: Array) -> dict[str, Array]:
+def unrotate(answers: dict[str, Array], vectors: Sequence[str], q: Float[Array, "4"]) -> dict[str, Array]:
     """Rotate vectors of a rotated pendulum back.
 
     Args:
         answers: quantities by their names in `StateQuantities`.
         vectors: names of those to rotate: `WORLD_VECTORS` or `BODY_VECTORS`.
-        q: (4,) the quaternion that `rotate_world` or `rotate_body_frames` was given.
+        q: the quaternion that `rotate_world` or `rotate_body_frames` was given.
 
     Returns:
         The same quantities in the axes of the first description.
@@ -94,11 +93,11 @@ def _normalised(q: Array) -> Array:
     return np.asarray(q / np.linalg.norm(q, axis=-1, keepdims=True))
 
 
-def siblings_reversed(model: Model) -> NDArray[np.intp]:
+def siblings_reversed(model: Model) -> Int[Indices, "bodies"]:
     """Order the bodies depth first with the branches on every body, and on the world, in reverse.
 
     Returns:
-        (N,) the bodies in the new order; ascending where no two joints have the same far body.
+        The bodies in the new order; ascending where no two joints have the same far body.
 
     """
     order: list[int] = []
@@ -110,11 +109,11 @@ def siblings_reversed(model: Model) -> NDArray[np.intp]:
     return np.array(order, np.intp)
 
 
-def reorder_bodies(model: Model, state: State, order: NDArray[np.intp]) -> tuple[Model, State]:
+def reorder_bodies(model: Model, state: State, order: Int[Indices, "bodies"]) -> tuple[Model, State]:
     """Number the bodies and joints in another order.
 
     Args:
-        order: (N,) the bodies in the new order, each behind its far body.
+        order: the bodies in the new order, each behind its far body.
 
     """
     place = np.append(np.argsort(order), -1)  # the world is −1 in both

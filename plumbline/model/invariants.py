@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.polynomial.legendre import legder, leggauss, legvander
 
-from plumbline.model.datatypes import JOINT_ELEMENTS, ZERO_INERTIA, Array, Model, Trajectory
+from plumbline.model.datatypes import JOINT_ELEMENTS, ZERO_INERTIA, Array, Float, Model, Trajectory
 from plumbline.model.kinematics import (
     angular_velocity,
     ball_spring_rest,
@@ -28,15 +28,15 @@ GAUSS_NODES = 5
 DEPARTURE = 1e-3  # m, beyond which a run has left the true motion
 
 
-def position_error(a: Array, b: Array) -> Array:
+def position_error(a: Float[Array, "... bodies 3"], b: Float[Array, "... bodies 3"]) -> Float[Array, "..."]:
     """Return the largest distance between the same body's centre of mass in two runs.
 
     Args:
-        a: (..., N, 3) positions [m].
-        b: (..., N, 3) positions [m].
+        a: positions [m].
+        b: positions [m].
 
     Returns:
-        (...) distances, the largest over the bodies [m].
+        Distances, the largest over the bodies [m].
 
     """
     return np.asarray(np.max(np.linalg.norm(a - b, axis=-1), axis=-1))
@@ -53,16 +53,18 @@ def motion_samples(run: Trajectory) -> dict[str, Array]:
     return {"position": run.r, "attitude": run.p, "velocity": run.v, "angular_velocity": omega}
 
 
-def motion_error(quantity: str, a: Array, b: Array) -> Array:
+def motion_error(
+    quantity: str, a: Float[Array, "... bodies _"], b: Float[Array, "... bodies _"]
+) -> Float[Array, "..."]:
     """Return the largest difference of any body between two motions.
 
     Args:
         quantity: a name of `MOTION_UNITS`.
-        a: (..., N, ·) samples of the first.
-        b: (..., N, ·) samples of the second.
+        a: samples of the first.
+        b: samples of the second.
 
     Returns:
-        (...) differences in the quantity's unit.
+        Differences in the quantity's unit.
 
     """
     return attitude_error(a, b) if quantity == "attitude" else position_error(a, b)
@@ -93,13 +95,15 @@ def motion_scales(model: Model, run: Trajectory, length: float) -> dict[str, flo
     return {"position": length, "attitude": 2.0, "velocity": speed, "angular_velocity": 2 * speed / length}
 
 
-def first_departure(t: Array, error: Array, radius: float | Array) -> float | None:
+def first_departure(
+    t: Float[Array, "samples"], error: Float[Array, "samples"], radius: float | Float[Array, "samples"]
+) -> float | None:
     """Find when a run has provably left the true motion.
 
     Args:
-        t: (T,) [s] sample times, ascending.
-        error: (T,) [m] `position_error` of the run and the midpoints of an enclosure.
-        radius: [m] of the enclosure, or (T,) of each sample.
+        t: [s] sample times, ascending.
+        error: [m] `position_error` of the run and the midpoints of an enclosure.
+        radius: [m] of the enclosure, or of each sample.
 
     Returns:
         The first sample [s] at which the error less the radius is above `DEPARTURE`, or the error is not a
@@ -111,15 +115,15 @@ def first_departure(t: Array, error: Array, radius: float | Array) -> float | No
     return float(t[left[0]]) if len(left) else None
 
 
-def attitude_error(p: Array, q: Array) -> Array:
+def attitude_error(p: Float[Array, "... bodies 4"], q: Float[Array, "... bodies 4"]) -> Float[Array, "..."]:
     """Return the largest rotation angle between the same body's attitudes in two runs; q equals −q.
 
     Args:
-        p: (..., N, 4) quaternions of the first run, normalised here.
-        q: (..., N, 4) quaternions of the second run, normalised here.
+        p: quaternions of the first run, normalised here.
+        q: quaternions of the second run, normalised here.
 
     Returns:
-        (...) angles, the largest over the bodies [rad].
+        Angles, the largest over the bodies [rad].
 
     """
     p = p / np.linalg.norm(p, axis=-1, keepdims=True)
@@ -129,48 +133,56 @@ def attitude_error(p: Array, q: Array) -> Array:
     return np.asarray(np.max(4 * np.arcsin(np.linalg.norm(p - sign * q, axis=-1) / 2), axis=-1))
 
 
-def kinetic_energy(model: Model, v: Array, omega: Array) -> Array:
+def kinetic_energy(
+    model: Model, v: Float[Array, "... bodies 3"], omega: Float[Array, "... bodies 3"]
+) -> Float[Array, "..."]:
     """Return Σ ½ m ṙ² + ½ ω′ᵀ J ω′.
 
     Args:
         model: the chain of N bodies.
-        v: (..., N, 3) velocities of the centres of mass, world frame [m/s].
-        omega: (..., N, 3) angular velocities, body frame [rad/s].
+        v: velocities of the centres of mass, world frame [m/s].
+        omega: angular velocities, body frame [rad/s].
 
     Returns:
-        (...) energies [J].
+        Energies [J].
 
     """
     spin = np.einsum("...ki,kij,...kj->...", omega, model.inertia, omega)
     return np.asarray(0.5 * np.einsum("k,...ki,...ki->...", model.mass, v, v) + 0.5 * spin)
 
 
-def potential_energy(model: Model, r: Array) -> Array:
+def potential_energy(model: Model, r: Float[Array, "... bodies 3"]) -> Float[Array, "..."]:
     """Return −Σ m g·r, which is zero at the pivot's height.
 
     Args:
         model: the chain of N bodies.
-        r: (..., N, 3) centres of mass, world frame [m].
+        r: centres of mass, world frame [m].
 
     Returns:
-        (...) energies [J].
+        Energies [J].
 
     """
     return np.asarray(-np.einsum("k,i,...ki->...", model.mass, model.gravity, r))
 
 
-def angular_momentum(model: Model, r: Array, p: Array, v: Array, omega: Array) -> Array:
+def angular_momentum(
+    model: Model,
+    r: Float[Array, "... bodies 3"],
+    p: Float[Array, "... bodies 4"],
+    v: Float[Array, "... bodies 3"],
+    omega: Float[Array, "... bodies 3"],
+) -> Float[Array, "... 3"]:
     """Return Σ m r × ṙ + A J ω′, the angular momentum about the pivot.
 
     Args:
         model: the chain of N bodies.
-        r: (..., N, 3) centres of mass, world frame [m].
-        p: (..., N, 4) quaternions, normalised here.
-        v: (..., N, 3) velocities of the centres of mass, world frame [m/s].
-        omega: (..., N, 3) angular velocities, body frame [rad/s].
+        r: centres of mass, world frame [m].
+        p: quaternions, normalised here.
+        v: velocities of the centres of mass, world frame [m/s].
+        omega: angular velocities, body frame [rad/s].
 
     Returns:
-        (..., 3) angular momenta, world frame [kg m²/s].
+        Angular momenta, world frame [kg m²/s].
 
     """
     spin = np.einsum("...kij,kjl,...kl->...i", rotation_matrix(p), model.inertia, omega)
@@ -181,12 +193,12 @@ def angular_momentum(model: Model, r: Array, p: Array, v: Array, omega: Array) -
 class Invariants:
     """Signed series (T, bodies or 1, components) of one run; each is zero in an exact motion."""
 
-    energy_drift: Array  # (T, 1, 1) J: E - E(0) - W, W the work of loads and drag
-    # (T, 1, 1) kg m²/s: change of the angular momentum about the pivot along gravity; None if not conserved
-    momentum_drift: Array | None
-    joint_gap: Array  # (T, J, 3) m: d of a ball joint; (|d| - ℓ, 0, 0) of a rod
-    gap_rate: Array  # (T, J, 3) m/s: its rate
-    norm_drift: Array  # (T, N, 1) –: |p| - 1
+    energy_drift: Float[Array, "samples 1 1"]  # J: E - E(0) - W, W the work of loads and drag
+    # kg m²/s: change of the angular momentum about the pivot along gravity; None if not conserved
+    momentum_drift: Float[Array, "samples 1 1"] | None
+    joint_gap: Float[Array, "samples joints 3"]  # m: d of a ball joint; (|d| - ℓ, 0, 0) of a rod
+    gap_rate: Float[Array, "samples joints 3"]  # m/s: its rate
+    norm_drift: Float[Array, "samples bodies 1"]  # |p| - 1
     work_uncertainty: float  # J: of W by quadrature over the samples
 
 
@@ -200,7 +212,9 @@ INVARIANT_UNITS = {
 }
 
 
-def work_of_loads(model: Model, run: Trajectory, omega: Array) -> tuple[Array, float]:
+def work_of_loads(
+    model: Model, run: Trajectory, omega: Float[Array, "samples bodies 3"]
+) -> tuple[Float[Array, "samples"], float]:
     """Return the work of loads, drag, dampers and efforts since t = 0, and how uncertain its quadrature is.
 
     Constant world forces do the work F·Δr exactly.  Other power is integrated by Gauss's rule over the motion
@@ -215,10 +229,10 @@ def work_of_loads(model: Model, run: Trajectory, omega: Array) -> tuple[Array, f
     difference shows e; e²/C and all differences are the uncertainty.
 
     Args:
-        omega: (T, N, 3) angular velocities of the run, body frame [rad/s].
+        omega: angular velocities of the run, body frame [rad/s].
 
     Returns:
-        Work, (T,) [J], and its uncertainty [J].
+        Work [J], and its uncertainty [J].
 
     """
     exact = np.einsum("ki,tki->t", model.force, run.r - run.r[0])
@@ -270,18 +284,23 @@ def _integrated_power(model: Model, run: Trajectory, width: int) -> Array:
     return np.concatenate([[0.0], np.cumsum(half[:, 0] * (power @ weights))])
 
 
-def hermite_interpolation(times: Array, y: Array, rate: Array, at: Array, width: int) -> tuple[Array, Array]:
+def hermite_interpolation(
+    times: Float[Array, "samples"],
+    y: Float[Array, "samples ..."],
+    rate: Float[Array, "samples ..."],
+    at: Float[Array, "intervals m"],
+    width: int,
+) -> tuple[Float[Array, "points ..."], Float[Array, "points ..."]]:
     """Interpolate by polynomials through values and rates of samples.
 
     Args:
-        times: (T,) [s] of the samples, T ≥ 2.
-        y: (T, ...) values.
-        rate: (T, ...) their rates [1/s].
-        at: (T − 1, m) times [s] within each interval.
+        times: [s] of the samples, T ≥ 2.
+        rate: their rates [1/s].
+        at: times [s] within each interval.
         width: how many samples around an interval its polynomial passes through, all where there are fewer.
 
     Returns:
-        Values and rates ((T − 1) m, ...) at these times.
+        Values and rates at these times.
 
     """
     count, width = len(times) - 1, min(width, len(times))
@@ -346,18 +365,20 @@ def compute_invariants(model: Model, run: Trajectory) -> Invariants:
 class ElementEnergies:
     """What rotors, springs, dampers and efforts hold and do along a run of T samples; zeros without any."""
 
-    rotors: Array  # (T,) J
-    springs: Array  # (T,) J
-    power: Array  # (T,) W: of efforts, less what dampers take
+    rotors: Float[Array, "samples"]  # J
+    springs: Float[Array, "samples"]  # J
+    power: Float[Array, "samples"]  # W: of efforts, less what dampers take
 
 
-def element_energies(model: Model, run: Trajectory, omega: Array) -> ElementEnergies:
+def element_energies(
+    model: Model, run: Trajectory, omega: Float[Array, "samples bodies 3"]
+) -> ElementEnergies:
     """Compute the energies of passive elements and the power of efforts and dampers.
 
     Angles start near the run's ``initial_x``, and their rates choose their turn at each further sample.
 
     Args:
-        omega: (T, N, 3) angular velocities of the run, body frame [rad/s].
+        omega: angular velocities of the run, body frame [rad/s].
 
     """
     rotors, springs, power = np.zeros((3, len(run.t)))
@@ -433,15 +454,17 @@ def _dot(a: Array, b: Array) -> Array:
     return np.asarray(np.sum(a * b, axis=-1))
 
 
-def joint_vector_rates(model: Model, run: Trajectory, omega: Array) -> Array:
+def joint_vector_rates(
+    model: Model, run: Trajectory, omega: Float[Array, "samples bodies 3"]
+) -> Float[Array, "samples joints 3"]:
     """Return ḋ, the rates of the vectors of `plumbline.model.kinematics.joint_vectors`.
 
     Args:
         model: the chain of N bodies.
-        omega: (T, N, 3) angular velocities of the run, body frame [rad/s].
+        omega: angular velocities of the run, body frame [rad/s].
 
     Returns:
-        (T, J, 3) rates, world frame [m/s].
+        Rates, world frame [m/s].
 
     """
     a = rotation_matrix(run.p)

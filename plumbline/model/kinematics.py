@@ -12,19 +12,19 @@ from itertools import pairwise
 
 import numpy as np
 
-from plumbline.model.datatypes import Array, JointKind, Model, State
+from plumbline.model.datatypes import Array, Float, JointKind, Model, State
 
 _NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])  # of each axis the next and the one after
 
 
-def rotation_matrix(p: Array) -> Array:
+def rotation_matrix(p: Float[Array, "... 4"]) -> Float[Array, "... 3 3"]:
     """Return the rotation matrices A of quaternions: the homogeneous quadratic form divided by pᵀp.
 
     Args:
-        p: (..., 4) quaternions, scalar first, of any length but 0.
+        p: quaternions, scalar first, of any length but 0.
 
     Returns:
-        (..., 3, 3) rotations, body → world.
+        Rotations, body → world.
 
     """
     p = np.asarray(p, dtype=np.result_type(p, float))
@@ -39,58 +39,37 @@ def rotation_matrix(p: Array) -> Array:
     return A / s[..., None, None]
 
 
-def rotate_vectors(A: Array, v: Array) -> Array:
-    """Multiply matrices and vectors pairwise: A v.
-
-    Args:
-        A: (..., 3, 3) matrices, for example rotations body → world; inertias and their like do as well.
-        v: (..., 3) vectors.
-
-    Returns:
-        (..., 3) products.
-
-    """
+def rotate_vectors(A: Float[Array, "... m n"], v: Float[Array, "... n"]) -> Float[Array, "... m"]:
+    """Multiply matrices (rotations, inertias, …) and vectors pairwise: A v."""
     return np.asarray((A @ v[..., None])[..., 0])
 
 
-def cross(a: Array, b: Array) -> Array:
+def cross(a: Float[Array, "... 3"], b: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
     """Return a × b as `numpy.cross` does, to the bit, in a sixth of its time on a few vectors.
 
     Args:
-        a: (..., 3) left factors.
-        b: (..., 3) right factors; the leading dimensions are broadcast.
-
-    Returns:
-        (..., 3) products.
+        b: right factors; the leading dimensions are broadcast.
 
     """
     return np.asarray(a.take(_NEXT, -1) * b.take(_LAST, -1) - a.take(_LAST, -1) * b.take(_NEXT, -1))
 
 
-def cross_matrix(s: Array) -> Array:
-    """Return the skew-symmetric matrix s̃ with s̃ v = s × v.
-
-    Args:
-        s: (..., 3) vectors.
-
-    Returns:
-        (..., 3, 3) matrices.
-
-    """
+def cross_matrix(s: Float[Array, "... 3"]) -> Float[Array, "... 3 3"]:
+    """Return the skew-symmetric matrix s̃ with s̃ v = s × v."""
     half = np.zeros((*s.shape, 3), np.result_type(s, float))
     half[..., 0, 1], half[..., 0, 2], half[..., 1, 2] = -s[..., 2], s[..., 1], -s[..., 0]
     return half - half.swapaxes(-1, -2)
 
 
-def quaternion_product(a: Array, b: Array) -> Array:
+def quaternion_product(a: Float[Array, "... 4"], b: Float[Array, "... 4"]) -> Float[Array, "... 4"]:
     """Multiply quaternions: rotation_matrix(a b) = rotation_matrix(a) rotation_matrix(b).
 
     Args:
-        a: (..., 4) left factors, scalar first.
-        b: (..., 4) right factors, scalar first.
+        a: left factors, scalar first.
+        b: right factors, scalar first.
 
     Returns:
-        (..., 4) products a b.
+        Products a b.
 
     """
     aw, av, bw, bv = a[..., :1], a[..., 1:], b[..., :1], b[..., 1:]
@@ -98,27 +77,24 @@ def quaternion_product(a: Array, b: Array) -> Array:
     return np.concatenate([scalar, aw * bv + bw * av + cross(av, bv)], -1)
 
 
-def quaternion_conjugate(p: Array) -> Array:
+def quaternion_conjugate(p: Float[Array, "... 4"]) -> Float[Array, "... 4"]:
     """Return the conjugate quaternions; of unit ones, the inverse rotations.
 
     Args:
-        p: (..., 4) quaternions, scalar first.
-
-    Returns:
-        (..., 4) conjugates.
+        p: quaternions, scalar first.
 
     """
     return np.asarray(p * np.array([1.0, -1.0, -1.0, -1.0]))
 
 
-def quaternion_exponential(half_turn: Array) -> Array:
+def quaternion_exponential(half_turn: Float[Array, "... 3"]) -> Float[Array, "... 4"]:
     """Return the quaternions of rotations by twice a vector.
 
     Args:
-        half_turn: (..., 3) halves of rotation vectors [rad].
+        half_turn: halves of rotation vectors [rad].
 
     Returns:
-        (..., 4) unit quaternions, scalar first.
+        Unit quaternions, scalar first.
 
     """
     size = np.sqrt(np.sum(half_turn * half_turn, -1, keepdims=True))
@@ -127,14 +103,11 @@ def quaternion_exponential(half_turn: Array) -> Array:
     return np.concatenate([np.cos(size), ratio * half_turn], -1)
 
 
-def turn_of_z(u: Array) -> Array:
+def turn_of_z(u: Float[Array, "... 3"]) -> Float[Array, "... 4"]:
     """Return quaternions that turn z into u; into a u below the horizontal after half a turn about x.
 
-    Args:
-        u: (..., 3) unit vectors.
-
     Returns:
-        (..., 4) quaternions of a length between √2 and 2.
+        Quaternions of a length between √2 and 2.
 
     """
     x, y, z = np.moveaxis(u, -1, 0)
@@ -143,14 +116,14 @@ def turn_of_z(u: Array) -> Array:
     return np.where((z >= 0)[..., None], up, down)
 
 
-def rotation_vector(q: Array) -> Array:
+def rotation_vector(q: Float[Array, "... 4"]) -> Float[Array, "... 3"]:
     """Return the rotation vector θ u of quaternions, 0 ≤ θ ≤ π.
 
     Args:
-        q: (..., 4) quaternions, scalar first, of any length but 0.
+        q: quaternions, scalar first, of any length but 0.
 
     Returns:
-        (..., 3) vectors [rad], the same in both frames.
+        Vectors [rad], the same in both frames.
 
     """
     size = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
@@ -159,39 +132,38 @@ def rotation_vector(q: Array) -> Array:
     return np.asarray(ratio * q[..., 1:])
 
 
-def ball_spring_rest(model: Model, k: int) -> Array:
+def ball_spring_rest(model: Model, k: int) -> Float[Array, "4"]:
     """Return the turn of a ball joint at which its spring is unloaded.
 
     Returns:
-        (4,) quaternion, near → far body.
+        Quaternion, near → far body.
 
     """
     return quaternion_product(model.turn[k, 0], quaternion_conjugate(model.turn[k, 1]))
 
 
-def quaternion_rate(p: Array, omega: Array) -> Array:
+def quaternion_rate(p: Float[Array, "... 4"], omega: Float[Array, "... 3"]) -> Float[Array, "... 4"]:
     """Return ṗ = ½ L(p)ᵀ ω′, the inverse of `angular_velocity` for unit quaternions.
 
     Args:
-        p: (..., 4) unit quaternions.
-        omega: (..., 3) angular velocities ω′, body frame [rad/s].
+        omega: angular velocities ω′, body frame [rad/s].
 
     Returns:
-        (..., 4) rates ṗ [1/s].
+        Rates ṗ [1/s].
 
     """
     return 0.5 * quaternion_product(p, np.concatenate([np.zeros_like(omega[..., :1]), omega], -1))
 
 
-def angular_velocity(p: Array, pdot: Array) -> Array:
+def angular_velocity(p: Float[Array, "... 4"], pdot: Float[Array, "... 4"]) -> Float[Array, "... 3"]:
     """Return ω′ = 2 L(p) ṗ as the notes define it, also where pᵀp ≠ 1.
 
     Args:
-        p: (..., 4) quaternions, not normalised here.
-        pdot: (..., 4) their rates [1/s].
+        p: quaternions, not normalised here.
+        pdot: their rates [1/s].
 
     Returns:
-        (..., 3) angular velocities, body frame [rad/s].
+        Angular velocities, body frame [rad/s].
 
     """
     return 2.0 * quaternion_product(quaternion_conjugate(p), pdot)[..., 1:]
@@ -199,26 +171,25 @@ def angular_velocity(p: Array, pdot: Array) -> Array:
 
 def state_from_minimal(
     model: Model,
-    p: Array,
-    omega: Array,
-    u: Array,
-    udot: Array,
-    x: Array | None = None,
-    xdot: Array | None = None,
-    r: Array | None = None,
-    v: Array | None = None,
+    p: Float[Array, "bodies 4"],
+    omega: Float[Array, "bodies 3"],
+    u: Float[Array, "bodies 3"],
+    udot: Float[Array, "bodies 3"],
+    x: Float[Array, "bodies coordinates"] | None = None,
+    xdot: Float[Array, "bodies coordinates"] | None = None,
+    r: Float[Array, "bodies 3"] | None = None,
+    v: Float[Array, "bodies 3"] | None = None,
 ) -> State:
     """Complete minimal coordinates to a state, from the world outwards.
 
     Args:
-        p: (N, 4) unit quaternions, body → world; of bodies whose joint leaves their attitude free.
-        omega: (N, 3) angular velocities of the same bodies, body frame [rad/s].
-        u: (N, 3) unit directions of the rods, world frame; zero for other joints.
-        udot: (N, 3) their rates, perpendicular to ``u`` [1/s].
-        x: (N, 2) coordinates of hinges, slides and their like [rad, m]; absent: zeros.
-        xdot: (N, 2) their rates.
-        r: (N, 3) centres of mass of free bodies, world frame [m]; absent: zeros.
-        v: (N, 3) their velocities [m/s].
+        p: unit quaternions, body → world; of bodies whose joint leaves their attitude free.
+        omega: angular velocities of the same bodies, body frame [rad/s].
+        u: unit directions of the rods, world frame; zero for other joints.
+        udot: their rates, perpendicular to ``u`` [1/s].
+        x: coordinates of hinges, slides and their like [rad, m]; absent: zeros.
+        r: centres of mass of free bodies, world frame [m]; absent: zeros.
+        v: their velocities [m/s].
 
     Returns:
         The state, on the constraint manifold to rounding.
@@ -255,29 +226,33 @@ def complete_state(model: Model, state: State) -> State:
 
 def forward_kinematics(
     model: Model,
-    p: Array,
-    omega: Array,
-    u: Array,
-    udot: Array,
-    r: Array | None = None,
-    v: Array | None = None,
-    x: Array | None = None,
-    xdot: Array | None = None,
-) -> tuple[Array, Array, Array, Array]:
+    p: Float[Array, "... bodies 4"],
+    omega: Float[Array, "... bodies 3"],
+    u: Float[Array, "... bodies 3"],
+    udot: Float[Array, "... bodies 3"],
+    r: Float[Array, "... bodies 3"] | None = None,
+    v: Float[Array, "... bodies 3"] | None = None,
+    x: Float[Array, "... bodies coordinates"] | None = None,
+    xdot: Float[Array, "... bodies coordinates"] | None = None,
+) -> tuple[
+    Float[Array, "... bodies 4"],
+    Float[Array, "... bodies 3"],
+    Float[Array, "... bodies 3"],
+    Float[Array, "... bodies 3"],
+]:
     """Return attitudes, angular velocities, centres of mass and their velocities, of one state or of many.
 
     Args:
-        p: (..., N, 4) unit quaternions, body → world, where they are coordinates.
-        omega: (..., N, 3) angular velocities of the same bodies, body frame [rad/s].
-        u: (..., N, 3) unit directions of the rods, world frame; zero for other joints.
-        udot: (..., N, 3) their rates [1/s].
-        r: (..., N, 3) centres of mass of free bodies, world frame [m]; absent, like the rest: zeros.
-        v: (..., N, 3) their velocities [m/s].
-        x: (..., N, 2) joint coordinates [rad, m].
-        xdot: (..., N, 2) their rates.
+        p: unit quaternions, body → world, where they are coordinates.
+        omega: angular velocities of the same bodies, body frame [rad/s].
+        u: unit directions of the rods, world frame; zero for other joints.
+        udot: their rates [1/s].
+        r: centres of mass of free bodies, world frame [m]; absent, like the rest: zeros.
+        v: their velocities [m/s].
+        x: joint coordinates [rad, m].
 
     Returns:
-        p (..., N, 4), ω′ (..., N, 3), r and ṙ (..., N, 3) of all bodies.
+        p, ω′, r and ṙ of all bodies.
 
     """
     model = model.tree
@@ -324,16 +299,17 @@ class JointFrame:
         self.turn_far, self.turn_near = model.turn[k]
         self.above = above
 
-    def motion(self, x: Array, xdot: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    def motion(
+        self, x: Float[Array, "... coordinates"], xdot: Float[Array, "... motions"]
+    ) -> tuple[
+        tuple[Float[Array, "... 3"], Float[Array, "... 4"]],
+        tuple[Float[Array, "... 3"], Float[Array, "... 3"]],
+    ]:
         """Return where the near body is from the far one, and its rates seen from there.
 
-        Args:
-            x: (..., 2) coordinates.
-            xdot: (..., 2) their rates.
-
         Returns:
-            The shift of the near point (..., 3) [m], world axes, and the quaternion (..., 4) near → far body;
-            then the rates of the shift and Ω = ω_near − ω_far, (..., 3), world axes.
+            The shift of the near point [m], world axes, and the quaternion near → far body; then the rates of
+            the shift and Ω = ω_near − ω_far, world axes.
 
         """
         shift = shift_rate = spin = np.zeros(3)
@@ -350,31 +326,30 @@ class JointFrame:
                 turn = quaternion_product(turn, half)
         return (shift, quaternion_product(turn, quaternion_conjugate(self.turn_near))), (shift_rate, spin)
 
-    def axes(self, x: Array) -> list[tuple[str, Array]]:
+    def axes(self, x: Float[Array, "coordinates"]) -> list[tuple[str, Float[Array, "3"]]]:
         """Return what moves, and along or about which world axis.
 
-        Args:
-            x: (2,) coordinates.
-
         Returns:
-            "turn" or "slide" and the axis (3,), of every motion.
+            "turn" or "slide" and the axis, of every motion.
 
         """
         rates = [self.motion(x, unit)[1] for unit in np.eye(len(self.motions))]
         return [(what, rate[what == "turn"]) for (what, _), rate in zip(self.motions, rates, strict=False)]
 
 
-def joint_vectors(model: Model, r: Array, p: Array) -> Array:
+def joint_vectors(
+    model: Model, r: Float[Array, "... bodies 3"], p: Float[Array, "... bodies 4"]
+) -> Float[Array, "... joints 3"]:
     """Return d_k, the vectors from the far to the near point of every joint.
 
     Zero for a joint that is closed, of length ℓ_k for a rod, along the axis for a slide.
 
     Args:
-        r: (..., N, 3) centres of mass, world frame [m].
-        p: (..., N, 4) quaternions, normalised here.
+        r: centres of mass, world frame [m].
+        p: quaternions, normalised here.
 
     Returns:
-        (..., J, 3) vectors, world frame [m].
+        Vectors, world frame [m].
 
     """
     a, (far, body) = rotation_matrix(p), model.body.T
@@ -384,16 +359,18 @@ def joint_vectors(model: Model, r: Array, p: Array) -> Array:
     return np.asarray(near - hang)
 
 
-def spring_vectors(model: Model, r: Array, p: Array) -> Array:
+def spring_vectors(
+    model: Model, r: Float[Array, "... bodies 3"], p: Float[Array, "... bodies 4"]
+) -> Float[Array, "... springs 3"]:
     """Return the vectors from the first to the second point of every spring.
 
     Args:
         model: the mechanism of N bodies with K springs.
-        r: (..., N, 3) centres of mass, world frame [m].
-        p: (..., N, 4) quaternions, normalised here.
+        r: centres of mass, world frame [m].
+        p: quaternions, normalised here.
 
     Returns:
-        (..., K, 3) vectors, world frame [m].
+        Vectors, world frame [m].
 
     """
     a, body = rotation_matrix(p), model.spring_body
@@ -459,11 +436,11 @@ def own_rates(model: Model) -> list[slice]:
     return [slice(int(start), int(end)) for start, end in pairwise(first)]
 
 
-def minimal_rates(model: Model, state: State) -> Array:
+def minimal_rates(model: Model, state: State) -> Float[Array, "nu"]:
     """Return ν, the minimal rates of a state.
 
     Returns:
-        (nu,) in the order of `velocity_jacobian`.
+        In the order of `velocity_jacobian`.
 
     """
     model, own = model.tree, list[Array]()
@@ -473,7 +450,7 @@ def minimal_rates(model: Model, state: State) -> Array:
     return np.concatenate([state.udot[model.rods].ravel(), *own])
 
 
-def velocity_jacobian(model: Model, state: State) -> Array:
+def velocity_jacobian(model: Model, state: State) -> Float[Array, "... rows nu"]:
     """Return the map W from the minimal rates to the bodies' velocities: (v_0, ω′_0, v_1, ω′_1, …) = W ν.
 
     ν holds udot of the rods in order, then body by body ω′, (ṙ, ω′) of a free body, or the rates of its
@@ -485,7 +462,7 @@ def velocity_jacobian(model: Model, state: State) -> Array:
         state: a state on the constraint manifold; or many, of arrays with leading axes.
 
     Returns:
-        (..., 6N, nu) matrix; linear velocities in the world frame, angular in the body's.
+        Six rows per body; linear velocities in the world frame, angular in the body's.
 
     """
     model = model.tree
@@ -520,7 +497,7 @@ def velocity_jacobian(model: Model, state: State) -> Array:
     return out.reshape(*a.shape[:-3], 6 * n, -1)
 
 
-def mass_matrix(model: Model, state: State) -> Array:
+def mass_matrix(model: Model, state: State) -> Float[Array, "... nu nu"]:
     """Return M = Wᵀ diag(m_k I, J_k) W with W of `velocity_jacobian`: the kinetic energy is ½ νᵀ M ν.
 
     Args:
@@ -528,7 +505,7 @@ def mass_matrix(model: Model, state: State) -> Array:
         state: a state on the constraint manifold; or many, of arrays with leading axes.
 
     Returns:
-        (..., nu, nu) symmetric matrix, as `StateQuantities.mass_matrix`, with the rotors.
+        Symmetric matrix, as `StateQuantities.mass_matrix`, with the rotors.
 
     """
     flat = velocity_jacobian(model, state)
@@ -549,11 +526,18 @@ def mass_matrix(model: Model, state: State) -> Array:
     return np.asarray(out)
 
 
-def joint_coordinates(model: Model, state: State) -> tuple[Array, Array, Array, Array]:
+def joint_coordinates(
+    model: Model, state: State
+) -> tuple[
+    Float[Array, "... joints 3"],
+    Float[Array, "... joints 3"],
+    Float[Array, "... joints coordinates"],
+    Float[Array, "... joints coordinates"],
+]:
     """Return the coordinates of all joints: those of closing ones follow from the bodies.
 
     Returns:
-        u, u̇ (J, 3) of rods, x, ẋ (J, 2) of other joints, as those of `State`.
+        u, u̇ of rods, x, ẋ of other joints, as those of `State`.
 
     """
     if not model.has_loops:
@@ -578,14 +562,19 @@ def with_joint_coordinates(model: Model, state: State) -> State:
 
 def coordinates_of_joints(
     model: Model, state: State, joints: Sequence[int]
-) -> tuple[Array, Array, Array, Array]:
+) -> tuple[
+    Float[Array, "... joints 3"],
+    Float[Array, "... joints 3"],
+    Float[Array, "... joints coordinates"],
+    Float[Array, "... joints coordinates"],
+]:
     """Compute coordinates of joints from the motion of the bodies; angles in (−π, π].
 
     Args:
         state: of which p, omega, r and v count.
 
     Returns:
-        u, u̇ (K, 3) of rods, x, ẋ (K, 2) of other joints, as those of `State`.
+        u, u̇ of rods, x, ẋ of other joints, as those of `State`.
 
     """
     a = rotation_matrix(state.p)

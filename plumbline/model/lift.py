@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from plumbline.model.datatypes import Array, EngineFailure, JointKind, Model, State
+from plumbline.model.datatypes import Array, EngineFailure, Float, JointKind, Model, State
 from plumbline.model.kinematics import forward_kinematics, quaternion_rate, rotate_vectors, rotation_matrix
 
 BallRates = Literal["body", "relative, near axes", "relative, far axes"]
@@ -18,8 +18,8 @@ _STEP = 2.0**-300
 
 
 def lift_acceleration(
-    model: Model, state: State, joints: Array, ball_rates: BallRates, label: str
-) -> tuple[Array, Array]:
+    model: Model, state: State, joints: Float[Array, "nu"], ball_rates: BallRates, label: str
+) -> tuple[Float[Array, "bodies 3"], Float[Array, "bodies 3"]]:
     """Compute the accelerations of all bodies from those of the joint coordinates.
 
     Args:
@@ -30,7 +30,7 @@ def lift_acceleration(
         label: what returned the numbers, for the message.
 
     Returns:
-        r̈ (N, 3), world frame, and ω̇′ (N, 3), body frame.
+        r̈, world frame, and ω̇′, body frame.
 
     Raises:
         EngineFailure: there are more numbers, or fewer.

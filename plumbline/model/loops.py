@@ -22,6 +22,11 @@ from plumbline.model.datatypes import (
     JOINT_FIELDS,
     ZERO_INERTIA,
     Array,
+    Bool,
+    Flags,
+    Float,
+    Indices,
+    Int,
     Model,
     State,
     StateQuantities,
@@ -61,12 +66,12 @@ class CutMechanism:
 
     source: Model  # N bodies, J joints
     model: Model  # a tree of J bodies, depth first
-    place: NDArray[np.intp]  # (J,) which body of the tree joint k of the source holds
+    place: Int[Indices, "joints"]  # which body of the tree joint k of the source holds
     ends: tuple[tuple[int, int], ...]  # of each loop the bodies b and c of the tree that coincide
 
     @property
-    def row_scale(self) -> Array:
-        """(6 L,) factors that make the rows of F and J comparable: 1/ℓ of lengths, ℓ of `wrench_length`."""
+    def row_scale(self) -> Float[Array, "loop_rows"]:
+        """Factors that make the rows of F and J comparable: 1/ℓ of lengths, ℓ of `wrench_length`."""
         length = wrench_length(self.source)
         return np.tile([1 / length] * 3 + [1.0] * 3, len(self.ends))
 
@@ -127,14 +132,14 @@ class CutMechanism:
         bodies, names = self.place[: self.source.n], ("r", "p", "v", "pdot")
         return replace(run, **{name: getattr(run, name)[:, bodies] for name in names})
 
-    def gap(self, state: State) -> Array:
+    def gap(self, state: State) -> Float[Array, "loop_rows"]:
         """Return F.
 
         Args:
             state: of the tree.
 
         Returns:
-            (6 L,) loop by loop [m, rad]; of opposite attitudes 1 rad or more.
+            Loop by loop [m, rad]; of opposite attitudes 1 rad or more.
 
         """
         a, found = rotation_matrix(state.p), []
@@ -146,14 +151,14 @@ class CutMechanism:
             found.append(np.concatenate([state.r[b] - state.r[c], -skew]))
         return np.concatenate(found)
 
-    def jacobian(self, state: State) -> Array:
+    def jacobian(self, state: State) -> Float[Array, "loop_rows nu"]:
         """Return J.
 
         Args:
             state: of the tree.
 
         Returns:
-            (6 L, nu) for the rates ν of `velocity_jacobian`.
+            For the rates ν of `velocity_jacobian`.
 
         """
         w = velocity_jacobian(self.model, state).reshape(self.model.n, 6, -1)
@@ -199,13 +204,13 @@ def cut_open(model: Model) -> CutMechanism:
     return CutMechanism(model, replace(model, kind=kinds, **changes), place, ends)
 
 
-def displaced(model: Model, state: State, step: Array) -> State:
+def displaced(model: Model, state: State, step: Float[Array, "nu"]) -> State:
     """Move a tree's coordinates.
 
     Args:
         model: a tree.
         state: where it is.
-        step: (nu,) changes in the order of the rates of `velocity_jacobian`.
+        step: changes in the order of the rates of `velocity_jacobian`.
 
     Returns:
         The state there, with the same rates.
@@ -226,13 +231,13 @@ def displaced(model: Model, state: State, step: Array) -> State:
     return complete_state(model, replace(state, p=p, r=r, x=x, u=u))
 
 
-def with_rates(model: Model, state: State, rates: Array) -> State:
+def with_rates(model: Model, state: State, rates: Float[Array, "nu"]) -> State:
     """Give a tree other rates.
 
     Args:
         model: a tree.
         state: where it is.
-        rates: (nu,) in the order of `velocity_jacobian`.
+        rates: in the order of `velocity_jacobian`.
 
     Returns:
         The state with these rates.
@@ -254,14 +259,14 @@ def with_rates(model: Model, state: State, rates: Array) -> State:
 
 
 def assembled(
-    model: Model, state: State, movable: NDArray[np.bool_] | None = None, is_pose_kept: bool = False
+    model: Model, state: State, movable: Bool[Flags, "nu"] | None = None, is_pose_kept: bool = False
 ) -> State:
     """Close a mechanism's loops to rounding: the nearest coordinates (Newton's method) and rates.
 
     Args:
         model: the mechanism; a tree is left alone.
         state: near an assembled state.
-        movable: (nu,) of the mechanism's rates, True for those that may change; absent: all.
+        movable: of the mechanism's rates, True for those that may change; absent: all.
         is_pose_kept: whether coordinates whose rates are not ``movable`` keep their values too.
 
     Returns:
@@ -279,12 +284,12 @@ def assembled(
     return cut.source_state(with_rates(cut.model, best, rates))
 
 
-def closed_pose(cut: CutMechanism, state: State, free: NDArray[np.bool_] | None = None) -> State:
+def closed_pose(cut: CutMechanism, state: State, free: Bool[Flags, "nu"] | None = None) -> State:
     """Close the loops of a cut mechanism by Newton's method, with the shortest steps.
 
     Args:
         state: of the tree, near a pose where its ends are together.
-        free: (nu,) True for coordinates that may change; absent: all.
+        free: True for coordinates that may change; absent: all.
 
     Returns:
         That pose, with the same rates; where the loops cannot be closed from here, gaps remain.
@@ -309,17 +314,17 @@ def closed_pose(cut: CutMechanism, state: State, free: NDArray[np.bool_] | None 
 
 
 def closed_rates(
-    cut: CutMechanism, state: State, rates: Array, free: NDArray[np.bool_] | None = None
-) -> Array:
+    cut: CutMechanism, state: State, rates: Float[Array, "nu"], free: Bool[Flags, "nu"] | None = None
+) -> Float[Array, "nu"]:
     """Project rates on those that keep the loops of a cut mechanism closed.
 
     Args:
         state: of the tree, its ends together.
-        rates: (nu,) of the tree.
-        free: (nu,) True for those that may change; absent: all.
+        rates: of the tree.
+        free: True for those that may change; absent: all.
 
     Returns:
-        (nu,) the nearest rates with J ν = 0; where there are none, rates of ends differ.  Those that may
+        The nearest rates with J ν = 0; where there are none, rates of ends differ.  Those that may
         change and cannot move are exactly 0, not what rounding leaves: a comparison would be relative to it.
 
     """
@@ -331,14 +336,14 @@ def closed_rates(
     return found
 
 
-def allowed_rates(cut: CutMechanism, state: State) -> Array:
+def allowed_rates(cut: CutMechanism, state: State) -> Float[Array, "mobility nu"]:
     """Return the rates that keep the loops of a cut mechanism closed.
 
     Args:
         state: of the tree, its ends together.
 
     Returns:
-        (mobility, nu) orthonormal rates that span them; a rate that none of them moves is exactly 0 in all.
+        Orthonormal rates that span them; a rate that none of them moves is exactly 0 in all.
 
     """
     rods = np.zeros((int(cut.model.rods.sum()), rate_count(cut.model)))
@@ -443,7 +448,7 @@ def motion_without_inertia(model: Model, state: State) -> int | None:
     return int(np.argmax(np.where(lacking, np.linalg.norm(rates[place[: model.n], 3:], axis=1), -1.0)))
 
 
-def loop_gaps(model: Model, state: State) -> tuple[Array, Array]:
+def loop_gaps(model: Model, state: State) -> tuple[Float[Array, "loops"], Float[Array, "loops"]]:
     """Measure how far the loops of a state are from closed.
 
     Args:
@@ -451,7 +456,7 @@ def loop_gaps(model: Model, state: State) -> tuple[Array, Array]:
         state: a state of the tree.
 
     Returns:
-        (L,) largest gap of each [m, rad], and (L,) of its rate [m/s, rad/s].
+        Largest gap of each [m, rad], and of its rate [m/s, rad/s].
 
     """
     cut = cut_open(model)
@@ -531,14 +536,14 @@ def is_singular(value: float) -> bool:
     return value < MIN_SINGULAR_VALUE
 
 
-def singular_values(cut: CutMechanism, state: State) -> tuple[Array, Array]:
+def singular_values(cut: CutMechanism, state: State) -> tuple[Float[Array, "n"], Float[Array, "rank nu"]]:
     """Return the singular values of J with its rows by `row_scale`.
 
     Args:
         state: of the tree, its ends together.
 
     Returns:
-        All of them, descending, and the rows (rank, nu) that span J's own.
+        All of them, descending, and the rows that span J's own.
 
     """
     _, values, rows = np.linalg.svd(cut.jacobian(state) * cut.row_scale[:, None])
@@ -558,12 +563,13 @@ def _rates_of_source(cut: CutMechanism) -> NDArray[np.intp]:
     return np.array([*swings, *(i for b in bodies for i in range(own[b].start, own[b].stop))], np.intp)
 
 
-def independent_rows(matrix: Array, scale: Array | None = None) -> NDArray[np.intp]:
+def independent_rows(
+    matrix: Float[Array, "m n"], scale: Float[Array, "m"] | None = None
+) -> Int[Indices, "rank"]:
     """Choose rows that do not depend on others, by a pivoted QR of the scaled rows.
 
     Args:
-        matrix: (m, n).
-        scale: (m,) factors of the rows; absent: to unit rows.
+        scale: factors of the rows; absent: to unit rows.
 
     Returns:
         Their numbers, ascending.
@@ -578,7 +584,7 @@ def independent_rows(matrix: Array, scale: Array | None = None) -> NDArray[np.in
 
 
 @lru_cache(maxsize=1)  # adapters reduce many answers at one state
-def determinate_projectors(model: Model, state: State) -> Array | None:
+def determinate_projectors(model: Model, state: State) -> Float[Array, "joints 6 6"] | None:
     """Find what dependent rows leave of each joint's wrench: forces F and moments N/ℓ about the near points.
 
     Args:
@@ -586,7 +592,7 @@ def determinate_projectors(model: Model, state: State) -> Array | None:
         state: assembled.
 
     Returns:
-        (J, 6, 6) orthogonal projectors, with the length ℓ of `wrench_length`; None where all is determinate.
+        Orthogonal projectors, with the length ℓ of `wrench_length`; None where all is determinate.
 
     """
     cut = cut_open(model)

@@ -17,6 +17,7 @@ from plumbline.model.datatypes import (
     KINDS,
     WELD,
     Array,
+    Float,
     Kind,
     Model,
     State,
@@ -37,14 +38,11 @@ SPRINGS = 4  # between points
 MIN_FIRST_SINGULAR_VALUE = 5e-2  # of the unit rows of a new loop's mechanism: away from singular poses
 
 
-def random_inertias(rng: np.random.Generator, mass: Array) -> Array:
+def random_inertias(rng: np.random.Generator, mass: Float[Array, "bodies"]) -> Float[Array, "bodies 3 3"]:
     """Draw inertias of ellipsoids of any attitude, which are always physical.
 
-    Args:
-        mass: (N,) kg.
-
     Returns:
-        (N, 3, 3) kg m², body frame.
+        Kg m², body frame.
 
     """
     axes = np.linalg.qr(rng.normal(size=(len(mass), 3, 3)))[0]

@@ -35,6 +35,10 @@ from plumbline.model.datatypes import (
     KINDS,
     ROD,
     SPRING_FIELDS,
+    Bool,
+    Flags,
+    Indices,
+    Int,
     Kind,
     Model,
     State,
@@ -60,9 +64,9 @@ class Rearranged:
     """A mechanism with bodies and joints in another order, and with other free bodies."""
 
     model: Model
-    order: NDArray[np.intp]  # (N,) the first mechanism's bodies in the new order
-    joint: NDArray[np.intp]  # (J,) of each joint of the first mechanism its new number; −1: left out
-    is_reversed: NDArray[np.bool_]  # (J,) of the first mechanism's joints
+    order: Int[Indices, "bodies"]  # the first mechanism's bodies in the new order
+    joint: Int[Indices, "joints"]  # of each joint of the first mechanism its new number; −1: left out
+    is_reversed: Bool[Flags, "joints"]  # of the first mechanism's joints
 
     def state(self, state: State) -> State:
         """Describe a state of the first mechanism as one of this one."""

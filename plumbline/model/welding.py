@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from plumbline.model.datatypes import Array, Model
+from plumbline.model.datatypes import Array, Float, Model
 
 INERTIA_SHARES = 0.25, 0.75  # of the inertia that is left
 SPLIT_DIRECTION = np.ones(3) / np.sqrt(3.0)  # in principal axes
@@ -26,8 +26,8 @@ class RigidPart:
     """One rigid piece of a body, welded to the others."""
 
     mass: float  # kg
-    centre: Array  # (3,) m, from the body's centre of mass, body frame
-    inertia: Array  # (3, 3) kg m², about the piece's own centre, body axes
+    centre: Float[Array, "3"]  # m, from the body's centre of mass, body frame
+    inertia: Float[Array, "3 3"]  # kg m², about the piece's own centre, body axes
 
 
 BodyParts = list[tuple[RigidPart, ...]]  # of every body
@@ -60,12 +60,12 @@ def split_bodies(model: Model) -> BodyParts:
     return [split_body(float(mass), inertia) for mass, inertia in zip(model.mass, model.inertia, strict=True)]
 
 
-def split_body(mass: float, inertia: Array) -> tuple[RigidPart, RigidPart]:
+def split_body(mass: float, inertia: Float[Array, "3 3"]) -> tuple[RigidPart, RigidPart]:
     """Split a body into the two halves of the module's docstring.
 
     Args:
         mass: the body's mass [kg].
-        inertia: (3, 3) about its centre of mass, body frame [kg m²].
+        inertia: about its centre of mass, body frame [kg m²].
 
     """
     principal, axes = np.linalg.eigh(inertia)
@@ -77,11 +77,11 @@ def split_body(mass: float, inertia: Array) -> tuple[RigidPart, RigidPart]:
     )
 
 
-def part_offsets(parts: BodyParts) -> Array:
+def part_offsets(parts: BodyParts) -> Float[Array, "bodies"]:
     """Return how far the centres of the pieces are from their body's centre of mass.
 
     Returns:
-        (N,) the largest distance in each body [m].
+        The largest distance in each body [m].
 
     """
     return np.array([max(float(np.linalg.norm(part.centre)) for part in pieces) for pieces in parts])

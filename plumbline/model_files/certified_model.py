@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from plumbline.importers.neutral_model import CanonicalState, ElementaryJoint, ModelQuantities, NeutralModel
-from plumbline.model.datatypes import Array
+from plumbline.model.datatypes import Array, Float
 from plumbline.model.kinematics import quaternion_conjugate, quaternion_product
 from plumbline.truth import import_truth_tool
 from plumbline.truth.ball_geometry import entries, flatten, midpoints
@@ -304,8 +304,8 @@ class _Magnitudes:
 
     length: Array  # (bodies,) m, with the way to centres of mass, by which engines place bodies
     turns: Array  # (bodies,) number of frames on the path, and the angles' sum
-    mass_matrix: Array  # (n, n)
-    bias_force: Array  # (n,)
+    mass_matrix: Float[Array, "n n"]
+    bias_force: Float[Array, "n"]
     gravity_force: Array
     passive_force: Array
     potential: float  # J

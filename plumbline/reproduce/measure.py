@@ -28,7 +28,7 @@ from plumbline.measurements.state_relations import (
     WELDED_HALVES,
     scale_fields,
 )
-from plumbline.model.datatypes import Array, Integrator
+from plumbline.model.datatypes import Array, Float, Integrator
 from plumbline.model.invariants import MOTION_UNITS, motion_samples
 from plumbline.model.step_methods import JointSpaceMethod, describe_method
 from plumbline.model.welding import split_bodies
@@ -72,7 +72,7 @@ class StepEvidence(Evidence):
     """A few steps that are not those of the declared formula."""
 
     integrator: Integrator
-    times: Array  # (2,) s, start and end
+    times: Float[Array, "2"]  # s, start and end
     count: int  # of steps
     formula: str  # in words
 
@@ -82,7 +82,7 @@ class MotionEvidence(Evidence):
     """A refinement study whose order, limit or drift is off."""
 
     integrator: Integrator
-    times: Array  # (T,) s
+    times: Float[Array, "samples"]  # s
     ordered: bool  # whether the observed order is in dispute
     drifts: tuple[str, ...]  # invariants that are in dispute
     sizes: tuple[float, float]  # m and m/s: scales of r and v where orders are observed
@@ -270,14 +270,14 @@ class ConvergenceMeasure:
         """The integrator as the engine's adapter declares it."""
         return self.engine.integrator(self.method)
 
-    def sample_times(self, case: ReproductionCase) -> Array | None:
+    def sample_times(self, case: ReproductionCase) -> Float[Array, "samples"] | None:
         """Choose sample times: start and end, more where the work of moments or drag is integrated.
 
         Args:
             case: the refinement study.
 
         Returns:
-            Times (T,) [s], or None where the steps are too coarse for the work.
+            Times [s], or None where the steps are too coarse for the work.
 
         """
         model, count = case.model, 1
@@ -287,12 +287,14 @@ class ConvergenceMeasure:
                 return None
         return np.linspace(0.0, case.until, count + 1)
 
-    def run(self, case: ReproductionCase, times: Array) -> tuple[MotionTruth, list[RefinementRun]]:
+    def run(
+        self, case: ReproductionCase, times: Float[Array, "samples"]
+    ) -> tuple[MotionTruth, list[RefinementRun]]:
         """Run the refinement study, and compute its truth.
 
         Args:
             case: the refinement study.
-            times: sample times (T,) [s].
+            times: sample times [s].
 
         Returns:
             The truth, and the engine's runs from coarse to fine.

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from plumbline.layout import ROOT
-from plumbline.model.datatypes import FREE, JOINT_ELEMENTS, KINDS, Array, Model, State
+from plumbline.model.datatypes import FREE, JOINT_ELEMENTS, KINDS, Array, Float, Model, State
 from plumbline.model.kinematics import (
     own_rates,
     quaternion_product,
@@ -114,7 +114,7 @@ class Scenario:
         return path if "/" in path else f"./{path}"
 
     @property
-    def times(self) -> Array:
+    def times(self) -> Float[Array, "samples"]:
         """(T,) s, the sample times from 0 to the duration."""
         return (
             np.arange(round(self.duration / self.sample_interval) + 1, dtype=np.float64)

@@ -28,7 +28,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from plumbline.model.datatypes import FREE, JOINT_ELEMENTS, KINDS, Array, AxesKind
+from plumbline.model.datatypes import FREE, JOINT_ELEMENTS, KINDS, Array, AxesKind, Float
 from plumbline.model.kinematics import quaternion_product, rotation_matrix
 
 SCHEMA_VERSION = 1
@@ -100,7 +100,7 @@ def name_error(name: str) -> str:
     return f"has {size} bytes" if size > MAX_NAME_BYTES else ""
 
 
-def unit_vector(values: list[float]) -> Array:
+def unit_vector(values: list[float]) -> Float[Array, "n"]:
     """Scale a vector to unit length without overflow or underflow.
 
     Args:
@@ -171,14 +171,11 @@ class AxisAngle(SchemaModel):
         """The angle in rad."""
         return self.angle if self.angle is not None else math.radians(self.degrees or 0.0)
 
-    def quaternion(self, multiple: float = 1.0) -> Array:
+    def quaternion(self, multiple: float = 1.0) -> Float[Array, "4"]:
         """Return the unit quaternion of a multiple of the rotation.
 
         Args:
             multiple: factor of the angle.
-
-        Returns:
-            (4,) scalar first.
 
         """
         half = 0.5 * multiple * self.radians
@@ -751,11 +748,11 @@ class Document(SchemaModel):
         return {k: v for k, v in data.items() if v or k not in ("springs", "closes", "seed")}
 
 
-def attitude_quaternion(attitude: Attitude) -> Array:
+def attitude_quaternion(attitude: Attitude) -> Float[Array, "4"]:
     """Return the unit quaternion of an attitude, in whichever form the file gives it.
 
     Returns:
-        (4,) scalar first, body → world, unit to rounding.
+        Scalar first, body → world, unit to rounding.
 
     """
     if attitude.quaternion is not None:
@@ -779,11 +776,11 @@ def _euler_quaternion(euler: Euler) -> Array:
     return unit_vector(quaternion_product(quaternion_product(factors[0], factors[1]), factors[2]).tolist())
 
 
-def inertia_matrix(inertia: Inertia) -> Array:
+def inertia_matrix(inertia: Inertia) -> Float[Array, "3 3"]:
     """Return the inertia matrix, in whichever form the file gives it.
 
     Returns:
-        (3, 3) about the centre of mass, body frame, exactly symmetric [kg m²].
+        About the centre of mass, body frame, exactly symmetric [kg m²].
 
     """
     matrix = _matrix_of(inertia.principal or inertia.six or inertia.matrix or [])

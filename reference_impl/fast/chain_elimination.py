@@ -27,7 +27,7 @@ from scipy.linalg import lapack
 from reference_impl.direct import EPS, Solution, check_state_solvable
 from reference_impl.euler_parameters import G, L, tilde
 from reference_impl.joints import joint_of_rows
-from reference_impl.mechanism import Array, Mechanism
+from reference_impl.mechanism import Array, Float, Mechanism
 from reference_impl.singular_system import SingularSystem
 
 # Constants that turn flattened outer products of p with another vector into what is needed of them.
@@ -72,15 +72,14 @@ class FactoredJoints(NamedTuple):
     rod's rows 2 and 3 empty.
     """
 
-    d: Array | None  # (3, M) m, world frame, joint k's gap or rod; None for balls only
-    U: Array | None  # (3, c, M) force on body k per μ_k
-    lever_rows: (
-        Array  # (2, c, 3, M) U_nearᵀ X of body k's proximal, U_farᵀ X of body k−1's distal point (pivot: 0)
-    )
-    U_near: Array | None  # (3, c, M) as U, with the notes' own lever off pᵀp = 1 (E2)
-    U_far: Array | None
-    factor: tuple[Array, ...]
-    Rs: Array | None  # (2, 3, M) m, the points turned; None for balls only
+    d: Float[Array, "3 bodies"] | None  # m, world frame, joint k's gap or rod; None for balls only
+    U: Float[Array, "3 c bodies"] | None  # force on body k per μ_k
+    # U_nearᵀ X of body k's proximal, U_farᵀ X of body k−1's distal point (pivot: 0)
+    lever_rows: Float[Array, "2 c 3 bodies"]
+    U_near: Float[Array, "3 c bodies"] | None  # as U, with the notes' own lever off pᵀp = 1 (E2)
+    U_far: Float[Array, "3 c bodies"] | None
+    factor: tuple[Float[Array, "..."], ...]
+    Rs: Float[Array, "2 3 bodies"] | None  # m, the points turned; None for balls only
 
 
 class StructuredSystem:
@@ -213,15 +212,17 @@ class StructuredSystem:
         Rs = _matrix_vector(R, self.s)
         return Rs, norm * Rs + (norm - 1) * self.s
 
-    def joint_gaps(self, q: Array, v: Array) -> tuple[Array, Array]:
+    def joint_gaps(
+        self, q: Float[Array, "7 bodies"], v: Float[Array, "7 bodies"]
+    ) -> tuple[Float[Array, "3 bodies"], Float[Array, "3 bodies"]]:
         """Return the vectors d from where joint k hangs to body k's proximal point, and their rates.
 
         Args:
-            q: (r; p) (7, M) [m, –].
-            v: (ṙ; ṗ) (7, M) [m/s, 1/s].
+            q: (r; p) [m, –].
+            v: (ṙ; ṗ) [m/s, 1/s].
 
         Returns:
-            d (3, M) [m] and ḋ (3, M) [m/s], world frame.
+            d [m] and ḋ [m/s], world frame.
 
         """
         norm, R = self._norm_and_rotation(q)
@@ -233,15 +234,17 @@ class StructuredSystem:
         d = q[:3] + As[0] - self._at_parent(q[:3] + As[1])
         return d, v[:3] + velocity[0] - self._at_parent(v[:3] + velocity[1])
 
-    def constraints(self, q: Array, v: Array) -> tuple[Array, Array]:
+    def constraints(
+        self, q: Float[Array, "7 bodies"], v: Float[Array, "7 bodies"]
+    ) -> tuple[Float[Array, "c bodies"], Float[Array, "c bodies"]]:
         """Evaluate the constraints: d of a ball joint, dᵀd − ℓ² of a rod (E1).
 
         Args:
-            q: (r; p) (7, M) [m, –].
-            v: (ṙ; ṗ) (7, M) [m/s, 1/s].
+            q: (r; p) [m, –].
+            v: (ṙ; ṗ) [m/s, 1/s].
 
         Returns:
-            C and Ċ (c, M); where c = 3, rows 2 and 3 of a rod are 0.
+            C and Ċ; where c = 3, rows 2 and 3 of a rod are 0.
 
         """
         d, rate = self.joint_gaps(q, v)
@@ -352,16 +355,18 @@ class StructuredSystem:
         """Number of joints: one holds each body."""
         return self.body_count
 
-    def acceleration(self, q: Array, v: Array, baumgarte: float = 0.0) -> Array:
+    def acceleration(
+        self, q: Float[Array, "7 bodies"], v: Float[Array, "7 bodies"], baumgarte: float = 0.0
+    ) -> Float[Array, "7 bodies"]:
         """Return the accelerations, on or off the constraints.
 
         Args:
-            q: (r; p) (7, M) [m, –].
-            v: (ṙ; ṗ) (7, M) [m/s, 1/s].
+            q: (r; p) [m, –].
+            v: (ṙ; ṗ) [m/s, 1/s].
             baumgarte: a [1/s]; adds −2 a Ċ − a² C to γ and likewise to γ_E.  0 is the notes' raw form.
 
         Returns:
-            (r̈; p̈) (7, M) [m/s², 1/s²].
+            (r̈; p̈) [m/s², 1/s²].
 
         Raises:
             SingularSystem: S is singular.
@@ -445,14 +450,19 @@ class StructuredSystem:
         rows[0] = np.where(self.rods, row, rows[0])
         return rows
 
-    def solve(self, r: Array, p: Array, v: Array, pdot: Array) -> Solution:
+    def solve(
+        self,
+        r: Float[Array, "bodies 3"],
+        p: Float[Array, "bodies 4"],
+        v: Float[Array, "bodies 3"],
+        pdot: Float[Array, "bodies 4"],
+    ) -> Solution:
         """Solve (N5) for every chain.
 
         Args:
-            r: positions (M, 3) [m], world frame.
-            p: Euler parameters (M, 4).
-            v: velocities ṙ (M, 3) [m/s], world frame.
-            pdot: rates ṗ (M, 4) [1/s].
+            r: positions [m], world frame.
+            v: velocities ṙ [m/s], world frame.
+            pdot: rates ṗ [1/s].
 
         Returns:
             r̈, p̈, λ, λ_E and the forces at the joints; its ``joint`` counts the bodies of all chains.
@@ -493,15 +503,17 @@ class StructuredSystem:
 
     # -- the manifold -------------------------------------------------------------------------------
 
-    def project(self, q: Array, v: Array) -> tuple[Array, Array]:
+    def project(
+        self, q: Float[Array, "7 bodies"], v: Float[Array, "7 bodies"]
+    ) -> tuple[Float[Array, "7 bodies"], Float[Array, "7 bodies"]]:
         """Project onto C = 0, pᵀp = 1, Ċ = 0, pᵀṗ = 0 by Newton steps in the metric of M and 4 LᵀJL.
 
         Two steps at position level: the first leaves the square of the gap, which for the drift of one
         integration step is below rounding.
 
         Args:
-            q: (r; p) (7, M) [m, –].
-            v: (ṙ; ṗ) (7, M) [m/s, 1/s].
+            q: (r; p) [m, –].
+            v: (ṙ; ṗ) [m/s, 1/s].
 
         Returns:
             q and v on the constraints.
@@ -528,15 +540,12 @@ class StructuredSystem:
         return np.concatenate([linear, turn])
 
 
-def component_first(a: Array, b: Array) -> Array:
+def component_first(a: Float[Array, "bodies 3"], b: Float[Array, "bodies 4"]) -> Float[Array, "7 bodies"]:
     """Stack body-first arrays into one component-first array.
 
     Args:
-        a: r or ṙ (M, 3).
-        b: p or ṗ (M, 4).
-
-    Returns:
-        (7, M), contiguous.
+        a: r or ṙ.
+        b: p or ṗ.
 
     """
     return np.ascontiguousarray(np.concatenate([a.T, b.T]))

@@ -23,7 +23,7 @@ from numpy.polynomial.legendre import leggauss, legvander
 from reference_impl.fast.chain_elimination import component_first
 from reference_impl.fast.tree_elimination import EliminatedSystem, TreeSystem, eliminated_system
 from reference_impl.integrate import IntegrationResult, state_scales
-from reference_impl.mechanism import Array, Mechanism
+from reference_impl.mechanism import Array, Float, Mechanism
 
 DEFAULT_NODES = 16  # a sweep of a small chain costs NumPy's calls and not its nodes: 8 … 20 were tried
 MAX_SWEEPS = 14  # at most in a step; more are better spent on a shorter step
@@ -39,27 +39,25 @@ class BatchIntegrationResult(IntegrationResult):
     rejected_steps: int  # steps that were repeated shorter
     stiff_steps: int  # steps whose size the sweeps' convergence decided and not the tolerance: stiffness
     note: str  # a sentence where the problem is stiff for the sweeps
-    x: Array  # (T, N, 2) rad or m, of joints with elements where springs act on angles; elsewhere no meaning
+    # rad or m, of joints with elements where springs act on angles; elsewhere no meaning
+    x: Float[Array, "samples joints coordinates"]
 
 
 @dataclass(frozen=True, eq=False)
 class GaussTables:
     """Tables of the S-point Gauss–Legendre collocation on [0, 1]."""
 
-    c: Array  # (S,) nodes
-    b: Array  # (S,) weights
-    A: Array  # (S, S): ∫₀^cᵢ of the polynomial through the nodes
-    node_to_mode: Array  # (S, S): node values → Legendre coefficients
+    c: Float[Array, "nodes"]  # nodes
+    b: Float[Array, "nodes"]  # weights
+    A: Float[Array, "nodes nodes"]  # ∫₀^cᵢ of the polynomial through the nodes
+    node_to_mode: Float[Array, "nodes nodes"]  # node values → Legendre coefficients
     _extrapolation_cache: dict[float, Array] = field(default_factory=dict)
 
-    def extrapolation_matrix(self, ratio: float) -> Array:
+    def extrapolation_matrix(self, ratio: float) -> Float[Array, "nodes nodes"]:
         """Return the matrix from Legendre modes of a step to values at the nodes of the next one.
 
         Args:
             ratio: length of the next step over that of this one.
-
-        Returns:
-            (S, S).
 
         """
         if ratio not in self._extrapolation_cache:
@@ -70,14 +68,16 @@ class GaussTables:
             )
         return self._extrapolation_cache[ratio]
 
-    def mode_integrals(self, tau: Array) -> tuple[Array, Array]:
+    def mode_integrals(
+        self, tau: Float[Array, "samples"]
+    ) -> tuple[Float[Array, "samples nodes"], Float[Array, "samples nodes"]]:
         """Integrate each Legendre mode once and twice from the start of the step.
 
         Args:
-            tau: upper limits (T,), fractions of the step.
+            tau: upper limits, fractions of the step.
 
         Returns:
-            (T, S) each: the first and the second integral.
+            The first and the second integral.
 
         """
         S, x = len(self.c), 2 * tau - 1
@@ -107,11 +107,11 @@ def gauss_tables(S: int) -> GaussTables:
 
 def integrate_collocation(
     chains: Sequence[Mechanism] | EliminatedSystem,
-    r: Array,
-    p: Array,
-    v: Array,
-    pdot: Array,
-    times: Array,
+    r: Float[Array, "bodies 3"],
+    p: Float[Array, "bodies 4"],
+    v: Float[Array, "bodies 3"],
+    pdot: Float[Array, "bodies 4"],
+    times: Float[Array, "samples"],
     rtol: float,
     *,
     nodes: int = DEFAULT_NODES,
@@ -130,11 +130,11 @@ def integrate_collocation(
 
     Args:
         chains: the mechanisms; M bodies in all.
-        r: initial positions (M, 3) [m], world frame, the bodies of all chains in order.
-        p: initial Euler parameters (M, 4).
-        v: initial velocities ṙ (M, 3) [m/s], world frame.
-        pdot: initial rates ṗ (M, 4) [1/s].
-        times: sample times (T,) [s], ascending from the initial time.
+        r: initial positions [m], world frame, the bodies of all chains in order.
+        p: initial Euler parameters.
+        v: initial velocities ṙ [m/s], world frame.
+        pdot: initial rates ṗ [1/s].
+        times: sample times [s], ascending from the initial time.
         rtol: tolerance of the error, relative to the `state_scales` of each chain; see ``dense``.
         nodes: S, of a step.
         sweep_tolerance: ends the sweeps of a step, relative like ``rtol``; 0.1 ``rtol`` by default.

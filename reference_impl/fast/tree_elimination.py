@@ -29,7 +29,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from reference_impl.direct import (
     RUN_RANK_TOLERANCE,
@@ -43,7 +42,7 @@ from reference_impl.euler_parameters import L, angular_velocity, cross, dot
 from reference_impl.fast.chain_elimination import StructuredSystem, component_first
 from reference_impl.integrate import Acceleration
 from reference_impl.joints import constraint_rows, joint_of_rows
-from reference_impl.mechanism import Array, Mechanism
+from reference_impl.mechanism import Array, Float, Indices, Int, Mechanism
 from reference_impl.singular_system import SingularSystem
 
 
@@ -51,17 +50,17 @@ from reference_impl.singular_system import SingularSystem
 class _Level:
     """Joints of one depth and one number of rows c."""
 
-    body: NDArray[np.intp]  # (g,) their near bodies
-    far: NDArray[np.intp]  # (g,) their far bodies, −1 the world
-    row: NDArray[np.intp]  # (g, c)
+    body: Int[Indices, "g"]  # their near bodies
+    far: Int[Indices, "g"]  # their far bodies, −1 the world
+    row: Int[Indices, "g c"]
 
 
 @dataclass(frozen=True, eq=False)
 class _Rows:
     """The rows of all joints, then of all rotors; forces of elements."""
 
-    C: Array  # (c,)
-    rate: Array  # (c,) Ċ
+    C: Float[Array, "c"]
+    rate: Float[Array, "c"]  # Ċ
     r_near: Array  # (rows, 3)
     p_near: Array  # (rows, 4)
     p_far: Array  # (rows, 4)
@@ -73,11 +72,13 @@ class _Rows:
 class TreeSystem:
     """Trees side by side; M bodies in all.  q = (r; p) and v = (ṙ; ṗ), (7, M), as in `StructuredSystem`."""
 
-    def __init__(self, chains: Sequence[Mechanism], x: Array | None = None) -> None:
+    def __init__(
+        self, chains: Sequence[Mechanism], x: Float[Array, "joints coordinates"] | None = None
+    ) -> None:
         """Join the mechanisms.
 
         Args:
-            x: joint coordinates (joints, 2) near which the angles of springs are taken [rad]; absent:
+            x: joint coordinates near which the angles of springs are taken [rad]; absent:
                 principal values.
 
         """
@@ -125,17 +126,23 @@ class TreeSystem:
             return self
         return type(self)(self.chains * count, None if self.x is None else np.tile(self.x, (count, 1)))
 
-    def acceleration(self, q: Array, v: Array, baumgarte: float = 0.0, x: Array | None = None) -> Array:
+    def acceleration(
+        self,
+        q: Float[Array, "7 bodies"],
+        v: Float[Array, "7 bodies"],
+        baumgarte: float = 0.0,
+        x: Float[Array, "joints coordinates"] | None = None,
+    ) -> Float[Array, "7 bodies"]:
         """Return the accelerations, on or off the constraints.
 
         Args:
-            q: (r; p) (7, M) [m, –].
-            v: (ṙ; ṗ) (7, M) [m/s, 1/s].
+            q: (r; p) [m, –].
+            v: (ṙ; ṗ) [m/s, 1/s].
             baumgarte: a [1/s]; adds −2 a Ċ − a² C to γ and likewise to γ_E.  0 is the notes' raw form.
-            x: joint coordinates (joints, 2) in place of those of the constructor.
+            x: joint coordinates in place of those of the constructor.
 
         Returns:
-            (r̈; p̈) (7, M) [m/s², 1/s²].
+            (r̈; p̈) [m/s², 1/s²].
 
         Raises:
             SingularSystem: S is singular.
@@ -171,15 +178,22 @@ class TreeSystem:
             raise SingularSystem("the accelerations are not finite: S is singular, or the state is no number")
         return found, multiplier, rows
 
-    def solve(self, r: Array, p: Array, v: Array, pdot: Array, *, x: Array | None = None) -> Solution:
+    def solve(
+        self,
+        r: Float[Array, "bodies 3"],
+        p: Float[Array, "bodies 4"],
+        v: Float[Array, "bodies 3"],
+        pdot: Float[Array, "bodies 4"],
+        *,
+        x: Float[Array, "joints coordinates"] | None = None,
+    ) -> Solution:
         """Solve (N5) for every tree.
 
         Args:
-            r: positions (M, 3) [m], world frame.
-            p: Euler parameters (M, 4).
-            v: velocities ṙ (M, 3) [m/s], world frame.
-            pdot: rates ṗ (M, 4) [1/s].
-            x: joint coordinates (joints, 2) in place of those of the constructor.
+            r: positions [m], world frame.
+            v: velocities ṙ [m/s], world frame.
+            pdot: rates ṗ [1/s].
+            x: joint coordinates in place of those of the constructor.
 
         Returns:
             r̈, p̈, λ and the wrenches at the joints, those of elements included; λ_E is not computed (NaN).
@@ -210,12 +224,14 @@ class TreeSystem:
             joint_moment=joint_moments(forest, p, pull, of_p),
         )
 
-    def project(self, q: Array, v: Array) -> tuple[Array, Array]:
+    def project(
+        self, q: Float[Array, "7 bodies"], v: Float[Array, "7 bodies"]
+    ) -> tuple[Float[Array, "7 bodies"], Float[Array, "7 bodies"]]:
         """Project onto C = 0, pᵀp = 1, Ċ = 0, pᵀṗ = 0 by Newton steps in the metric of M and 4 LᵀJL.
 
         Args:
-            q: (r; p) (7, M) [m, –].
-            v: (ṙ; ṗ) (7, M) [m/s, 1/s].
+            q: (r; p) [m, –].
+            v: (ṙ; ṗ) [m/s, 1/s].
 
         Returns:
             q and v on the constraints.
@@ -240,7 +256,7 @@ class TreeSystem:
         """Append zeros for the rows of rotors."""
         return np.concatenate([values, np.zeros(len(self.joint) - len(values))])
 
-    def _rows(self, q: Array, v: Array, x: Array | None = None) -> _Rows:
+    def _rows(self, q: Array, v: Array, x: Float[Array, "joints coordinates"] | None = None) -> _Rows:
         state = q[:3].T, q[3:].T, v[:3].T, v[3:].T
         rows = constraint_rows(self.forest, *state)
         rate = rows.constraint_rate(*state[2:])
@@ -356,7 +372,9 @@ class DenseSystem(TreeSystem):
 EliminatedSystem = StructuredSystem | TreeSystem
 
 
-def eliminated_system(mechanisms: Sequence[Mechanism], x: Array | None = None) -> EliminatedSystem:
+def eliminated_system(
+    mechanisms: Sequence[Mechanism], x: Float[Array, "joints coordinates"] | None = None
+) -> EliminatedSystem:
     """Make the form of the notes' system that motions are integrated in: O(bodies) where there are no loops.
 
     Args:
@@ -385,7 +403,9 @@ def eliminated_acceleration(chain: Mechanism) -> Acceleration:
     """
     system = eliminated_system([chain])
 
-    def acceleration(r: Array, p: Array, v: Array, pdot: Array, x: Array | None = None) -> Array:
+    def acceleration(
+        r: Array, p: Array, v: Array, pdot: Array, x: Float[Array, "joints coordinates"] | None = None
+    ) -> Array:
         if isinstance(system, TreeSystem):
             system.x = x
         a = system.acceleration(component_first(r, p), component_first(v, pdot))

@@ -13,6 +13,7 @@ CASES = {
     "Args repeats the name 'mass'": (
         'def f(mass: int) -> None:\n    """Weigh it.\n\n    Args:\n        mass: the mass.\n    """\n'
     ),
+    "an array without a shape": 'def f(x: Sequence[Array]) -> Float[Array, "3"]:\n    """Weigh it."""\n',
 }  # fmt: skip
 
 
