@@ -391,7 +391,7 @@ def test_accelerations_that_are_not_carried_break_the_way_back():
 @pytest.mark.parametrize("engine", ["exudyn", "exudyn-tree"])
 def test_a_linear_solver_that_solves_something_else_is_seen(engine):
     sound = load_adapter(engine)
-    faulty = plant(type(sound), replace(defect_named("distal-1e-5"), engine=engine))
+    faulty = plant(replace(defect_named("distal-1e-5"), engine=engine))
     sound.with_option = faulty.with_option
     for held in check_run_relations(
         sound, model := pendulums.make_model(JOINT_PATTERNS["balls"]), pendulums.state_from_seed(model, 1)
