@@ -32,6 +32,7 @@ class Arithmetic(Protocol):
     cross: Callable[[Any, Any], Any]  # a × b
     cross_matrix: Callable[[Any], Any]  # ã: ã b = a × b
     inverse: Callable[[Any], Any]  # of a symmetric 3×3 matrix
+    inverse_parts: Callable[[Any], tuple[Any, Any]]  # a matrix X and a scalar d with X/d the inverse
     sqrt: Callable[[Any], Any]  # of a scalar that is not negative, but for rounding
     sin_cos: Callable[[Any], tuple[Any, Any]]  # of a scalar
     turn_over_sine: Callable[[Any, Any], Any]  # θ/sin θ by sin θ and cos θ, 0 ≤ θ < π
@@ -111,6 +112,9 @@ class _Floats:
         cofactors = self.cross(a.take(_NEXT, -1), a.take(_LAST, -1))
         with np.errstate(divide="ignore", invalid="ignore"):
             return self.symmetric(cofactors / self.dot(a[..., :1], cofactors[..., :1]))
+
+    def inverse_parts(self, a: Any) -> tuple[Any, Any]:
+        return self.inverse(a), self.scalar(1.0)
 
     def sqrt(self, x: Any) -> Any:
         return np.sqrt(x)

@@ -84,6 +84,9 @@ class _Balls:
     def inverse(self, a: Any) -> Any:
         return a.inv()
 
+    def inverse_parts(self, a: Any) -> tuple[Any, Any]:
+        return a.inv(), self.arb(1)
+
     def sqrt(self, x: Any) -> Any:
         return x.nonnegative_part().sqrt()
 

@@ -166,6 +166,9 @@ class _Jets:
         x = self.num.inverse(a.value)
         return Jet(x, None if a.slope is None else self.num.symmetric(-(x @ a.slope @ x)))
 
+    def inverse_parts(self, a: Jet) -> tuple[Jet, Jet]:
+        return self.inverse(a), self.scalar(1.0)
+
     def sqrt(self, x: Jet) -> Jet:
         root = self.num.sqrt(x.value)
         if x.slope is None:

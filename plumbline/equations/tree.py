@@ -77,18 +77,20 @@ class _Swing:
     def reduce(self, x: Articulated) -> Articulated:
         num = self.num
         across = None if self.across is None else num.widened(self.across, x.f)
-        self.f, self.inverse = x.f if across is None else x.f - across, num.inverse(x.c)
-        self.w = num.mul(self.inverse, self.u)
-        self.size = 1 / num.dot(self.u, self.w)
-        self.push = num.widened(self.pull, x.f) + num.mul(num.transpose(self.w), self.f)
-        c = num.mul(self.u, num.transpose(self.u)) * self.size
-        f = num.mul(self.u, self.push * self.size)
+        self.f = x.f if across is None else x.f - across
+        self.adjugate, self.determinant = num.inverse_parts(x.c)
+        w = num.mul(self.adjugate, self.u)
+        share = 1 / num.dot(self.u, w)
+        self.size = self.determinant * share
+        self.push = num.widened(self.pull * self.size, x.f) + num.mul(num.transpose(w), self.f) * share
+        c = num.symmetric(num.mul(self.u * self.size, num.transpose(self.u)))
+        f = num.mul(self.u, self.push)
         return Articulated(c, None, None, f if across is None else f + across, None)
 
     def advance(self, a: Any, alpha: Any) -> tuple[Any, Any, Any]:
         num = self.num
-        tension = (num.mul(num.transpose(self.u), a) + self.push) * self.size
-        near = num.mul(self.inverse, num.mul(self.u, tension) - self.f)
+        tension = num.mul(num.transpose(self.u), a) * self.size + self.push
+        near = num.mul(self.adjugate, num.mul(self.u, tension) - self.f) * (1 / self.determinant)
         return near, alpha, near - a
 
 
@@ -169,6 +171,18 @@ class _Single:
         return (a, alpha + gained, rate) if self.turns else (a + gained, alpha, rate)
 
 
+def rotation_rows(p: Sequence[Any]) -> tuple[list[list[Any]], Any]:
+    """Return pᵀp A of a quaternion of four scalars, row by row, and pᵀp."""
+    w, x, y, z = p
+    ww, xx, yy, zz = w * w, x * x, y * y, z * z
+    rows = [
+        [ww + xx - yy - zz, (x * y - w * z) * 2, (x * z + w * y) * 2],
+        [(x * y + w * z) * 2, ww - xx + yy - zz, (y * z - w * x) * 2],
+        [(x * z - w * y) * 2, (y * z + w * x) * 2, ww - xx - yy + zz],
+    ]
+    return rows, ww + xx + yy + zz
+
+
 class Tree:
     """A tree at a state: lists over the bodies, in world axes.
 
@@ -201,6 +215,7 @@ class Tree:
         self.arm: list[Any] = []
         self._bias: list[tuple[Any, Any]] = []  # acceleration of the carried point, angular acceleration
         self.blocks: list[list[Any]] = []
+        self._inward: list[Any] = []  # ω × (ω × s) of the near points
         self._kinetic = self._potential = num.scalar(0.0)  # of the joints' elements
         for k in range(model.n):
             self._add_body(k)
@@ -224,14 +239,8 @@ class Tree:
             A matrix, body → world.
 
         """
-        w, x, y, z = p
-        ww, xx, yy, zz = w * w, x * x, y * y, z * z
-        rows = [
-            [ww + xx - yy - zz, (x * y - w * z) * 2, (x * z + w * y) * 2],
-            [(x * y + w * z) * 2, ww - xx + yy - zz, (y * z - w * x) * 2],
-            [(x * z - w * y) * 2, (y * z + w * x) * 2, ww - xx - yy + zz],
-        ]
-        return self.num.from_rows(rows) * (1 / (ww + xx + yy + zz))
+        rows, square = rotation_rows(p)
+        return self.num.from_rows(rows) * (1 / square)
 
     def _add_body(self, k: int) -> None:
         """Go from the far body along joint k to body k."""
@@ -244,7 +253,7 @@ class Tree:
             above, w, lever = self.A[far], self.w[far], num.mul(self.A[far], hang)
             P, v = self.r[far] + lever, self.v[far] + num.cross(w, lever)
             arm = lever - self.near[far]
-            bend = num.cross(w, num.cross(w, arm))
+            bend = self.centripetal(far, hang, lever) - self._inward[far]
         swing, blocks = self.zero, list[Any]()
         if kind.has_attitude:
             A, own = self.attitude(k)
@@ -262,10 +271,12 @@ class Tree:
             swing, w = num.cross(w, relative), own
         else:
             A, P, v, w, arm, bend, swing, blocks = self._move(k, above, P, v, w, arm, bend)
-        near = self.zero if kind.holds_nothing else num.mul(A, num.vector(model.point[..., k, 1, :]))
+        point = num.vector(model.point[..., k, 1, :])
+        near = self.zero if kind.holds_nothing else num.mul(A, point)
         self.A.append(A)
         self.w.append(w)
         self.near.append(near)
+        self._inward.append(self.zero if kind.holds_nothing else self.centripetal(k, point, near))
         self.arm.append(arm)
         self.r.append(P - near)
         self.v.append(v - num.cross(w, near))
@@ -312,6 +323,53 @@ class Tree:
         """
         return self.num.matrix(self.model.inertia[..., k, :, :])
 
+    def near_inertia(self, k: int) -> Any:
+        """Return the inertia of a body about its near point.
+
+        Returns:
+            A matrix, body axes [kg m²].
+
+        """
+        num, J, model = self.num, self.inertia(k), self.model
+        if KINDS[model.kind[k]].holds_nothing:
+            return J
+        s = num.cross_matrix(num.vector(model.point[..., k, 1, :]))
+        return J - num.mul(s, s) * num.scalar(model.mass[..., k])
+
+    def centripetal(self, k: int, point: Any, arm: Any) -> Any:
+        """Return ω × (ω × s) of a point of body k.
+
+        Args:
+            point: s in body axes [m].
+            arm: s in world axes.
+
+        Returns:
+            A vector in world axes.
+
+        """
+        return self.num.cross(self.w[k], self.num.cross(self.w[k], arm))
+
+    def gyroscopic(self, k: int, inertia: Any) -> Any:
+        """Return ω × (I ω) of body k.
+
+        Args:
+            inertia: I about the near point, world axes.
+
+        Returns:
+            A vector in world axes.
+
+        """
+        return self.num.cross(self.w[k], self.num.mul(inertia, self.w[k]))
+
+    def joint_axes(self, k: int, side: int) -> Any:
+        """Return the axes of joint k in its far (0) or its near body (1).
+
+        Returns:
+            A matrix.
+
+        """
+        return self.rotation(self.model.turn[..., k, side, :])
+
     def rod_direction(self, k: int) -> tuple[Any, Any]:
         """Return the direction u of rod k as a unit vector and u̇ perpendicular to it.
 
@@ -336,7 +394,7 @@ class Tree:
     def _move(self, k: int, above: Any, P: Any, v: Any, w: Any, arm: Any, bend: Any) -> tuple[Any, ...]:
         """Go along the scalar motions of joint k."""
         num, model = self.num, self.model
-        A, swing, blocks = num.mul(above, self.rotation(model.turn[..., k, 0, :])), self.zero, []
+        A, swing, blocks = num.mul(above, self.joint_axes(k, 0)), self.zero, []
         elements = ("armature", "damping", "stiffness", "rest", "effort")
         for i, (what, number) in enumerate(KINDS[model.kind[k]].motions):
             x, rate = self.coordinate(k, i)
@@ -359,7 +417,7 @@ class Tree:
             else:
                 swing, w = swing + num.cross(w, axis) * rate, w + axis * rate
                 A = num.mul(A, self._turn_about(number, x))
-        A = num.mul(A, num.transpose(self.rotation(model.turn[..., k, 1, :])))
+        A = num.mul(A, num.transpose(self.joint_axes(k, 1)))
         return A, P, v, w, arm, bend, swing, blocks
 
     def _turn_about(self, axis: int, angle: Any) -> Any:
@@ -380,20 +438,28 @@ class Tree:
         a, damping, stiffness = (num.scalar(x) for x in numbers)
         effort = -spin * damping
         if np.any(numbers[2]):
-            axes = num.mul(above, self.rotation(model.turn[..., k, 0, :]))
-            R = num.mul(num.transpose(axes), num.mul(A, self.rotation(model.turn[..., k, 1, :])))
+            far, near = num.mul(above, self.joint_axes(k, 0)), num.mul(A, self.joint_axes(k, 1))
+            R = num.mul(near, num.transpose(far))
 
             def entry(i: int, j: int) -> Any:
                 return num.entry(R, i, j)
 
-            sine = [[(entry(i, j) - entry(j, i)) / 2] for i, j in ((2, 1), (0, 2), (1, 0))]
-            z = num.mul(axes, num.from_rows(sine))
-            cosine = (entry(0, 0) + entry(1, 1) + entry(2, 2) - 1) / 2
-            turn = z * num.turn_over_sine(num.sqrt(num.dot(z, z)), cosine)
+            sine = num.from_rows([[(entry(i, j) - entry(j, i)) / 2] for i, j in ((2, 1), (0, 2), (1, 0))])
+            turn = sine * self.turn_over_sine(k, sine, (entry(0, 0) + entry(1, 1) + entry(2, 2) - 1) / 2)
             effort = effort - turn * stiffness
             self._potential = self._potential + stiffness * num.dot(turn, turn) / 2
         self._kinetic = self._kinetic + a * num.dot(spin, spin) / 2
         return effort, a if np.any(numbers[0]) else None
+
+    def turn_over_sine(self, k: int, sine: Any, cosine: Any) -> Any:
+        """Return θ/sin θ of the turn θ of a joint with all turns.
+
+        Args:
+            sine: sin θ times the axis, a vector in world axes.
+            cosine: cos θ.
+
+        """
+        return self.num.turn_over_sine(self.num.sqrt(self.num.dot(sine, sine)), cosine)
 
     def _pulls(self) -> tuple[dict[int, tuple[Any, Any]], Any]:
         """What springs between points do to bodies: force, moment about the near point; and their energy."""
@@ -451,13 +517,13 @@ class Tree:
         self, k: int, pull: tuple[Any, Any] | None, wrenches: Sequence[Mapping[int, tuple[Any, Any]]]
     ) -> Articulated:
         """What body k needs by itself: under its loads, and in further columns against each wrench alone."""
-        num, model, s, w = self.num, self.model, self.near[k], self.w[k]
+        num, model, s = self.num, self.model, self.near[k]
         c, b, i = self._inertia(k)
         m = num.scalar(model.mass[..., k])
         load, moment = self._own_load(k)
-        load, moment = load + num.vector(model.gravity) * m, moment - num.cross(w, self._spin(k))
-        f = -num.cross(w, num.cross(w, s)) * m - load
-        n = -num.cross(s, f) - moment
+        load = load + num.vector(model.gravity) * m
+        f = -self._inward[k] * m - load
+        n = self.gyroscopic(k, i) + num.cross(s, load) - moment
         if pull is not None:
             f, n = f - pull[0], n - pull[1]
         if wrenches:
@@ -509,18 +575,16 @@ class Tree:
             if KINDS[self.model.kind[k]].holds_distance:
                 swing = self.blocks[k][0]
                 a = a + swing.u * swing.pull
-            s, w = self.near[k], self.w[k]
             at.append(a)
             turning.append(alpha)
-            acceleration.append(a + num.cross(s, alpha) - num.cross(w, num.cross(w, s)))
+            acceleration.append(a + num.cross(self.near[k], alpha) - self._inward[k])
         return acceleration, turning
 
     def _inertia(self, k: int) -> tuple[Any, Any, Any]:
         """c, b and i of body k by itself."""
         num, m, s = self.num, self.num.scalar(self.model.mass[..., k]), self.num.cross_matrix(self.near[k])
-        inertia = num.mul(num.mul(self.A[k], self.inertia(k)), num.transpose(self.A[k]))
-        b = s * m
-        return self.one * m, b, num.symmetric(inertia - num.mul(b, s))
+        inertia = num.mul(num.mul(self.A[k], self.near_inertia(k)), num.transpose(self.A[k]))
+        return self.one * m, s * m, num.symmetric(inertia)
 
     def solve(self, wrenches: Sequence[Mapping[int, tuple[Any, Any]]] = ()) -> Solution:
         """Solve for the accelerations and the wrenches of the joints.
@@ -541,14 +605,11 @@ class Tree:
         total = [self._body_alone(k, pulls.get(k), wrenches) for k in range(n)]
         carried: list[Any] = [None] * n
         for k in reversed(range(n)):
-            x = total[k]
-            for block in reversed(self.blocks[k]):
-                x = block.reduce(x)
-            carried[k] = x
+            carried[k] = x = self.reduced(k, total[k])
             if self.far[k] >= 0:
                 total[self.far[k]] = self._carry(k, x, total[self.far[k]])
         acceleration, turning, forces, moments = list[Any](), list[Any](), list[Any](), list[Any]()
-        rates: list[list[Any]] = [[] for _ in range(n)]
+        rates: list[list[Any]] = [[]] * n
         at: list[Any] = []  # accelerations of the near points
         for k in range(n):
             far, x = self.far[k], carried[k]
@@ -560,17 +621,37 @@ class Tree:
             if x.b is not None:
                 force = force + num.mul(x.b, alpha)
                 moment = num.mul(num.transpose(x.b), a) + num.mul(x.i, alpha) + x.n
-            for block in self.blocks[k]:
-                a, alpha, rate = block.advance(a, alpha)
-                rates[k].append(rate)
+            a, alpha, rates[k] = self.advanced(k, a, alpha)
             at.append(a)
             turning.append(alpha)
             forces.append(force)
             moments.append(moment)
-            w, s = self.w[k], self.near[k]
-            swing = num.widened(num.cross(w, num.cross(w, s)), a)
-            acceleration.append(a + num.mul(num.cross_matrix(s), alpha) - swing)
+            inward = num.widened(self._inward[k], a)
+            acceleration.append(a + num.mul(num.cross_matrix(self.near[k]), alpha) - inward)
         return Solution(acceleration, turning, forces, moments, rates)
+
+    def reduced(self, k: int, x: Articulated) -> Articulated:
+        """Take the motions of joint k out of what its body and all beyond need."""
+        for block in reversed(self.blocks[k]):
+            x = block.reduce(x)
+        return x
+
+    def advanced(self, k: int, a: Any, alpha: Any) -> tuple[Any, Any, list[Any]]:
+        """Go from the far side of joint k to the near one.
+
+        Args:
+            a: acceleration of the point that the joint carries, without its own motions.
+            alpha: angular acceleration before them.
+
+        Returns:
+            Both with the joint's motions, and its rates as `Solution` has them.
+
+        """
+        rates = list[Any]()
+        for block in self.blocks[k]:
+            a, alpha, rate = block.advance(a, alpha)
+            rates.append(rate)
+        return a, alpha, rates
 
     def quantities(self, solution: Solution) -> dict[str, Any]:
         """Return the state quantities but the mass matrix, by name: of those per body a list.

@@ -1,48 +1,81 @@
-"""Motion by heyoka's adaptive Taylor method in minimal coordinates, in double, extended or quad precision.
+"""Motion by heyoka's adaptive Taylor method in joint coordinates, in double, extended or quad precision.
 
-Coordinates per body: the quaternion p, ω′, and for a rod u, u̇ (world frame).  The joint forces come from the
-block elimination described in `certified_state`, written as expressions in the coordinates; no constraint is
-integrated, so nothing drifts.  Mechanisms with other joints have the equations of `taylor_tree`; loops are
-held by accelerations there, and drift by rounding.  One compiled integrator serves every model with the same
-sequence of joints: the numbers of the model enter as parameters, which also keeps double-precision constants
-out of the quad model.  Vectors (3,) and matrices (3, 3) of expressions are NumPy arrays of objects.
+The equations are those of `plumbline.equations.tree`, as expressions in the coordinates: u, u̇ of a rod (world
+axes), r, ṙ of a free body, p and ω′ of both and of balls, x and ẋ of the other joints.  No constraint is
+integrated, so nothing drifts; only loops are held by accelerations, and drift by rounding: they are cut open
+(`plumbline.model.loops`), and the forces on the ends follow from the tree's response to unit wrenches.
+
+A spring of a joint with all turns needs θ/sin θ of its turn θ, which has no Taylor series by recurrence where
+θ = 0.  Hence θ² and γ = θ/(6 sin θ) are integrated beside the motion; (8) of `certificate_checker` has their
+rates, whose series in θ² is f₀.
+
+The numbers of the model enter as parameters, which keeps numbers that were rounded to doubles out of the
+equations.  What is exactly 0 is left out: one compiled integrator serves every model with the same joints and
+the same zeros.
 """
 
 from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from plumbline.model.datatypes import Array, EngineFailure, Model, State
-from plumbline.model.kinematics import forward_kinematics
-from plumbline.model.loops import cut_open
+from plumbline.equations import arithmetic, objects, tree
+from plumbline.model.datatypes import (
+    JOINT_ELEMENTS,
+    KINDS,
+    ZERO_INERTIA,
+    Array,
+    EngineFailure,
+    Kind,
+    Model,
+    State,
+)
+from plumbline.model.kinematics import forward_kinematics, rotation_matrix
+from plumbline.model.loops import CutMechanism, cut_open, independent_rows
 from plumbline.processes.processor import processor_features
 from plumbline.processes.user_cache import content_key, recall, remember
-from plumbline.truth import import_truth_tool, taylor_tree
-from plumbline.truth.taylor_tree import Closure, Topology, rotation_matrix, vector
+from plumbline.truth import import_truth_tool
 
 Precision = Literal["double", "extended", "quad", "octuple"]
 OCTUPLE_BITS, OCTUPLE_DIGITS = 237, 75
-_Joints = tuple[bool, ...] | Topology  # of a chain whether each joint is a rod
+BALL_SPRING_TERMS = 40  # of f₀
+# Numbers of a model that are parameters as they are
+PLAIN_NUMBERS = (
+    "gravity", "mass", "point", "length", "force", "moment", "drag_force", "drag_moment", *JOINT_ELEMENTS,
+    "spring_point", "spring_stiffness", "spring_damping", "spring_length",
+)  # fmt: skip
+# Of a loop the bodies b and c, and which of the six rows are held: shifts, then turns, in axes of b.
+Closure = tuple[int, int, tuple[int, ...]]
+
+
+class Structure(NamedTuple):
+    """What the equations depend on besides the values of the parameters."""
+
+    kind: tuple[Kind, ...]
+    body: tuple[tuple[int, int], ...]
+    springs: tuple[tuple[int, int], ...]  # bodies of springs between points
+    closures: tuple[Closure, ...]
+    # by name the shape, and the entries: a constant, or None for a parameter
+    numbers: tuple[tuple[str, tuple[int, ...], tuple[float | None, ...]], ...]
 
 
 @dataclass(frozen=True, eq=False)
 class MinimalCoordinateRun:
-    """A motion in minimal coordinates; arrays hold numbers of the precision's own type."""
+    """A motion in minimal coordinates; arrays hold numbers of the precision's own type, at most extended."""
 
     t: Array  # (T,) s
     p: Any  # (T, N, 4)
     omega: Any  # (T, N, 3) rad/s, body frame
     u: Any  # (T, N, 3), world frame; 0 for ball joints
     udot: Any  # (T, N, 3) 1/s, world frame
-    r: Any  # (T, N, 3) m, world frame, computed from the coordinates in the same precision
+    r: Any  # (T, N, 3) m, world frame, computed from the coordinates
     v: Any  # (T, N, 3) m/s, world frame
     steps: int
 
@@ -65,28 +98,48 @@ def simulate_taylor(
             jumps, or heyoka was built without quad precision.
 
     """
-    if model.has_loops:
-        cut = cut_open(model)
-        there, bodies = cut.state(state), cut.place[: model.n]
-        run = _simulate(cut.model, there, times, precision, taylor_tree.closures(cut, there))
-        names = ("p", "omega", "u", "udot", "r", "v")
-        return replace(run, **{name: getattr(run, name)[:, bodies] for name in names})
-    return _simulate(model, state, times, precision, ())
+    if not model.has_loops:
+        return _simulate(model, state, times, precision)
+    cut = cut_open(model)
+    there, bodies = cut.state(state), cut.place[: model.n]
+    run = _simulate(cut.model, there, times, precision, _closures(cut, there))
+    names = ("p", "omega", "u", "udot", "r", "v")
+    return replace(run, **{name: getattr(run, name)[:, bodies] for name in names})
 
 
 def _simulate(
-    model: Model, state: State, times: Array, precision: Precision, closures: tuple[Closure, ...]
+    model: Model, state: State, times: Array, precision: Precision, closures: tuple[Closure, ...] = ()
 ) -> MinimalCoordinateRun:
     """Integrate a tree, its loops closed."""
     integrator, number = _prepared_integrator(model, state, precision, closures=closures)
     outcome, _, _, steps, _, samples = integrator.propagate_grid([number(float(t)) for t in times])
     if "time_limit" not in str(outcome):
         raise EngineFailure(f"heyoka stopped: {outcome}")
-    if not model.is_chain:
-        return _tree_kinematics(model, times, samples, int(steps))
-    proximal, distal = ([vector(map(number, s)) for s in x] for x in (model.proximal, model.distal))
-    length = [number(x) for x in model.length]
-    return _forward_kinematics(model, times, np.asarray(samples), proximal, distal, length, int(steps))
+    y = np.asarray(samples)
+    if y.dtype not in (np.dtype(float), np.dtype(np.longdouble)):
+        y = np.vectorize(lambda x: np.longdouble(str(x)), otypes=[np.longdouble])(y)
+    shape = {"p": 4, "x": model.columns, "xdot": model.columns}
+    names = ("p", "omega", "u", "udot", "r", "v", "x", "xdot")
+    parts = {name: np.zeros((len(times), model.n, shape.get(name, 3)), y.dtype) for name in names}
+    parts["p"][..., 0], at = 1, 0
+    for k, kind in enumerate(model.kind):
+        for name, size in _coordinate_names(kind):
+            parts[name][:, k, :size] = y[:, at : at + size]
+            at += size
+    p, omega, r, v = forward_kinematics(model, *parts.values())
+    return MinimalCoordinateRun(times, p, omega, parts["u"], parts["udot"], r, v, int(steps))
+
+
+def _closures(cut: CutMechanism, state: State) -> tuple[Closure, ...]:
+    """Choose rows that close the loops and do not depend on others, at a state with the ends together."""
+    J = cut.jacobian(state).reshape(len(cut.ends), 6, -1)
+    for block, (b, _) in zip(J, cut.ends, strict=True):
+        block[:3] = rotation_matrix(state.p[b]).T @ block[:3]
+    rows = independent_rows(J.reshape(-1, J.shape[-1]), cut.row_scale)
+    return tuple(
+        (b, c, tuple(int(row) - 6 * loop for row in rows if row // 6 == loop))
+        for loop, (b, c) in enumerate(cut.ends)
+    )
 
 
 def taylor_series(
@@ -124,11 +177,11 @@ def _positions_then_rates(model: Model) -> list[tuple[int, bool]]:
     """Places in heyoka's state of p, u or r, x of all bodies, then of rates, and whether each is one."""
     q: list[int] = []
     v: list[int] = []
-    springs = taylor_tree.topology(model).ball_springs
-    first, last = 0, sum(size for kind in model.kind for _, size in taylor_tree.coordinate_names(kind))
+    springs = _ball_springs(model)
+    first, last = 0, sum(size for kind in model.kind for _, size in _coordinate_names(kind))
     for k, kind in enumerate(model.kind):
         own: dict[str, list[int]] = {}
-        for name, size in taylor_tree.coordinate_names(kind):
+        for name, size in _coordinate_names(kind):
             own[name] = [*range(first, first + size)]
             first += size
         if k in springs:
@@ -169,18 +222,26 @@ def _prepared_integrator(
 ) -> tuple[Any, Callable[[Any], Any]]:
     """The integrator of a model at time 0 in a state, and the conversion to its numbers."""
     mp, number = import_truth_tool("mpmath"), _number_conversion(precision)
-    joints: _Joints = taylor_tree.topology(model)._replace(closures=closures)
-    parameters, values = taylor_tree.parameter_values, taylor_tree.initial_values
-    if model.is_chain:
-        joints = tuple(bool(rod) for rod in model.rods)
-        parameters, values = _parameter_values, _initial_values
-    integrator = _compiled_integrator(joints, model.has_drag, precision, order)
     with mp.workdps(100):
-        used = len(integrator.pars)  # up to the last parameter that appears in the equations
-        integrator.pars[:] = [number(x) for x in parameters(mp, model)[:used]]
-        integrator.state[:] = [number(x) for x in values(mp, model, state)]
+        numbers, initial = _numbers_and_coordinates(mp, model, state, bool(closures))
+        shapes = tuple(
+            (name, x.shape, tuple(_constant(name, entry) for entry in x.flat)) for name, x in numbers.items()
+        )
+        body, springs = (tuple((int(a), int(b)) for a, b in x) for x in (model.body, model.spring_body))
+        structure = Structure(model.kind, body, springs, closures, shapes)
+        integrator = _compiled_integrator(structure, precision, order)
+        values = [
+            number(x) for name, every in numbers.items() for x in every.flat if _constant(name, x) is None
+        ]
+        integrator.pars[:] = values[: len(integrator.pars)]  # up to the last one that the equations have
+        integrator.state[:] = [number(x) for x in initial]
     integrator.time = number(0.0)
     return integrator, number
+
+
+def _constant(name: str, value: Any) -> float | None:
+    """A number that is left out of the parameters: 0, and of axes ±1, whose products are exact."""
+    return float(value) if value == 0 or (name == "axes" and abs(value) == 1) else None
 
 
 def _number_conversion(precision: Precision) -> Callable[[Any], Any]:
@@ -203,63 +264,109 @@ def _number_conversion(precision: Precision) -> Callable[[Any], Any]:
     return number
 
 
-def _initial_values(mp: Any, model: Model, state: State) -> list[Any]:
-    """Coordinates in the order of `_equations_of_motion`, normalised in mpmath's precision."""
+def _coordinate_names(kind: Kind) -> list[tuple[str, int]]:
+    """Fields of `State` with the coordinates of a joint in the order of the equations, and their sizes."""
+    joint = KINDS[kind]
+    if not joint.has_attitude:
+        count = len(joint.motions)
+        return [("x", count), ("xdot", count)] if count else []
+    place = [("u", 3), ("udot", 3)] if joint.holds_distance else []
+    place = [("r", 3), ("v", 3)] if joint.holds_nothing else place
+    return [*place, ("p", 4), ("omega", 3)]
+
+
+def _ball_springs(model: Model) -> list[int]:
+    """Joints with all turns and a spring."""
+    return [k for k, kind in enumerate(model.kinds) if kind.is_spherical and model.stiffness[k, 0] != 0]
+
+
+def _bare_joints(model: Model) -> list[int]:
+    """Rods and balls without elements whose bodies have inertia, no springs, and carry only such joints."""
+    principal = np.linalg.eigvalsh(model.inertia)
+    bare = (model.mass > 0) & (principal[:, 0] > ZERO_INERTIA * principal[:, 2])
+    bare &= ~np.isin(np.arange(model.n), model.spring_body)
+    bare &= bool(np.any(model.rods))  # balls alone need more products so
+    for k, kind in enumerate(model.kinds[: model.n]):
+        bare[k] &= kind.holds_no_turn and not any(np.any(getattr(model, name)[k]) for name in JOINT_ELEMENTS)
+    for k in reversed(range(model.n)):
+        if model.body[k, 0] >= 0 and not bare[k]:
+            bare[model.body[k, 0]] = False
+    return [int(k) for k in np.flatnonzero(bare)]
+
+
+class _PreciseTree(tree.Tree):
+    """A tree in numbers of mpmath, with the turns θ of joints with springs."""
+
+    def __init__(self, mp: Any, model: Model, state: State) -> None:
+        self.angles: dict[int, Any] = {}
+        self.mp = mp
+        super().__init__(objects.objects(mp, mp.mpf), model, state)
+
+    def turn_over_sine(self, k: int, sine: Any, cosine: Any) -> Any:
+        self.angles[k] = self.mp.atan2(self.mp.norm([*sine[:, 0]]), cosine)
+        return super().turn_over_sine(k, sine, cosine)
+
+
+def _numbers_and_coordinates(
+    mp: Any, model: Model, state: State, is_closed: bool
+) -> tuple[dict[str, Any], list[Any]]:
+    """Numbers of the model by name, and its coordinates, quaternions and directions normalised.
+
+    Gravity enters as a force.  ``reach`` leads from the near point of the far body to the joint's far point.
+    """
+    precise, n, lift = _PreciseTree(mp, model, state), model.n, np.vectorize(mp.mpf, otypes=[object])
+    numbers = {name: lift(getattr(model, name)) for name in PLAIN_NUMBERS}
+    point, mass = numbers["point"], numbers["mass"]
+    weight = mass[:, None] * numbers["gravity"]
+    numbers |= {"force": numbers["force"] + weight, "gravity": lift(np.zeros(3))}
+    numbers["axes"] = np.array([[precise.joint_axes(k, side) for side in (0, 1)] for k in range(n)])
+    numbers["inertia"] = np.array([precise.near_inertia(k) for k in range(n)])
+    numbers["per_length"] = np.array([1 / x if x else x for x in numbers["length"]])
+    numbers["terms"] = np.array([-1 / mp.mpf(2 * (i + 1) * (2 * i + 5)) for i in range(BALL_SPRING_TERMS)])
+    far = model.body[:n, 0]
+    numbers["reach"] = np.where((far >= 0)[:, None], point[:n, 0] - point[far, 1], mp.mpf(0))
+    numbers["mobility"] = lift(np.zeros((n, 6, 6)))
+    for k in () if is_closed else _bare_joints(model):
+        b = precise.num.cross_matrix(point[k, 1][:, None] * mass[k])
+        M = np.block([[precise.one * mass[k], b], [b.T, precise.near_inertia(k)]])
+        numbers["mobility"][k] = np.array((mp.matrix(M.tolist()) ** -1).tolist())
     values: list[Any] = []
-    for k in range(model.n):
-        p, omega, u, udot = (mp.matrix(x[k].tolist()) for x in (state.p, state.omega, state.u, state.udot))
-        if model.rods[k]:
-            u /= mp.norm(u)
-            udot -= u * (u.T * udot)[0]
-            values += [*u, *udot]
-        values += [*(p / mp.norm(p)), *omega]
-    return values
-
-
-def _parameter_values(mp: Any, model: Model) -> list[Any]:
-    """Numbers of the model in the order of `_Body`: gravity, then per body."""
-    values: list[Any] = model.gravity.tolist()
-    for k in range(model.n):
-        m, J = mp.mpf(float(model.mass[k])), mp.matrix(model.inertia[k].tolist())
-        J_inverse = J**-1
-        sp, sd = (_cross_matrix(mp, s[k]) for s in (model.proximal, model.distal))
-        values += [*J, *J_inverse]
-        for a, b in ((sp, sp), (sp, sd), (sd, sd)):
-            values += [*(mp.eye(3) / m - a * J_inverse * b)]
-        values += [*model.proximal[k].tolist(), *model.distal[k].tolist(), 1 / m]
-        values += [*(mp.matrix(model.force[k].tolist()) / m), *model.moment[k].tolist()]
-        values += [float(model.length[k]), float(model.drag_force[k]) / m, float(model.drag_moment[k])]
-    return values
-
-
-def _cross_matrix(mp: Any, s: Array) -> Any:
-    x, y, z = (mp.mpf(float(c)) for c in s)
-    return mp.matrix([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    for k, kind in enumerate(model.kind):
+        parts = {
+            name: mp.matrix(getattr(state, name)[k, :size].tolist()) for name, size in _coordinate_names(kind)
+        }
+        if KINDS[kind].has_attitude:
+            parts["p"] /= mp.norm(parts["p"])
+        if KINDS[kind].holds_distance:
+            parts |= zip(("u", "udot"), (x[:, 0] for x in precise.rod_direction(k)), strict=True)
+        values += [entry for part in parts.values() for entry in part]
+    for k in _ball_springs(model):
+        theta = precise.angles[k]
+        values += [theta**2, 1 / (6 * mp.sinc(theta))]
+    return numbers, values
 
 
 @cache
-def _compiled_integrator(joints: _Joints, drag: bool, precision: Precision, order: int | None = None) -> Any:
-    """The Taylor integrator of a mechanism with these joints; order None: the precision's own.
+def _compiled_integrator(structure: Structure, precision: Precision, order: int | None = None) -> Any:
+    """The Taylor integrator of a mechanism; order None: the precision's own.
 
     It is remembered with its machine code: to read it takes a third to a quarter of the time of compiling it.
     """
     hy = load_heyoka()
-    code = b"".join(Path(file).read_bytes() for file in (__file__, taylor_tree.__file__))
+    sources = (__file__, tree.__file__, objects.__file__, arithmetic.__file__)
+    code = b"".join(Path(file).read_bytes() for file in sources)
     key = content_key(
-        "Taylor", code, hy.__version__, processor_features(), repr((joints, drag, precision, order))
+        "Taylor", code, hy.__version__, processor_features(), repr((structure, precision, order))
     )
     integrator = recall(key, lambda found: hasattr(found, "propagate_grid"))
     if integrator is None:
-        integrator = _compile_integrator(hy, joints, drag, precision, order)
+        integrator = _compile_integrator(hy, structure, precision, order)
         remember(key, integrator)
     return integrator
 
 
-def _compile_integrator(hy: Any, joints: _Joints, drag: bool, precision: Precision, order: int | None) -> Any:
-    if isinstance(joints, Topology):
-        system = taylor_tree.equations_of_motion(hy, joints)
-    else:
-        system = _equations_of_motion(hy, joints, drag)
+def _compile_integrator(hy: Any, structure: Structure, precision: Precision, order: int | None) -> Any:
+    system = _ExpressionTree(hy, structure).equations(structure.closures)
     number = _number_conversion(precision)
     zero = number(0.0)
     # Unoptimised code takes two to three times as long to run and a tenth of the time to compile: for ten
@@ -274,188 +381,248 @@ def _compile_integrator(hy: Any, joints: _Joints, drag: bool, precision: Precisi
 # --- equations of motion as expressions -----------------------------------------------------------
 
 
-class _Body:
-    """Parameters (in the order of `_parameter_values`) and coordinates of one body as expressions."""
+class _ExpressionTree(tree.Tree):
+    """The mechanism at variables of heyoka, its numbers parameters or 0."""
 
-    def __init__(self, hy: Any, k: int, first_parameter: int) -> None:
-        self.next_parameter, self.hy = first_parameter, hy
-        self.J, self.J_inverse, self.Ypp, self.Ypd, self.Ydd = (self.take(9).reshape(3, 3) for _ in range(5))
-        self.sp, self.sd, (self.inverse_mass,) = self.take(3), self.take(3), self.take(1)
-        self.force_per_mass, self.moment = self.take(3), self.take(3)
-        self.length, self.drag_force_per_mass, self.drag_moment = self.take(3)
-        self.p, self.w, self.u, self.udot = (
-            vector(hy.make_vars(*(f"{name}{i}_{k}" for i in range(size))))
-            for name, size in (("p", 4), ("w", 3), ("u", 3), ("d", 3))
-        )
-        self.A = rotation_matrix(self.p)
+    def __init__(self, hy: Any, structure: Structure) -> None:
+        self.hy, parameter = hy, 0
+        found: dict[str, Any] = {}
+        for name, shape, entries in structure.numbers:
+            values: list[Any] = []
+            for entry in entries:
+                values.append(hy.par[parameter] if entry is None else entry)
+                parameter += entry is None
+            found[name] = np.fromiter(values, object, len(values)).reshape(shape)
+        own = ("axes", "per_length", "terms", "mobility", "reach")
+        self.axes, self.per_length, self.terms, self.mobility, self.reach = (found.pop(x) for x in own)
+        self.bare: dict[int, _BareJoint] = {}
+        self.springs: dict[int, Any] = {}  # sin θ times the axis
+        self.coordinates = [
+            {
+                name: [hy.expression(f"{name}{i}_{k}") for i in range(size)]
+                for name, size in _coordinate_names(kind)
+            }
+            for k, kind in enumerate(structure.kind)
+        ]
+        body, springs = (np.array(x, np.intp).reshape(-1, 2) for x in (structure.body, structure.springs))
+        turn = np.zeros((len(body), 2, 4), object)
+        model = Model(kind=structure.kind, body=body, spring_body=springs, turn=turn, **found)
+        super().__init__(objects.objects(hy), model, None)  # type: ignore[arg-type]
 
-    def take(self, count: int) -> Any:
-        self.next_parameter += count
-        return vector(self.hy.par[i] for i in range(self.next_parameter - count, self.next_parameter))
+    def column(self, k: int, name: str) -> Any:
+        return self.num.vector(self.coordinates[k][name])
 
-    def centripetal(self, s: Any) -> Any:
-        """ω′ × (ω′ × s) (3,), body frame."""
-        return np.cross(self.w, np.cross(self.w, s))
+    def coordinate(self, k: int, i: int) -> tuple[Any, Any]:
+        return self.coordinates[k]["x"][i], self.coordinates[k]["xdot"][i]
 
-    def point_acceleration(self, at_force: Any, at_below: Any, free: Any, force: Any, below: Any) -> Any:
-        """Acceleration of a point (3,): free motion, the proximal force, minus the force passed on below.
+    def attitude(self, k: int) -> tuple[Any, Any]:
+        A = self.num.from_rows(tree.rotation_rows(self.coordinates[k]["p"])[0])
+        return A, A @ self.column(k, "omega")
 
-        ``at_force`` and ``at_below`` are the mobilities of the point for the two forces, body frame.
-        """
-        pulled = at_force @ (self.A.T @ force)
-        if below is not None:
-            pulled = pulled - at_below @ (self.A.T @ below)
-        return free + self.A @ pulled
+    def free_point(self, k: int) -> tuple[Any, Any]:
+        return self.column(k, "r"), self.column(k, "v")
 
+    def rod_direction(self, k: int) -> tuple[Any, Any]:
+        return self.column(k, "u"), self.column(k, "udot")
 
-def _equations_of_motion(hy: Any, rods: tuple[bool, ...], drag: bool) -> list[tuple[Any, Any]]:
-    """Pairs (coordinate, its rate) of the chain."""
-    bodies: list[_Body] = []
-    for k in range(len(rods)):
-        bodies.append(_Body(hy, k, bodies[-1].next_parameter if bodies else 3))
-    turn, near_a, far_a = _free_accelerations(hy, rods, drag, bodies)
-    F = [*_joint_forces(rods, bodies, near_a, far_a), None]
-    system: list[tuple[Any, Any]] = []
-    hanging_point: Any = None  # acceleration of the distal point above
-    for k, body in enumerate(bodies):
-        couple = np.cross(body.sp, body.A.T @ F[k])
-        if F[k + 1] is not None:
-            couple = couple - np.cross(body.sd, body.A.T @ F[k + 1])
-        if rods[k]:  # ℓ ü is the acceleration of the rod's tip relative to its upper end
-            near = body.point_acceleration(body.Ypp, body.Ypd, near_a[k], F[k], F[k + 1])
-            relative = (near if hanging_point is None else near - hanging_point) / body.length
-            # the part along u is −u̇² u for a unit vector; written so, ‖u‖ does not drift
-            along = relative @ body.u + body.udot @ body.udot
-            system += [*zip(body.u, body.udot, strict=True)]
-            system += zip(body.udot, relative - along * body.u, strict=True)
-        if k + 1 < len(rods) and rods[k + 1]:
-            hanging_point = body.point_acceleration(body.Ypd.T, body.Ydd, far_a[k], F[k], F[k + 1])
-        p0, p1, p2, p3 = body.p
-        wx, wy, wz = 0.5 * body.w
-        p_rate = [-p1 * wx - p2 * wy - p3 * wz, p0 * wx - p3 * wy + p2 * wz]
-        p_rate += [p3 * wx + p0 * wy - p1 * wz, -p2 * wx + p1 * wy + p0 * wz]
-        w_rate = turn[k] + body.J_inverse @ couple
-        system += [*zip(body.p, p_rate, strict=True), *zip(body.w, w_rate, strict=True)]
-    return system
+    def joint_axes(self, k: int, side: int) -> Any:
+        return self.axes[k, side]
 
+    def near_inertia(self, k: int) -> Any:
+        return self.num.matrix(self.model.inertia[k])
 
-def _free_accelerations(
-    hy: Any, rods: tuple[bool, ...], drag: bool, bodies: list[_Body]
-) -> tuple[list[Any], list[Any], list[Any]]:
-    """Without joint forces: ω̇′ (body frame), accelerations of proximal and distal points (world frame)."""
-    gravity = vector(hy.par[i] for i in range(3))
-    turn: list[Any] = []
-    near_a: list[Any] = []
-    far_a: list[Any] = []
-    v = vector([hy.expression(0.0)] * 3)
-    for body, rod in zip(bodies, rods, strict=True):
-        moment = body.moment - np.cross(body.w, body.J @ body.w)
-        free = gravity + body.force_per_mass
-        if drag:
-            moment = moment - body.drag_moment * body.w
-            if rod:
-                v = v + body.length * body.udot
-            v = v - body.A @ np.cross(body.w, body.sp)
-            free = free - body.drag_force_per_mass * v
-            v = v + body.A @ np.cross(body.w, body.sd)
-        turn.append(body.J_inverse @ moment)
-        for point, accelerations in ((body.sp, near_a), (body.sd, far_a)):
-            inside = np.cross(turn[-1], point) + body.centripetal(point)
-            accelerations.append(free + body.A @ inside)
-    return turn, near_a, far_a
+    def centripetal(self, k: int, point: Any, arm: Any) -> Any:
+        if not KINDS[self.model.kind[k]].has_attitude:
+            return super().centripetal(k, point, arm)
+        squares = self.squares(k)
+        return self.A[k] @ ((squares - self.one * np.trace(squares)) @ point)
 
+    def gyroscopic(self, k: int, inertia: Any) -> Any:
+        if not KINDS[self.model.kind[k]].has_attitude:
+            return super().gyroscopic(k, inertia)
+        return self.A[k] @ self.gyration(k)
 
-def _joint_forces(
-    rods: tuple[bool, ...], bodies: list[_Body], near_a: list[Any], far_a: list[Any]
-) -> list[Any]:
-    """Force (3,) on each body at its proximal point, world frame, by block elimination along the chain."""
-    solves: list[Callable[[Any], Any]] = []
-    rhs: list[Any] = []
-    off: list[Any] = []  # (above, here)
-    directions = [body.u[:, None] if rod else None for body, rod in zip(bodies, rods, strict=True)]
-    for k, body in enumerate(bodies):
-        D, e, E = body.A @ body.Ypp @ body.A.T, -near_a[k], directions[k]
-        if k:
-            above = bodies[k - 1]
-            D, e = D + above.A @ above.Ydd @ above.A.T, e + far_a[k - 1]
-            coupling = -_project(directions[k - 1], above.A @ above.Ypd @ above.A.T, E)
-        D = _project(E, D, E)
-        if rods[k]:
-            e = vector([body.u @ e - body.length * (body.udot @ body.udot)])
-        if k:
-            off.append(coupling)
-            gain = np.stack([solves[-1](column) for column in coupling.T])
-            D, e = D - gain @ coupling, e - gain @ rhs[-1]
-        solves.append(_symmetric_solve(D))
-        rhs.append(e)
-    F: list[Any] = [None] * len(bodies)
-    multiplier: Any = None
-    for k in reversed(range(len(bodies))):
-        multiplier = solves[k](rhs[k] if multiplier is None else rhs[k] - off[k] @ multiplier)
-        F[k] = multiplier[0] * bodies[k].u if rods[k] else multiplier
-    return F
+    def gyration(self, k: int) -> Any:
+        """Return ω′ × (I′ ω′)."""
+        x = self.near_inertia(k) @ self.squares(k)
+        return self.num.vector([x[2, 1] - x[1, 2], x[0, 2] - x[2, 0], x[1, 0] - x[0, 1]])
 
+    def squares(self, k: int) -> Any:
+        """ω′ω′ᵀ: in body axes, products with the body's own numbers cost little."""
+        w = self.column(k, "omega")
+        return w @ w.T
 
-def _project(E: Any, Y: Any, E2: Any) -> Any:
-    """Eᵀ Y E2, where None stands for the identity."""
-    if E is not None:
-        Y = E.T @ Y
-    return Y if E2 is None else Y @ E2
+    def turn_over_sine(self, k: int, sine: Any, cosine: Any) -> Any:
+        self.springs[k] = sine
+        return 6.0 * self.hy.expression(f"ratio_{k}")
 
+    def reduced(self, k: int, x: tree.Articulated) -> tree.Articulated:
+        if not np.any(self.mobility[k] != 0):
+            return super().reduced(k, x)
+        self.bare[k] = _BareJoint(self, k)
+        return self.bare[k].articulated()
 
-def _symmetric_solve(D: Any) -> Callable[[Any], Any]:
-    """The map b → D⁻¹ b of a 1×1 or 3×3 symmetric positive definite D, by LDLᵀ."""
-    if len(D) == 1:
-        return lambda b: b / D[0, 0]
-    d0 = D[0, 0]
-    l10, l20 = D[1, 0] / d0, D[2, 0] / d0
-    d1 = D[1, 1] - l10 * D[1, 0]
-    c21 = D[2, 1] - l20 * D[1, 0]
-    l21 = c21 / d1
-    d2 = D[2, 2] - l20 * D[2, 0] - l21 * c21
+    def advanced(self, k: int, a: Any, alpha: Any) -> tuple[Any, Any, list[Any]]:
+        return self.bare[k].advanced(a) if k in self.bare else super().advanced(k, a, alpha)
 
-    def solve(b: Any) -> Any:
-        y1 = b[1] - l10 * b[0]
-        y2 = b[2] - l20 * b[0] - l21 * y1
-        x2 = y2 / d2
-        x1 = y1 / d1 - l21 * x2
-        return vector([b[0] / d0 - l10 * x1 - l20 * x2, x1, x2])
+    def equations(self, closures: Sequence[Closure]) -> list[tuple[Any, Any]]:
+        """Pairs (coordinate, its rate)."""
+        found = self.solve([wrench for closure in closures for wrench in self._wrenches(*closure)])
+        if closures:
+            rows = np.concatenate([self._relative(found, *closure) for closure in closures])
+            shares = np.concatenate([[[1.0]], _solve_symmetric(rows[:, 1:], -rows[:, :1])])
+            found = found.combined(lambda x: x @ shares)
+        system: list[tuple[Any, Any]] = []
+        for k, own in enumerate(self.coordinates):
+            rates = self._rates(k, found)
+            system += [pair for name, x in own.items() for pair in zip(x, rates[name], strict=True)]
+        for k in self.springs:
+            system += self._turn_rates(k)
+        number = self.hy.expression
+        return [(x, number(rate) if isinstance(rate, float) else rate) for x, rate in system]
 
-    return solve
+    def _rates(self, k: int, found: tree.Solution) -> dict[str, Any]:
+        """Rates of the coordinates of joint k by name."""
+        kind, own, blocks = KINDS[self.model.kind[k]], self.coordinates[k], found.rates[k]
+        if not kind.has_attitude:
+            return {"x": own.get("xdot"), "xdot": [rate.item() for rate in blocks]}
+        wx, wy, wz = (0.5 * w for w in own["omega"])
+        p0, p1, p2, p3 = own["p"]
+        rates: dict[str, Any] = {
+            "p": [
+                -p1 * wx - p2 * wy - p3 * wz,
+                p0 * wx - p3 * wy + p2 * wz,
+                p3 * wx + p0 * wy - p1 * wz,
+                -p2 * wx + p1 * wy + p0 * wz,
+            ],
+            "omega": (self.bare[k].turning if k in self.bare else self.A[k].T @ found.turning[k])[:, 0],
+        }
+        if kind.holds_distance:
+            u, udot = self.rod_direction(k)
+            relative = blocks[0] * self.per_length[k]
+            along = self.num.dot(relative, u) + self.num.dot(udot, udot)  # written so, ‖u‖ does not drift
+            rates |= {"u": own["udot"], "udot": (relative - u * along)[:, 0]}
+        if kind.holds_nothing:
+            rates |= {"r": own["v"], "v": blocks[0][:, 0]}
+        return rates
 
+    def _turn_rates(self, k: int) -> list[tuple[Any, Any]]:
+        """Pairs (θ², rate) and (γ, rate) of a joint with all turns and a spring."""
+        square, ratio = self.hy.make_vars(f"square_{k}", f"ratio_{k}")
+        spin = self.w[k] - self.w[self.far[k]] if self.far[k] >= 0 else self.w[k]
+        change, f = 12.0 * ratio * self.num.dot(self.springs[k], spin), 1.0
+        for term in reversed(self.terms):
+            f = square * f * term + 1.0
+        return [(square, change), (ratio, ratio * ratio * change * f)]
 
-def _forward_kinematics(
-    model: Model, times: Array, y: Any, proximal: list[Any], distal: list[Any], length: list[Any], steps: int
-) -> MinimalCoordinateRun:
-    """Coordinates by name, and r, v from the pivot outwards, in the precision of y (T, coordinates)."""
-    columns = iter(y.T)
-    zero = y[:, 0] - y[:, 0]
-    parts: dict[str, list[Any]] = {name: [] for name in ("p", "omega", "u", "udot", "r", "v")}
-    tip = tip_v = vector([zero] * 3)
-    for k in range(model.n):
-        u, udot = (vector([next(columns) if model.rods[k] else zero for _ in range(3)]) for _ in range(2))
-        p, w = vector(next(columns) for _ in range(4)), vector(next(columns) for _ in range(3))
-        A = rotation_matrix(p)
-        r = tip + u * length[k] - A @ proximal[k]
-        v = tip_v + udot * length[k] - A @ np.cross(w, proximal[k])
-        tip, tip_v = r + A @ distal[k], v + A @ np.cross(w, distal[k])
-        for part, value in zip(parts.values(), (p, w, u, udot, r, v), strict=True):
-            part.append(np.stack(list(value), 1))
-    return MinimalCoordinateRun(t=times, steps=steps, **{name: np.stack(x, 1) for name, x in parts.items()})
+    def _wrenches(self, b: int, c: int, rows: Sequence[int]) -> list[dict[int, tuple[Any, Any]]]:
+        """Unit forces, or moments, along the axes of b on it, and against them on c."""
+        found = []
+        for row in rows:
+            axis = self.A[b][:, row % 3 : row % 3 + 1]
+            force, moment = (axis, self.zero) if row < 3 else (self.zero, axis)
+            found.append({b: (force, moment), c: (-force, -moment)})
+        return found
+
+    def _relative(self, found: tree.Solution, b: int, c: int, rows: Sequence[int]) -> Any:
+        """Relative accelerations of b and c in the rows that are held."""
+        parts = (x[b] - x[c] for x in (found.acceleration, found.turning))
+        return np.concatenate([self.A[b].T @ part for part in parts])[list(rows)]
 
 
-def _tree_kinematics(model: Model, times: Array, samples: Any, steps: int) -> MinimalCoordinateRun:
-    """Coordinates by name and what follows from them; in extended precision where the samples have more."""
-    y = np.asarray(samples)
-    if y.dtype not in (np.dtype(float), np.dtype(np.longdouble)):
-        y = np.vectorize(lambda x: np.longdouble(str(x)), otypes=[np.longdouble])(y)
-    shape = {"p": 4, "x": 2, "xdot": 2}
-    names = ("p", "omega", "u", "udot", "r", "v", "x", "xdot")
-    parts = {name: np.zeros((len(times), model.n, shape.get(name, 3)), y.dtype) for name in names}
-    parts["p"][..., 0], at = 1, 0
-    for k, kind in enumerate(model.kind):
-        for name, size in taylor_tree.coordinate_names(kind):
-            parts[name][:, k, :size] = y[:, at : at + size]
-            at += size
-    p, omega, r, v = forward_kinematics(model, *parts.values())
-    return MinimalCoordinateRun(times, p, omega, parts["u"], parts["udot"], r, v, steps)
+class _BareJoint:
+    """A rod or a ball joint whose body carries only such joints, by the body's mobility Λ in its own axes.
+
+    There Λ is constant: articulated bodies need twice as many products of series.  With the force F of the
+    joint along its directions D, forces F_j of those joints j that the body carries at e, Z = (D, e × D) in
+    body axes, Z₀ of its own, and w what the body needs at rest,
+
+        x = (a′, α′) = Λ (Z₀ F − w − Σ Z_j F_j),    Z_jᵀ x = Y_j F_j − g_j,    Dᵀ a_far = Y F − g.
+
+    Attributes:
+        directions: D, world axes.
+        yielding, driven: Y and g.
+        turning: α′.
+        hanging, forces: by the joints that the body carries a_far, world axes, and F_j.
+
+    """
+
+    def __init__(self, mechanism: _ExpressionTree, k: int) -> None:
+        num, model, back, mobility = mechanism.num, mechanism.model, mechanism.A[k].T, mechanism.mobility[k]
+        self.mechanism, self.k = mechanism, k
+        s, squares = num.vector(model.point[k, 1]), mechanism.squares(k)
+        self.inward = squares - mechanism.one * np.trace(squares)
+        load = back @ (num.vector(model.force[k]) - mechanism.v[k] * num.scalar(model.drag_force[k]))
+        moment = num.vector(model.moment[k]) - mechanism.column(k, "omega") * num.scalar(model.drag_moment[k])
+        f = -(self.inward @ s) * num.scalar(model.mass[k]) - load
+        self.rest = mobility @ np.concatenate([f, mechanism.gyration(k) + num.cross(s, load) - moment])
+        swings = [block for block in mechanism.blocks[k] if hasattr(block, "u")]
+        self.directions = swings[0].u if swings else mechanism.one
+        own = np.concatenate([back @ self.directions, np.full((3, self.directions.shape[1]), 0.0, object)])
+        self.unit = mobility @ own
+        self.yielding, self.driven = own.T @ self.unit, own.T @ self.rest
+        for swing in swings:
+            self.driven = self.driven + swing.pull
+        self.carried = [joint for j, joint in mechanism.bare.items() if mechanism.far[j] == k]
+        self.hanging, self.forces = dict[int, Any](), dict[int, Any]()
+        self.gained, self.shares = np.full((6, 0), 0.0, object), np.full((0, 1 + own.shape[1]), 0.0, object)
+        if not self.carried:
+            return
+        Z, driven, blocks, at = list[Any](), list[Any](), dict[tuple[int, int], Any](), 0
+        for joint in self.carried:
+            D, e = back @ joint.directions, num.vector(mechanism.reach[joint.k])
+            Z.append(np.concatenate([D, num.cross_matrix(e) @ D]))
+            driven.append(joint.driven + D.T @ (self.inward @ e))
+            blocks[at, at] = joint.yielding
+            at += len(joint.yielding)
+        others = np.concatenate(Z, 1)
+        self.gained = mobility @ others
+        right = [np.concatenate(driven) - others.T @ self.rest, others.T @ self.unit]
+        K = others.T @ self.gained + num.assemble(at, blocks)
+        self.shares = _solve_symmetric(K, np.concatenate(right, 1))  # F_j by what drives them and by F
+        by_others = own.T @ self.gained
+        self.driven = self.driven + by_others @ self.shares[:, :1]
+        self.yielding = num.symmetric(self.yielding - by_others @ self.shares[:, 1:])
+
+    def articulated(self) -> tree.Articulated:
+        """What a body needs at the joint's far point."""
+        D = self.directions
+        found = D @ _solve_symmetric(self.yielding, np.concatenate([D.T, self.driven], 1))
+        return tree.Articulated(self.mechanism.num.symmetric(found[:, :3]), None, None, found[:, 3:], None)
+
+    def advanced(self, a: Any) -> tuple[Any, Any, list[Any]]:
+        """Accelerations as `Tree.advanced` returns them."""
+        num, A, far = self.mechanism.num, self.mechanism.A[self.k], self.mechanism.far[self.k]
+        if far in self.mechanism.bare:
+            above = self.mechanism.bare[far]
+            a, force = above.hanging[self.k], above.forces[self.k]
+        else:
+            force = _solve_symmetric(self.yielding, self.directions.T @ a + self.driven)
+        forces, at = self.shares[:, :1] + self.shares[:, 1:] @ force, 0
+        x = self.unit @ force - self.rest - self.gained @ forces
+        near, self.turning = x[:3], x[3:]
+        for joint in self.carried:
+            e, count = num.vector(self.mechanism.reach[joint.k]), len(joint.yielding)
+            self.hanging[joint.k] = A @ (near + num.cross(self.turning, e) + self.inward @ e)
+            self.forces[joint.k], at = forces[at : at + count], at + count
+        near, turning = A @ near, A @ self.turning
+        return near, turning, [near - a, turning]
+
+
+def _solve_symmetric(K: Any, b: Any) -> Any:
+    """Solve K x = b (n, ·) by the lower triangle of K = L D Lᵀ; ``scaled`` is L D."""
+    n = len(b)
+    scaled, L, x = K.copy(), K.copy(), [*b]
+    for j in range(n):
+        for i in range(j, n):
+            for m in range(j):
+                scaled[i, j] = scaled[i, j] - L[i, m] * scaled[j, m]
+            L[i, j] = scaled[i, j] / scaled[j, j]
+    for i in range(n):
+        for j in range(i):
+            x[i] = x[i] - L[i, j] * x[j]
+    for i in reversed(range(n)):
+        x[i] = x[i] / scaled[i, i]
+        for j in range(i + 1, n):
+            x[i] = x[i] - L[j, i] * x[j]
+    return np.array(x, object)

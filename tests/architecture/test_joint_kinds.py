@@ -13,7 +13,6 @@ OWN_TABLES = r"""
     | plumbline\.truth\.certificate_(file|checker)  # certificates are checked without the code that made them
     | plumbline\.(importers|model_files|cli)\..*  # elementary joints of robots' files; --base free
     | plumbline\.storage\.results_store  # the base of a model file
-    | plumbline\.truth\.taylor_tree  # not yet
     | adapters\..* | bench\..*
 """
 OTHER_MEANINGS = {"slide": "a motion"}
