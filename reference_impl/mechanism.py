@@ -200,6 +200,11 @@ class Mechanism:
         return self.has_chain_joints and not self.lacks_inertia
 
     @property
+    def has_joint_moments(self) -> bool:
+        """Whether moments at the joints are compared: those of a chain's bare rods and balls are 0."""
+        return not self.is_chain
+
+    @property
     def has_chain_joints(self) -> bool:
         """Whether every body is joined to the one before, the first to the world, by bare rods and balls."""
         return _has_chain_joints(self)

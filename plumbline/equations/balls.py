@@ -8,6 +8,7 @@ from typing import Any, cast
 import numpy as np
 
 from plumbline.equations.arithmetic import Arithmetic
+from plumbline.model.datatypes import Array
 
 
 def balls(flint: Any) -> Arithmetic:
@@ -96,3 +97,38 @@ class _Balls:
 
     def turn_over_sine(self, sine: Any, cosine: Any) -> Any:
         return 1 / self.arb.atan2(sine, cosine).sinc()
+
+
+def entries(v: Any) -> list[Any]:
+    """List the balls of a matrix of one column.
+
+    Args:
+        v: an ``arb_mat`` (m, 1).
+
+    """
+    return list(v.entries())
+
+
+def flatten(ball: list[Any]) -> list[Any]:
+    """List all balls of a list or of a list of lists.
+
+    Args:
+        ball: balls, or lists of them.
+
+    """
+    return [x for row in ball for x in row] if isinstance(ball[0], list) else ball
+
+
+def midpoints(ball: list[Any]) -> Array:
+    """Return midpoints rounded to double.
+
+    Args:
+        ball: balls, or lists of them.
+
+    Returns:
+        An array of the list's shape.
+
+    """
+    return np.array(
+        [[float(x.mid()) for x in row] if isinstance(row, list) else float(row.mid()) for row in ball]
+    )

@@ -246,7 +246,7 @@ class Tree:
         """Go from the far body along joint k to body k."""
         num, model, far = self.num, self.model, self.far[k]
         kind = KINDS[model.kind[k]]
-        hang = num.vector(model.point[..., k, 0, :])
+        hang = self.joint_point(k, 0)
         above, w, arm, bend = self.one, self.zero, hang, self.zero
         P, v = hang, self.zero
         if far >= 0:
@@ -271,7 +271,7 @@ class Tree:
             swing, w = num.cross(w, relative), own
         else:
             A, P, v, w, arm, bend, swing, blocks = self._move(k, above, P, v, w, arm, bend)
-        point = num.vector(model.point[..., k, 1, :])
+        point = self.joint_point(k, 1)
         near = self.zero if kind.holds_nothing else num.mul(A, point)
         self.A.append(A)
         self.w.append(w)
@@ -333,7 +333,7 @@ class Tree:
         num, J, model = self.num, self.inertia(k), self.model
         if KINDS[model.kind[k]].holds_nothing:
             return J
-        s = num.cross_matrix(num.vector(model.point[..., k, 1, :]))
+        s = num.cross_matrix(self.joint_point(k, 1))
         return J - num.mul(s, s) * num.scalar(model.mass[..., k])
 
     def centripetal(self, k: int, point: Any, arm: Any) -> Any:
@@ -360,6 +360,15 @@ class Tree:
 
         """
         return self.num.cross(self.w[k], self.num.mul(inertia, self.w[k]))
+
+    def joint_point(self, k: int, side: int) -> Any:
+        """Return the point of joint k in its far (0) or its near body (1), from the body's centre of mass.
+
+        Returns:
+            A vector, body axes.
+
+        """
+        return self.num.vector(self.model.point[..., k, side, :])
 
     def joint_axes(self, k: int, side: int) -> Any:
         """Return the axes of joint k in its far (0) or its near body (1).
@@ -696,16 +705,17 @@ class Tree:
             product = product + i - num.mul(num.transpose(b), R)
         return c, moved, num.symmetric(product)
 
-    def mass_matrix(self) -> Any:
-        """Compute M of the rates ν of `StateQuantities.mass_matrix`.
+    def mass_matrix(self, is_relative: bool = False) -> Any:
+        """Compute M of the rates ν of `StateQuantities.mass_matrix`, or of rates relative to the far bodies.
 
-        A rate ω′ or u̇ turns or swings its own body alone: what is attached to a body with an attitude of
+        A rate ω′ or u̇ of ν turns or swings its own body alone: what is attached to a body with an attitude of
         its own is carried without a turn, as by a joint whose b and i are 0.
         """
         num, model, n = self.num, self.model, self.model.n
+        keeps_attitude = [kind.has_attitude and not is_relative for kind in model.kinds]
         total = [self._inertia(k) for k in range(n)]
         for k in reversed(range(n)):
-            far, keeps = self.far[k], KINDS[model.kind[k]].has_attitude
+            far, keeps = self.far[k], keeps_attitude[k]
             if far >= 0:
                 c, b, i = total[k]
                 moved = self._carried_inertia(k, c, None if keeps else b, None if keeps else i)
@@ -731,13 +741,35 @@ class Tree:
                             add(row, at, num.mul(num.transpose(along if about is None else about),
                                                  push if about is None else moment))  # fmt: skip
                     lever = num.mul(num.cross_matrix(self.arm[j]), push)
-                    moment = lever if KINDS[model.kind[j]].has_attitude else moment + lever
+                    moment = lever if keeps_attitude[j] else moment + lever
                     j = self.far[j]
         for pairs, armature in self._rotors(columns):
             for number, (row, left) in enumerate(pairs):
                 for column, right in pairs[number:]:
                     add(row, column, num.mul(num.transpose(left), right) * armature)
         return num.assemble(rate_count(model), blocks)
+
+    def joint_forces(self, wrenches: Sequence[tuple[Any, Any]]) -> list[Any]:
+        """Project wrenches on the bodies on the relative rates of the joints.
+
+        Args:
+            wrenches: of each body a force and a moment about its centre of mass.
+
+        Returns:
+            Columns, which follow each other as the rates do.
+
+        """
+        num, found = self.num, dict[int, Any]()
+        f = [force for force, _ in wrenches]
+        n = [moment - num.cross(s, force) for s, (force, moment) in zip(self.near, wrenches, strict=True)]
+        for k, columns in reversed([*enumerate(self._rate_columns())]):
+            for at, slide, turn in columns:
+                along, part = (slide, f[k]) if turn is None else (turn, n[k])
+                found[at] = num.mul(num.transpose(along), part)
+            if (far := self.far[k]) >= 0:
+                f[far] = f[far] + f[k]
+                n[far] = n[far] + n[k] + num.cross(self.arm[k], f[k])
+        return [found[at] for at in sorted(found)]
 
     def _rate_columns(self) -> list[list[tuple[int, Any, Any]]]:
         """Of each joint's rates in ν: where they are, and the velocities of the near point or the turns."""

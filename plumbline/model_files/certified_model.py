@@ -1,11 +1,10 @@
 """Certified quantities of a neutral model (a URDF or MJCF file) at given states, with bounds of rounding.
 
-On the joints of `plumbline.importers.neutral_model`, in ball arithmetic: composite rigid bodies for M,
-recursive Newton–Euler for h.  The bound of an engine's rounding is made of the
-magnitudes of the terms, so that it does not vanish where terms cancel: with ℓ_b the length of the path from
-the world to the centre of mass of body b (offsets, anchors, displacements), W_b and V_b the sums of the rates
-of rotations and of slides on that path, u_bi = ℓ_b for a rotation on the path and 1 for a slide, w_bi = 1 for
-a rotation,
+By `plumbline.equations` in balls, on the joints of `plumbline.importers.neutral_model`.  The bound of an
+engine's rounding is made of the magnitudes of the terms, so that it does not vanish where terms cancel: with
+ℓ_b the length of the path from the world to the centre of mass of body b (offsets, anchors, displacements),
+W_b and V_b the sums of the rates of rotations and of slides on that path, u_bi = ℓ_b for a rotation on the
+path and 1 for a slide, w_bi = 1 for a rotation,
 
     |M|_ij = Σ_b m_b u_bi u_bj + ‖J_b‖ w_bi w_bj        |g|_i = Σ_b m_b u_bi g
     |h|_i  = |g|_i + Σ_b m_b u_bi (ℓ_b W_b² + 2 W_b V_b) + ‖J_b‖ w_bi W_b²
@@ -25,12 +24,12 @@ from typing import Any
 
 import numpy as np
 
+from plumbline.equations.balls import balls, entries, flatten, midpoints
+from plumbline.equations.tree import Tree
 from plumbline.importers.neutral_model import CanonicalState, ElementaryJoint, ModelQuantities, NeutralModel
-from plumbline.model.datatypes import Array, Float
+from plumbline.model.datatypes import KINDS, WELD, Array, Float, Kind, Model
 from plumbline.model.kinematics import quaternion_conjugate, quaternion_product
 from plumbline.truth import import_truth_tool
-from plumbline.truth.ball_geometry import entries, flatten, midpoints
-from plumbline.truth.joint_tree import JointTree
 
 ROUNDING_FACTOR = 16.0
 EPSILON = 2.0**-53
@@ -68,16 +67,16 @@ def certify_model(model: NeutralModel, state: CanonicalState) -> CertifiedModelQ
     bits = START_BITS
     while True:
         with flint.ctx.workprec(bits):
-            balls, poses = _enclose(_BallModel(flint, model, state))
-            middle = {name: midpoints(ball) for name, ball in balls.items() if ball is not None}
+            found, poses = _enclose(_BallModel(flint, model, state))
+            middle = {name: midpoints(ball) for name, ball in found.items() if ball is not None}
         certified = _with_tolerances(model, state, poses, middle)
         sharp = all(
             float(x.rad()) <= MAX_RELATIVE_RADIUS * max(limit, MIN_MAGNITUDE)
-            for name, ball in balls.items()
+            for name, ball in found.items()
             if ball
             for x, limit in zip(flatten(ball), np.ravel(certified.tolerance[name]), strict=True)
         )
-        if (sharp and balls["acceleration"] is not None) or bits >= MAX_BITS:
+        if (sharp and found["acceleration"] is not None) or bits >= MAX_BITS:
             return certified
         bits *= 4
 
@@ -95,152 +94,157 @@ def rough_quantities(model: NeutralModel, state: CanonicalState) -> ModelQuantit
     """
     flint = import_truth_tool("flint")
     with flint.ctx.workprec(ROUGH_BITS):
-        balls = _BallModel(flint, model, state)
-        n, (M, _) = model.velocity_count, balls.joint_mass_matrix()
-        matrix = np.array(midpoints(M.tolist() if n else []), float).reshape(n, n)
-    armatures = [armature for armature, _ in _armature_and_rate(model, state)]
-    return ModelQuantities(_poses(balls), matrix + np.diag(np.array(armatures, float)))
+        there = _BallModel(flint, model, state)
+        matrix = midpoints(there.full_mass_matrix().tolist()) if model.velocity_count else np.zeros((0, 0))
+        return ModelQuantities(there.poses(), matrix)
 
 
-class _BallModel(JointTree):
-    """Model and state in balls; names as in `JointTree`, and per body: frame origin o, velocities, bias."""
+class _BallModel(Tree):
+    """A model at a state in balls, as a mechanism of links.
+
+    Each elementary joint carries a link of its own, a body without joints a welded one; the last link of a
+    body has its mass.  A free joint carries the body's frame, on which the body is welded.  Attitudes of
+    bodies and axes of joints, which doubles would round, are balls.
+    """
 
     def __init__(self, flint: Any, model: NeutralModel, state: CanonicalState) -> None:
-        super().__init__(flint)
-        self.model, self.state, self.n = model, state, len(model.bodies)
-        self.far = [body.parent for body in model.bodies]
-        self.m = [self.arb(float(body.mass)) for body in model.bodies]
-        self.J = [self.matrix(body.inertia) for body in model.bodies]
-        self.g = self.vector(model.gravity)
-        self.A, self.r, self.S = [], [], []
-        self.o: list[Any] = []
-        self.w: list[Any] = []
-        self.v: list[Any] = []  # of the frame's origin
-        self.alpha: list[Any] = []  # angular acceleration at ν̇ = 0
-        self.a: list[Any] = []  # acceleration of the frame's origin at ν̇ = 0
-        places = iter(model.joint_slices())
+        self.flint, self.neutral, self.at = flint, model, state
+        links: list[tuple[Kind, int, ElementaryJoint | None]] = []  # kind, far link, joint
+        self.owner: list[int] = []  # body of each link
+        self.last: list[int] = []  # by body its last link
         for k, body in enumerate(model.bodies):
-            self._place(k)
-            columns = []
-            for joint, x, v in (next(places) for _ in body.joints):
-                columns.append(self._move(joint, state.coordinates[x], state.velocities[v]))
-            twists = [self.twist_columns(P, part) for P, part in columns]
-            self.S.append(
-                self.mat([[M[i, j] for M in twists for j in range(M.ncols())] for i in range(6)])
-                if twists
-                else self.mat(6, 0)
-            )
-            self.r.append(self.o[k] + self.A[k] * self.vector(body.center))
+            far = self.last[body.parent] if body.parent >= 0 else -1
+            joints: list[ElementaryJoint | None] = [*body.joints]
+            if not body.joints or body.joints[-1].kind == "free":
+                joints.append(None)
+            for joint in joints:
+                is_free = joint is not None and joint.kind == "free"
+                kind: Kind = WELD if joint is None else joint.kind
+                links.append((kind, -1 if is_free else far, joint))
+                self.owner.append(k)
+                far = len(links) - 1
+            self.last.append(far)
+        self.joint = [joint for _, _, joint in links]
+        places = {id(joint): (x, v) for joint, x, v in model.joint_slices()}
+        none = slice(0, 0)
+        self.place = [places.get(id(joint), (none, none)) for joint in self.joint]
+        count, is_last = len(links), np.isin(np.arange(len(links)), self.last)
+        bodies = [model.bodies[k] for k in self.owner]
+        mechanism = Model(
+            mass=np.where(is_last, [body.mass for body in bodies], 0.0),
+            inertia=np.array([body.inertia for body in bodies]).reshape(-1, 3, 3) * is_last[:, None, None],
+            kind=tuple(kind for kind, _, _ in links),
+            body=np.array([[far, k] for k, (_, far, _) in enumerate(links)], np.intp).reshape(-1, 2),
+            point=np.zeros((count, 2, 3)), turn=np.zeros((count, 2, 4)), length=np.zeros(count),
+            gravity=model.gravity, force=np.zeros((count, 3)), moment=np.zeros((count, 3)),
+            drag_force=np.zeros(count), drag_moment=np.zeros(count),
+        )  # fmt: skip
+        super().__init__(balls(flint), mechanism, None)  # type: ignore[arg-type]
 
-    def _place(self, k: int) -> None:
-        """Put body k where it is before its joints move it."""
-        body, far = self.model.bodies[k], self.far[k]
-        A, arm = self.rotation(body.attitude), self.vector(body.position)
-        if far < 0:
-            self._append(A, arm, self.zero, self.zero, self.zero, self.zero)
-            return
-        arm = self.A[far] * arm
-        state = self._carried(arm, self.o[far], self.w[far], self.v[far], self.alpha[far], self.a[far])
-        self._append(self.A[far] * A, *state)
+    def _is_first(self, k: int) -> bool:
+        """Whether link k is the first of its body."""
+        return k == 0 or self.owner[k - 1] != self.owner[k]
 
-    def _append(self, *state: Any) -> None:
-        for values, value in zip((self.A, self.o, self.w, self.v, self.alpha, self.a), state, strict=True):
-            values.append(value)
+    def _center(self, k: int) -> Any:
+        """From the origin of the body's frame to the centre of mass of link k."""
+        return self.num.vector(self.neutral.bodies[self.owner[k]].center if k in self.last else np.zeros(3))
 
-    def _carried(self, arm: Any, o: Any, w: Any, v: Any, alpha: Any, a: Any) -> tuple[Any, ...]:
-        """Origin, rates and bias of the point at ``arm`` from a point of a rigid body."""
-        spin = self.cross_matrix(w)
-        return o + arm, w, v + spin * arm, alpha, a + self.cross_matrix(alpha) * arm + spin * (spin * arm)
+    def joint_point(self, k: int, side: int) -> Any:
+        num, body, joint = self.num, self.neutral.bodies[self.owner[k]], self.joint[k]
+        anchor = self.zero if joint is None else num.vector(joint.anchor)
+        if side:
+            return anchor - self._center(k)
+        if self._is_first(k):
+            anchor = num.vector(body.position) + num.mul(self.rotation(body.attitude), anchor)
+        return anchor - self._center(self.far[k]) if self.far[k] >= 0 else anchor
 
-    def _move(self, joint: ElementaryJoint, x: Array, rate: Array) -> tuple[Any, list[Any]]:
-        """Move the last body by one joint; return a point and the motions there."""
-        A, state = self.A[-1], tuple(q[-1] for q in (self.o, self.w, self.v, self.alpha, self.a))
-        rates = [self.arb(float(r)) for r in rate]
-        if joint.kind == "free":
-            A = self.rotation(x[3:])
-            w = A * self.mat(3, 1, rates[3:])
-            P = self.vector(x[:3])
-            state = P, w, self.mat(3, 1, rates[:3]), self.zero, self.zero
-            columns = [(self.zero, e) for e in self.units] + [(A * e, self.zero) for e in self.units]
-        elif joint.kind == "slide":
-            axis = A * self.unit(joint.axis)
-            shift = axis * (self.arb(float(x[0])) - self.arb(joint.reference))
-            P, w, v, alpha, a = self._carried(shift, *state)
-            cross = self.cross_matrix(w)
-            state = P, w, v + axis * rates[0], alpha, a + cross * axis * (2 * rates[0])
-            columns = [(self.zero, axis)]
-        else:
-            anchor = self.vector(joint.anchor)
-            P, w, v, alpha, a = self._carried(A * anchor, *state)
-            if joint.kind == "hinge":
-                u = self.unit(joint.axis)
-                spin = A * u * rates[0]
-                columns = [(A * u, self.zero)]
-                A = A * self.turn_about(u, self.arb(float(x[0])) - self.arb(joint.reference))
-            else:
-                A = A * self.rotation(x)
-                spin = A * self.mat(3, 1, rates)
-                columns = [(A * e, self.zero) for e in self.units]
-            alpha, w = alpha + self.cross_matrix(w) * spin, w + spin
-            state = self._carried(A * anchor * -1, P, w, v, alpha, a)
-        for values, value in zip(
-            (self.A, self.o, self.w, self.v, self.alpha, self.a), (A, *state), strict=True
-        ):
-            values[-1] = value
-        return P, columns
+    def joint_axes(self, k: int, side: int) -> Any:
+        num, joint = self.num, self.joint[k]
+        axes = self.one
+        if joint is not None and np.any(joint.axis):
+            across = np.eye(3)[int(np.argmin(np.abs(joint.axis)))]
+            z = self._unit(num.vector(joint.axis))
+            x = self._unit(num.cross(num.vector(across), z))
+            axes = num.columns([x, num.cross(z, x), z])
+        if side or not self._is_first(k):
+            return axes
+        return num.mul(self.rotation(self.neutral.bodies[self.owner[k]].attitude), axes)
 
-    def unit(self, axis: Array) -> Any:
-        """An axis as a vector of length one."""
-        u = self.vector(axis)
-        return u * (1 / self.dot(u, u).sqrt())
+    def _unit(self, v: Any) -> Any:
+        return v * (1 / self.num.sqrt(self.num.dot(v, v)))
 
-    def turn_about(self, u: Any, angle: Any) -> Any:
-        """The rotation about a unit vector: 1 + ũ sin φ + ũ² (1 − cos φ)."""
-        cross = self.cross_matrix(u)
-        return self.eye + cross * angle.sin() + cross * cross * (1 - angle.cos())
+    def coordinate(self, k: int, i: int) -> tuple[Any, Any]:
+        joint, num, (x, v) = self.joint[k], self.num, self.place[k]
+        assert joint is not None
+        return (num.scalar(self.at.coordinates[x][i]) - num.scalar(joint.reference),
+                num.scalar(self.at.velocities[v][i]))  # fmt: skip
 
-    def bias(self, k: int) -> tuple[Any, Any, Any]:
-        """Acceleration of the centre of mass at ν̇ = 0, its velocity, and the inertia in world axes."""
-        arm = self.r[k] - self.o[k]
-        _, _, v, _, a = self._carried(arm, self.o[k], self.w[k], self.v[k], self.alpha[k], self.a[k])
-        return a, v, self.A[k] * self.J[k] * self.A[k].transpose()
+    def attitude(self, k: int) -> tuple[Any, Any]:
+        num, (x, v), far = self.num, self.place[k], self.far[k]
+        A, spin = self.rotation(self.at.coordinates[x][-4:]), num.vector(self.at.velocities[v][-3:])
+        if KINDS[self.model.kind[k]].is_spherical:
+            axes = self.joint_axes(k, 0)
+            A = num.mul(axes if far < 0 else num.mul(self.A[far], axes), A)
+        spin = num.mul(A, spin)
+        return A, spin if far < 0 else self.w[far] + spin
 
-    def wrench(self, k: int, moment: Any, force: Any) -> Any:
-        """A moment and a force at the centre of mass, about the world's origin."""
-        return self.mat(6, 1, [*entries(moment + self.cross_matrix(self.r[k]) * force), *entries(force)])
+    def free_point(self, k: int) -> tuple[Any, Any]:
+        x, v = self.place[k]
+        return self.num.vector(self.at.coordinates[x][:3]), self.num.vector(self.at.velocities[v][:3])
+
+    def full_mass_matrix(self) -> Any:
+        """M with armatures, empty where nothing moves."""
+        if not self.neutral.velocity_count:
+            return self.flint.arb_mat(0, 0)
+        M = self.mass_matrix(is_relative=True)
+        for i, (armature, _) in enumerate(_armature_and_rate(self.neutral, self.at)):
+            M[i, i] = M[i, i] + self.num.scalar(armature)
+        return M
+
+    def forces(self) -> tuple[list[Any], list[Any]]:
+        """The forces that the joints need at v̇ = 0, and those of gravity alone."""
+        num, g, needed, weights = self.num, self.num.vector(self.model.gravity), [], []
+        for k, (a, alpha) in enumerate(zip(*self.coasting(), strict=True)):
+            m, w = num.scalar(self.model.mass[k]), self.w[k]
+            J = num.mul(num.mul(self.A[k], self.inertia(k)), num.transpose(self.A[k]))
+            moment = num.mul(J, alpha) + num.cross(w, num.mul(J, w))
+            needed.append(((a - g) * m, moment))
+            weights.append((-g * m, self.zero))
+        h, gravity = (
+            [x for part in self.joint_forces(each) for x in entries(part)] for each in (needed, weights)
+        )
+        return h, gravity
+
+    def poses(self) -> dict[str, Array]:
+        """Rotations and places of the bodies' frames, (3, 4)."""
+        found = {}
+        for body, k in zip(self.neutral.bodies, self.last, strict=True):
+            origin = self.r[k] - self.num.mul(self.A[k], self._center(k))
+            rows = zip(self.A[k].tolist(), origin.tolist(), strict=True)
+            found[body.name] = midpoints([[*row, *place] for row, place in rows])
+        return found
 
 
 def _enclose(c: _BallModel) -> tuple[dict[str, Any], dict[str, Array]]:
     """Enclose every quantity; the acceleration is None where M has no inverse at this precision."""
-    M, _ = c.joint_mass_matrix()
-    wrenches, weights, kinetic, potential = [], [], c.arb(0), c.arb(0)
-    moving = [False] * c.n
-    for k in range(c.n):
-        moving[k] = bool(c.S[k].ncols()) or (c.far[k] >= 0 and moving[c.far[k]])
-        a, v, inertia = c.bias(k)
-        spin = inertia * c.w[k]
-        moment = inertia * c.alpha[k] + c.cross_matrix(c.w[k]) * spin
-        wrenches.append(c.wrench(k, moment, (a - c.g) * c.m[k]))
-        weights.append(c.wrench(k, c.zero, c.g * (-c.m[k])))
-        kinetic += (c.m[k] * c.dot(v, v) + c.dot(c.w[k], spin)) / 2
+    M, (h, gravity), passive = c.full_mass_matrix(), c.forces(), _passive(c)
+    arb, mat, moving = c.flint.arb, c.flint.arb_mat, [False] * c.model.n
+    potential = arb(0)
+    for k, joint in enumerate(c.joint):
+        moving[k] = joint is not None or (c.far[k] >= 0 and moving[c.far[k]])
         if moving[k]:
-            potential -= c.m[k] * c.dot(c.g, c.r[k])
-    h, gravity = (
-        [x for k, sum_ in enumerate(c.subtree_sums(parts)) for x in entries(c.S[k].transpose() * sum_)]
-        for parts in (wrenches, weights)
-    )
+            potential -= arb(float(c.model.mass[k])) * c.num.dot(c.num.vector(c.model.gravity), c.r[k])
+    speed = mat(len(h), 1, [arb(float(v)) for v in c.at.velocities])
+    momentum = M * speed
+    kinetic = sum((a * b for a, b in zip(entries(momentum), entries(speed), strict=True)), arb(0)) / 2
     rates: list[Any] = []
-    for i, (value, rate) in enumerate(_armature_and_rate(c.model, c.state)):
-        M[i, i] = M[i, i] + c.arb(value)
-        kinetic += c.arb(value) * c.arb(rate) * c.arb(rate) / 2
-    passive = _passive(c)
     if gravity:
         try:
-            rates = entries(M.solve(c.mat(len(h), 1, [f - b for f, b in zip(passive, h, strict=True)])))
+            rates = entries(M.solve(mat(len(h), 1, [f - b for f, b in zip(passive, h, strict=True)])))
         except ZeroDivisionError:
             rates = []
         rates = rates if all(rate.is_finite() for rate in rates) else []
-    balls = {
+    found = {
         "mass_matrix": M.tolist() if gravity else [],
         "bias_force": h,
         "gravity_force": gravity,
@@ -249,16 +253,7 @@ def _enclose(c: _BallModel) -> tuple[dict[str, Any], dict[str, Array]]:
         "kinetic_energy": [kinetic],
         "potential_energy": [potential],
     }
-    return balls, _poses(c)
-
-
-def _poses(c: _BallModel) -> dict[str, Array]:
-    return {
-        body.name: np.array(
-            [[float(c.A[k][i, j].mid()) for j in range(3)] + [float(c.o[k][i, 0].mid())] for i in range(3)]
-        )
-        for k, body in enumerate(c.model.bodies)
-    }
+    return found, c.poses()
 
 
 def _armature_and_rate(model: NeutralModel, state: CanonicalState) -> list[tuple[float, float]]:
@@ -272,30 +267,28 @@ def _armature_and_rate(model: NeutralModel, state: CanonicalState) -> list[tuple
 def _passive(c: _BallModel) -> list[Any]:
     """Forces of dampers and springs."""
     force: list[Any] = []
-    for joint, xs, vs in c.model.joint_slices():
-        x, rate = c.state.coordinates[xs], c.state.velocities[vs]
-        damping, stiffness = c.arb(joint.damping), c.arb(joint.stiffness)
+    for joint, xs, vs in c.neutral.joint_slices():
+        x, rate = c.at.coordinates[xs], c.at.velocities[vs]
+        damping, stiffness = c.num.scalar(joint.damping), c.num.scalar(joint.stiffness)
         if joint.kind in ("hinge", "slide"):
-            stretched = [c.arb(float(x[0])) - c.arb(joint.spring_reference)]
+            stretched = [c.num.scalar(x[0]) - c.num.scalar(joint.spring_reference)]
         elif joint.kind == "ball":
             stretched = _rotation_vector(c, x)
         else:
-            body = next(body for body in c.model.bodies if joint in body.joints)
+            body = next(body for body in c.neutral.bodies if joint in body.joints)
             turn = quaternion_product(quaternion_conjugate(body.attitude), x[3:])
-            stretched = entries(c.vector(x[:3]) - c.vector(body.position)) + _rotation_vector(c, turn)
-        force += [-damping * c.arb(float(v)) - stiffness * s for v, s in zip(rate, stretched, strict=True)]
+            stretched = entries(c.num.vector(x[:3]) - c.num.vector(body.position)) + _rotation_vector(c, turn)
+        force += [-damping * c.num.scalar(v) - stiffness * s for v, s in zip(rate, stretched, strict=True)]
     return force
 
 
 def _rotation_vector(c: _BallModel, q: Array) -> list[Any]:
     """The rotation vector of a quaternion, of the rotation by at most π."""
-    scalar, vector = c.arb(float(q[0])), c.vector(q[1:])
-    if float(q[0]) < 0:
-        scalar, vector = -scalar, vector * -1
-    length = c.dot(vector, vector).sqrt()
+    scalar, vector = c.num.scalar(abs(q[0])), c.num.vector(-q[1:] if q[0] < 0 else q[1:])
     if not np.any(q[1:]):
         return entries(vector)
-    return entries(vector * (2 * c.arb.atan2(length, scalar) / length))
+    length = c.num.sqrt(c.num.dot(vector, vector))
+    return entries(vector * (2 * c.flint.arb.atan2(length, scalar) / length))
 
 
 @dataclass(frozen=True, eq=False)

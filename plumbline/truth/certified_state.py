@@ -2,7 +2,7 @@
 
 The minimal coordinates as doubles are normalised, positions and velocities follow from them, and the
 equations of motion of `plumbline.equations.tree` are solved in balls; mechanisms with loops are in
-`certified_loop`.  Every quantity has a radius that encloses all roundings of its computation, and the whole
+`loop_closure`.  Every quantity has a radius that encloses all roundings of its computation, and the whole
 solution is checked by the definition of the mechanism (`definition`).
 """
 
@@ -11,15 +11,18 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from plumbline.equations.balls import balls as ball_arithmetic
-from plumbline.equations.tree import Tree
+from plumbline.equations.balls import entries, flatten, midpoints
+from plumbline.equations.tree import Solution, Tree
 from plumbline.model.datatypes import Model, State, StateQuantities
 from plumbline.model.loops import determinate_part
 from plumbline.processes.exceptions import PlumblineError
 from plumbline.truth import import_truth_tool
-from plumbline.truth.ball_geometry import flatten, midpoints, quantity_scales, tree_quantities
-from plumbline.truth.certified_loop import enclose_loop
 from plumbline.truth.definition import definition_holds
+from plumbline.truth.loop_closure import solve_loop
+from plumbline.truth.rounding_bound import joint_elements, spring_terms
 
 MAX_RELATIVE_RADIUS = 1e-25  # relative to the largest magnitude of the quantity's own terms
 FIRST_BITS, BITS_PER_BODY = 200, 4  # balls lose up to 4 bits from one body to the next
@@ -121,24 +124,126 @@ def enclose_quantities(
     flint = import_truth_tool("flint")
     with flint.ctx.workprec(bits):
         try:
-            if model.has_loops:
-                return enclose_loop(flint, model, state)
-            return _enclose_tree(flint, model, state, mass_matrix)
+            return _enclose(flint, model, state, mass_matrix)
         except ZeroDivisionError:
             return None
 
 
-def _enclose_tree(flint: Any, model: Model, state: State, mass_matrix: bool) -> dict[str, Any]:
-    """All quantities of `enclose_quantities`, of a mechanism without loops."""
-    tree = Tree(ball_arithmetic(flint), model, state)
-    balls = tree_quantities(tree, tree.solve())
-    if model.is_chain:  # whose joints hold no moments
-        del balls["joint_moment"]
-    if mass_matrix:
-        balls["mass_matrix"] = tree.mass_matrix().tolist()
-    return balls | {"scale": quantity_scales(tree, balls)}
+def _enclose(flint: Any, model: Model, state: State, mass_matrix: bool) -> dict[str, Any]:
+    """As `enclose_quantities`; of loops "scale" has besides the largest gap of dependent rows."""
+    if not model.has_loops:
+        tree = Tree(ball_arithmetic(flint), model, state)
+        balls = tree_quantities(tree, tree.solve())
+        if not model.has_joint_moments:
+            del balls["joint_moment"]
+        if mass_matrix:
+            balls["mass_matrix"] = tree.mass_matrix().tolist()
+        return balls | {"scale": quantity_scales(tree, balls)}
+    tree, solution, cut, gap = solve_loop(flint, model, state)
+    balls = tree_quantities(tree, solution)
+    scale = quantity_scales(tree, balls) | {"gap": gap}
+    for name, ball in balls.items():
+        if name in ("joint_reaction", "joint_moment"):
+            balls[name] = [ball[k] for k in cut.place]
+        elif len(ball) == cut.model.n and isinstance(ball[0], list):
+            balls[name] = [ball[k] for k in cut.place[: model.n]]
+    return balls | {"scale": scale}
 
 
 def _is_sharp(name: str, balls: dict[str, Any]) -> bool:
     """Whether every radius of the quantity is small enough (an infinite or NaN one is not)."""
     return all(float(x.rad()) <= MAX_RELATIVE_RADIUS * balls["scale"][name] for x in flatten(balls[name]))
+
+
+def term_scales(
+    model: Model,
+    balls: dict[str, Any],
+    lever: float,
+    rate: float,
+    element_sizes: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> dict[str, float]:
+    """Estimate the sizes of the terms of each quantity.
+
+    Radii are compared with them, because a quantity itself may be zero.
+
+    Args:
+        balls: entries of each quantity, by name.
+        lever: largest distance of a body from the world's origin [m].
+        rate: largest rate of rotation [rad/s].
+        element_sizes: forces [N], moments [N m] and potential energy [J] of springs and their like, before
+            they cancel.
+
+    Returns:
+        By quantity the size, in its unit.
+
+    """
+    size = {name: float(np.max(np.abs(midpoints(ball)), initial=0.0)) for name, ball in balls.items()}
+    g = float(np.linalg.norm(model.gravity))
+    mass, inertia = float(np.sum(model.mass)), float(np.sum(np.linalg.norm(model.inertia, axis=(1, 2))))
+    push = float(np.sum(np.linalg.norm(model.force, axis=1))) + element_sizes[0]
+    torque = float(np.sum(np.linalg.norm(model.moment, axis=1))) + element_sizes[1]
+    a = max(size["acceleration"], g, rate**2 * lever, push / mass)
+    a = max(a, torque / (mass * lever) if lever else 0.0)
+    force = max(size["joint_reaction"], mass * a)
+    scales = {
+        "acceleration": a,
+        "angular_acceleration": max(
+            size["angular_acceleration"], rate**2, a / lever if lever else torque / inertia
+        ),
+        "joint_reaction": force,
+        "joint_moment": max(size.get("joint_moment", 0.0), force * lever),
+        "kinetic_energy": size["kinetic_energy"],
+        "potential_energy": max(size["potential_energy"], mass * g * lever + element_sizes[2]),
+        "angular_momentum": max(size["angular_momentum"], (mass * lever**2 + inertia) * rate),
+        "r": max(size["r"], lever),
+        "v": max(size["v"], lever * rate),
+        "mass_matrix": size.get("mass_matrix", 0.0),
+        "attitude": 1.0,
+        "angular_velocity": max(size["angular_velocity"], rate),
+    }
+    return {name: scale for name, scale in scales.items() if name in balls}
+
+
+def tree_quantities(tree: Tree, solution: Solution) -> dict[str, Any]:
+    """List the balls of a solved tree.
+
+    Args:
+        tree: in balls.
+
+    Returns:
+        By quantity, as `plumbline.truth.certified_state.enclose_quantities`, without mass matrix and scales.
+
+    """
+    vectors = tree.quantities(solution)
+    found: dict[str, Any] = {name: [vectors.pop(name)] for name in ("kinetic_energy", "potential_energy")}
+    found["angular_momentum"] = entries(vectors.pop("angular_momentum"))
+    vectors |= {"r": tree.r, "v": tree.v, "attitude": tree.A, "angular_velocity": tree.in_bodies(tree.w)}
+    return found | {name: [entries(x) for x in each] for name, each in vectors.items()}
+
+
+def quantity_scales(c: Any, balls: dict[str, Any]) -> dict[str, float]:
+    """Estimate the sizes of the terms of each quantity, see `term_scales`.
+
+    Args:
+        c: the tree.
+
+    Returns:
+        Sizes by quantity.
+
+    """
+    norm, model = np.linalg.norm, c.model
+    lever = float(np.sum(norm(model.point, axis=2)) + np.sum(model.length) + np.sum(np.abs(c.state.x)))
+    lever = max(lever, float(np.max(np.abs(midpoints(balls["r"])))))
+    rate = float(np.max(norm(midpoints([entries(w) for w in c.w]), axis=1)))
+    rate = max(rate, float(np.max(np.abs(c.state.xdot))), float(np.max(np.abs(c.state.udot))))
+    sizes = (0.0, 0.0, 0.0)
+    if model.has_elements:
+        state = State(**{name: value[None] for name, value in vars(c.state).items()})
+        elements, springs = joint_elements(model, state, np.zeros((1, model.n))), spring_terms(model, state)
+        push, turn = (
+            float(sum(np.sum(e.size) for e in elements if e.is_slide == is_slide))
+            for is_slide in (True, False)
+        )
+        potential = float(sum((np.sum(e.potential) for e in elements), np.sum(springs.potential)))
+        sizes = push + float(np.sum(springs.size)), turn + float(np.sum(springs.moment_size)), potential
+    return term_scales(model, balls, lever, rate, sizes)

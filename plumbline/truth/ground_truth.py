@@ -144,8 +144,8 @@ def motion_truth(
         model, state, times, perturbed_models(model, state)
     )
     growth, length = np.maximum.accumulate(growth), float(np.sum(stretched_length(model)))
-    if not model.is_chain:  # what is free or slides leaves the stretched mechanism
-        length = max(length, float(np.max(np.linalg.norm(truth.trajectory.r, axis=-1))))
+    # what is free or slides leaves the stretched mechanism
+    length = max(length, float(np.max(np.linalg.norm(truth.trajectory.r, axis=-1))))
     scales = motion_scales(model, truth.trajectory, length)
     excess = np.max([truth.uncertainty[q] / (scales[q] * RUN_ROUNDING * growth) for q in scales], axis=0)
     # not a number: one of them is not finite
@@ -241,11 +241,7 @@ def perturbed_models(model: Model, state: State) -> list[tuple[Model, State]]:
         larger = replace(model, point=size * model.point, length=size * model.length)
         grown = replace(state, r=size * state.r, v=size * state.v, **_with_longer_slides(model, state, size))
         return [*((m, state) for m in models), (larger, assembled(larger, complete_state(larger, grown)))]
-    models.append(
-        model.changed(proximal=perturbed(model.proximal), distal=perturbed(model.distal))
-        if model.is_chain
-        else replace(model, point=perturbed(model.point))
-    )
+    models.append(replace(model, point=perturbed(model.point)))
     return [(m, complete_state(m, state)) for m in models]
 
 

@@ -98,7 +98,7 @@ def list_parameters(model: Model, state: State) -> list[Parameter]:
 
 def _span(model: Model, k: int) -> float:
     """A body's size: distance of its points of a chain, or its near point, and radius of gyration."""
-    sizes = [model.proximal[k], model.distal[k] if model.is_chain else np.zeros(3)]
+    sizes = [model.proximal[k], model.distal[k] if model.has_chain_joints else np.zeros(3)]
     gyration = np.sqrt(np.trace(model.inertia[k]) / (2 * model.mass[k]))
     return max(float(gyration), *(float(np.linalg.norm(x)) for x in sizes))
 
@@ -109,7 +109,7 @@ def _geometry(model: Model, k: int, span: float) -> Iterator[Parameter]:
     if kind.holds_nothing:
         return
     yield from _components("proximal", k, model.proximal[k], span)
-    if not model.is_chain:
+    if not model.has_chain_joints:
         yield from _components("anchor", k, model.point[k, 0], span)
     elif k + 1 < model.n:
         yield from _components("distal", k, model.distal[k], span)

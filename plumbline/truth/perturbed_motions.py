@@ -207,18 +207,17 @@ def _simulate_batch(motion: AccurateMotion, cases: Sequence[tuple[Model, State]]
     found = np.moveaxis(
         np.array(samples).reshape(len(times), 2, 7, len(cases), -1), (3, 1, 0, 4, 2), (0, 1, 2, 3, 4)
     )
-    return [
-        _on_manifold(
-            model, Trajectory(times, q[..., :3], q[..., 3:], rate[..., :3], rate[..., 3:], substeps, start.x)
-        )
-        for (model, start), (q, rate) in zip(cases, found, strict=True)
+    runs = [
+        Trajectory(times, q[..., :3], q[..., 3:], rate[..., :3], rate[..., 3:], substeps, start.x)
+        for (_, start), (q, rate) in zip(cases, found, strict=True)
     ]
+    if isinstance(system, TreeSystem):  # whose samples have been projected
+        return runs
+    return [_on_manifold(model, run) for (model, _), run in zip(cases, runs, strict=True)]
 
 
 def _on_manifold(model: Model, run: Trajectory) -> Trajectory:
     """The run of a chain with unit quaternions, and points that satisfy the joints exactly."""
-    if not model.is_chain:  # its samples have been projected
-        return run
     omega = angular_velocity(run.p, run.pdot)
     ell = np.where(model.rods, model.length, np.inf)[:, None]
     u = joint_vectors(model, run.r, run.p) / ell

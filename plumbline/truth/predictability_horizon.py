@@ -31,7 +31,7 @@ from plumbline.model.loops import assembled
 from plumbline.model.sampling import derive_seed
 from reference_impl.fast.chain_elimination import component_first
 from reference_impl.fast.collocation import integrate_collocation
-from reference_impl.fast.tree_elimination import eliminated_system
+from reference_impl.fast.tree_elimination import TreeSystem, eliminated_system
 
 PERTURBATION_SIZE = 1e-7  # of each angle [rad], of each rate relative to the largest rate of the motion
 PERTURBATION_COUNT = 4  # random directions
@@ -157,11 +157,11 @@ def perturbed_states(
         omega = state.omega + spread * rng.normal(size=(model.n, 3))
         u = state.u + cross(perturbation_size * rng.normal(size=(model.n, 3)), state.u)
         udot = state.udot + cross(spread * rng.normal(size=(model.n, 3)), state.u)
-        if model.is_chain:
-            found.append(_make_state(model, p, omega, u, udot))
-            continue
-        x, r = (y + perturbation_size * rng.normal(size=y.shape) for y in (state.x, state.r))
-        xdot, v = (y + spread * rng.normal(size=y.shape) for y in (state.xdot, state.v))
+        others = state.x, state.r, state.xdot, state.v
+        if not all(kind.holds_no_turn for kind in model.kinds[: model.n]):  # these are coordinates too
+            sizes = (perturbation_size, perturbation_size, spread, spread)
+            others = tuple(y + size * rng.normal(size=y.shape) for y, size in zip(others, sizes, strict=True))
+        x, r, xdot, v = others
         near = complete_state(model, State(*_unit_coordinates(model, p, omega, u, udot), r, v, x, xdot))
         found.append(assembled(model, near))
     return found
@@ -180,8 +180,8 @@ def _integrate_batch(models: list[Model], states: list[State], times: Array) -> 
 def project_to_manifold(model: Model, r: Array, p: Array, v: Array, pdot: Array) -> State:
     """Return the state on the constraint manifold next to an integrated one.
 
-    Of a chain it has the same minimal coordinates; of a tree, r, p, ω′ and ṙ are those of the nearest state,
-    and joint coordinates are not computed.
+    Where the integrated form has no projection, it has the same minimal coordinates; else r, p, ω′ and ṙ are
+    those of the nearest state, and joint coordinates are not computed.
 
     Args:
         r: (N, 3) centres of mass [m], world frame.
@@ -190,8 +190,9 @@ def project_to_manifold(model: Model, r: Array, p: Array, v: Array, pdot: Array)
         pdot: (N, 4) ṗ [1/s].
 
     """
-    if not model.is_chain:
-        q, qdot = eliminated_system([model]).project(component_first(r, p), component_first(v, pdot))
+    system = eliminated_system([model])
+    if isinstance(system, TreeSystem):
+        q, qdot = system.project(component_first(r, p), component_first(v, pdot))
         p, zeros = np.ascontiguousarray(q[3:].T), np.zeros((model.n, 3))
         return State(p, angular_velocity(p, qdot[3:].T), zeros, zeros, q[:3].T, qdot[:3].T)
     p = p / np.linalg.norm(p, axis=1, keepdims=True)
@@ -200,7 +201,8 @@ def project_to_manifold(model: Model, r: Array, p: Array, v: Array, pdot: Array)
     near, far = (v + rotate_vectors(A, cross(omega, s)) for s in (model.proximal, model.distal))
     gap_rate = near - np.concatenate([np.zeros((1, 3)), far[:-1]])
     ell = np.where(model.rods, model.length, np.inf)[:, None]
-    return _make_state(model, p, omega, joint_vectors(model, r, p) / ell, gap_rate / ell)
+    u, udot = joint_vectors(model, r, p) / ell, gap_rate / ell
+    return state_from_minimal(model, *_unit_coordinates(model, p, omega, u, udot))
 
 
 def _interpolate_states(model: Model, base: State, other: State, part: float) -> State:
@@ -209,18 +211,9 @@ def _interpolate_states(model: Model, base: State, other: State, part: float) ->
     turn = turn * np.where(turn[:, :1] < 0, -1.0, 1.0)
     turn[:, 1:] *= part
     turn[:, 0] = np.sqrt(1 - np.sum(turn[:, 1:] ** 2, 1))
-    names = ("omega", "u", "udot") if model.is_chain else ("omega", "r", "v")
-    mixed = [getattr(base, x) + part * (getattr(other, x) - getattr(base, x)) for x in names]
-    p = quaternion_product(base.p, turn)
-    if model.is_chain:
-        return _make_state(model, p, *mixed)
-    omega, r, v = mixed
+    p, names = quaternion_product(base.p, turn), ("omega", "r", "v")
+    omega, r, v = (getattr(base, x) + part * (getattr(other, x) - getattr(base, x)) for x in names)
     return replace(project_to_manifold(model, r, p, v, quaternion_rate(p, omega)), x=base.x)
-
-
-def _make_state(model: Model, p: Array, omega: Array, u: Array, udot: Array) -> State:
-    """The state of a chain with coordinates that may be off their unit spheres."""
-    return state_from_minimal(model, *_unit_coordinates(model, p, omega, u, udot))
 
 
 def _unit_coordinates(

@@ -33,7 +33,6 @@ from plumbline.model.kinematics import (
     angular_velocity,
     complete_state,
     mass_matrix,
-    state_from_minimal,
     velocity_jacobian,
 )
 from plumbline.model.loops import RANK_TOLERANCE, cut_open
@@ -343,8 +342,6 @@ def _disturbed(model: Model, state: State, bound: RoundingBound) -> State:
     tolerance = np.asarray(bound.angular_acceleration)
     size = DISTURBANCE * max(float(np.max(np.linalg.norm(state.omega, axis=1))), 1.0) / np.max(tolerance)
     omega = state.omega + (size * tolerance)[:, None] * rng.normal(size=(model.n, 3))
-    if model.is_chain:
-        return state_from_minimal(model, state.p, omega, state.u, state.udot)
     xdot = state.xdot + (size * tolerance)[:, None] * rng.normal(size=state.xdot.shape)
     v = state.v + (size * np.asarray(bound.acceleration))[:, None] * rng.normal(size=(model.n, 3))
     return complete_state(model, replace(state, omega=omega, xdot=xdot, v=v))
@@ -427,7 +424,7 @@ def compare_parts(
             worst = np.argmax(error / np.maximum(bound, np.finfo(float).tiny), axis=0)
             body = np.arange(model.n)
             found["step_quadrature"].add(error[worst, body], bound[worst, body], effect[worst, body], place)
-        if not model.is_chain:  # the rows of its other joints off |p| = 1 are not written here
+        if not model.has_chain_joints:  # the rows of its other joints off |p| = 1 are not written here
             continue
         residual = constrained_residual(model, method, run)
         allowed = (

@@ -8,12 +8,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from adapters.reference_engine import Reference
+from plumbline.equations.balls import midpoints
 from plumbline.model.datatypes import KINDS
 from plumbline.model.kinematics import complete_state, spring_vectors, state_from_minimal
 from plumbline.model.random_mechanisms import ELEMENTS, random_tree
 from plumbline.model.sampling import compared_states, random_states
 from plumbline.scenario.generator import random_mechanism
-from plumbline.truth.ball_geometry import midpoints
 from plumbline.truth.certified_state import certify_state, enclose_quantities
 from plumbline.truth.rounding_bound import MAX_RELATIVE_BOUND, state_rounding_bound
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from plumbline.truth.ball_geometry import entries
+from plumbline.equations.balls import entries
 
 
 @dataclass(frozen=True, eq=False)

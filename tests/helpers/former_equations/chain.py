@@ -16,8 +16,9 @@ from typing import Any
 
 import numpy as np
 
+from plumbline.equations.balls import entries, midpoints
 from plumbline.model.datatypes import Model, State
-from plumbline.truth.ball_geometry import entries, midpoints, term_scales
+from plumbline.truth.certified_state import term_scales
 from tests.helpers.former_equations.tree import BallArithmetic
 
 

@@ -24,9 +24,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from plumbline.equations.balls import entries, midpoints
 from plumbline.model.datatypes import KINDS, Array, Model, State
 from plumbline.model.loops import CutMechanism, cut_open, independent_rows
-from plumbline.truth.ball_geometry import entries, midpoints
 from tests.helpers.former_equations.tree import (
     BallTree,
     equations_of_motion,

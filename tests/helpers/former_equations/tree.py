@@ -20,11 +20,12 @@ from typing import Any
 
 import numpy as np
 
+from plumbline.equations.balls import entries
 from plumbline.model.datatypes import KINDS, Model, State
 from plumbline.model.kinematics import own_rates, rate_count
-from plumbline.truth.ball_geometry import BallVectors, entries, quantity_scales
-from plumbline.truth.joint_tree import JointTree
+from plumbline.truth.certified_state import quantity_scales
 from tests.helpers.former_equations.ball_elements import ball_elements
+from tests.helpers.former_equations.joint_tree import BallVectors, JointTree
 
 
 class BallArithmetic(BallVectors):

@@ -1,4 +1,4 @@
-"""Certified quantities of a mechanism with loops, in ball arithmetic, with a proof that its pose is the one.
+"""A mechanism with loops in ball arithmetic: a proof that its pose is the only one, and what its tree does.
 
 The mechanism is cut open at its closing joints (`plumbline.model.loops`): each carries a part c of its near
 body b that coincides with b.  In coordinates z of the tree's joints (angles and shifts; Cayley's three
@@ -25,10 +25,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plumbline.equations.balls import balls as ball_arithmetic
-from plumbline.equations.tree import Tree
+from plumbline.equations.balls import entries, midpoints
+from plumbline.equations.tree import Solution, Tree
 from plumbline.model.datatypes import KINDS, ZERO_INERTIA, Array, Model, State
 from plumbline.model.loops import CutMechanism, cut_open, independent_rows
-from plumbline.truth.ball_geometry import entries, midpoints, quantity_scales, tree_quantities
 
 UNIQUENESS_RADIUS = 1e-10  # of dependent coordinates [rad, m], in which the pose is the only one
 NEWTON_STEPS = 40
@@ -165,15 +165,15 @@ class _Selection:
     inverse: NDArray[np.floating[Any]]  # double inverse of the block
 
 
-def enclose_loop(flint: Any, model: Model, state: State) -> dict[str, Any]:
-    """Enclose every quantity of a mechanism with loops at the working precision.
+def solve_loop(flint: Any, model: Model, state: State) -> tuple[Tree, Solution, CutMechanism, float]:
+    """Enclose the pose, the rates, and the accelerations and wrenches at the working precision.
 
     Args:
         state: near an assembled state.
 
     Returns:
-        As `plumbline.truth.certified_state.enclose_quantities`; "scale" has besides the largest gap of the
-        rows that were not kept.
+        The tree cut open, its loops closed; what it does; how it is cut; and the largest gap of the rows
+        that were not kept.
 
     Raises:
         ZeroDivisionError: no pose was proved to exist and to be unique, or a matrix has no inverse.
@@ -196,17 +196,10 @@ def enclose_loop(flint: Any, model: Model, state: State) -> dict[str, Any]:
     c = _LoopTree(flint, cut.model, start, z, _per_joint(nu, sizes))
     if model.lacks_inertia:
         c.shifted = _shifted_inertia(cut)
-    balls = _constrained_motion(flint, c, cut, chosen.rows)
     dropped = np.setdiff1d(np.arange(J.nrows()), chosen.rows)
     gap, rate = c.gap(cut.ends), entries(J * flint.arb_mat(len(nu), 1, nu))
-    of_body = ("acceleration", "angular_acceleration", "r", "v", "attitude", "angular_velocity")
-    at = dict.fromkeys(of_body, cut.place[: model.n])
-    at |= dict.fromkeys(("joint_reaction", "joint_moment"), cut.place)
-    scale = quantity_scales(c, balls)
-    scale["gap"] = max((float(abs(x[int(i)]).upper()) for x in (gap, rate) for i in dropped), default=0.0)
-    return {
-        name: [ball[int(k)] for k in at[name]] if name in at else ball for name, ball in balls.items()
-    } | {"scale": scale}
+    widest = max((float(abs(x[int(i)]).upper()) for x in (gap, rate) for i in dropped), default=0.0)
+    return c, _constrained_motion(flint, c, cut, chosen.rows), cut, widest
 
 
 def _rate_count(kind: str) -> int:
@@ -343,10 +336,8 @@ def _relative_rates(c: Tree) -> list[Any]:
     return found
 
 
-def _constrained_motion(
-    flint: Any, c: _LoopTree, cut: CutMechanism, rows: NDArray[np.intp]
-) -> dict[str, Any]:
-    """Solve for λ, and compute all quantities of the tree's bodies."""
+def _constrained_motion(flint: Any, c: _LoopTree, cut: CutMechanism, rows: NDArray[np.intp]) -> Solution:
+    """Solve for λ."""
     units = [flint.arb_mat(3, 1, [int(i == j) for i in range(3)]) for j in range(3)]
     wrenches = []
     for row in rows:
@@ -361,4 +352,4 @@ def _constrained_motion(
     kept = [relative[int(row)] for row in rows]
     K, opening = flint.arb_mat([row[1:] for row in kept]), flint.arb_mat([[-row[0]] for row in kept])
     shares = flint.arb_mat(len(rows) + 1, 1, [1, *entries(K.solve(opening))])
-    return tree_quantities(c, found.combined(lambda x: x * shares))
+    return found.combined(lambda x: x * shares)

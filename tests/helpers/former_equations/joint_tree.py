@@ -1,17 +1,94 @@
-"""Mass matrix and sums over subtrees of a tree of bodies on joints, in ball arithmetic.
-
-Each joint has the motions that it allows as columns S_k (6, m_k) of twists about the world's origin: angular
-velocity, and velocity of the point at the origin, in world axes (Featherstone, Rigid Body Dynamics
-Algorithms, 2008, table 6.2: composite rigid bodies).
-"""
+"""Vectors, rotations and mass matrices in ball arithmetic, as the former equations of trees had them."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 
-from plumbline.truth.ball_geometry import BallVectors, entries
+from plumbline.equations.balls import entries
+from plumbline.model.datatypes import Array
+
+
+class BallVectors:
+    """Vectors and rotations in balls; vectors are 3×1 ``arb_mat``."""
+
+    def __init__(self, flint: Any) -> None:
+        self.flint, self.mat, self.arb = flint, flint.arb_mat, flint.arb
+        self.zero = self.vector((0.0, 0.0, 0.0))
+        self.eye = self.matrix(np.eye(3))
+        self.units = [self.vector(e) for e in np.eye(3)]
+
+    def vector(self, v: Iterable[float]) -> Any:
+        """A vector of doubles.
+
+        Args:
+            v: three doubles.
+
+        Returns:
+            A 3×1 matrix.
+
+        """
+        return self.mat(3, 1, [self.arb(float(x)) for x in v])
+
+    def matrix(self, m: Array) -> Any:
+        """A 3×3 matrix of doubles.
+
+        Args:
+            m: (3, 3) doubles.
+
+        Returns:
+            A 3×3 matrix.
+
+        """
+        return self.mat(3, 3, [self.arb(float(x)) for x in np.ravel(m)])
+
+    def cross_matrix(self, a: Any) -> Any:
+        """ã: ã b = a × b.
+
+        Returns:
+            A 3×3 matrix.
+
+        """
+        x, y, z = a[0, 0], a[1, 0], a[2, 0]
+        return self.mat(3, 3, [0, -z, y, z, 0, -x, -y, x, 0])
+
+    @staticmethod
+    def dot(a: Any, b: Any) -> Any:
+        """aᵀb."""
+        return a[0, 0] * b[0, 0] + a[1, 0] * b[1, 0] + a[2, 0] * b[2, 0]
+
+    def rotation(self, p: Array) -> Any:
+        """A (N7) of the normalised quaternion: the homogeneous quadratic form over pᵀp.
+
+        Args:
+            p: (4,) a quaternion of doubles, scalar first, of any length but 0.
+
+        Returns:
+            A 3×3 matrix, body → world.
+
+        """
+        return self.rotation_of([self.arb(float(c)) for c in p])
+
+    def rotation_of(self, q: list[Any]) -> Any:
+        """A of a quaternion of balls, as `rotation`.
+
+        Args:
+            q: four balls, scalar first.
+
+        Returns:
+            A 3×3 matrix, body → world.
+
+        """
+        w, x, y, z = q
+        ww, xx, yy, zz = w * w, x * x, y * y, z * z
+        entries_ = [
+            [ww + xx - yy - zz, 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), ww - xx + yy - zz, 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), ww - xx - yy + zz],
+        ]
+        return self.mat(entries_) * (1 / (ww + xx + yy + zz))
 
 
 class JointTree(BallVectors):
