@@ -13,7 +13,7 @@ import numpy as np
 from flint import acb, arb, ctx
 
 from plumbline.model.datatypes import Array
-from plumbline.truth.closed_form.planar_pendulum import half_angle
+from plumbline.truth.closed_form.tops_and_pendulums import half_angle
 
 PRECISION = 160  # bits
 GRAVITY = "9.81"  # m/s²

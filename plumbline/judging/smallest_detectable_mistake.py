@@ -33,7 +33,8 @@ from plumbline.model.kinematics import angular_velocity, with_joint_coordinates
 from plumbline.model.step_methods import classical_runge_kutta
 from plumbline.truth.parameter_effects import difference_effects, effects_at_states
 from plumbline.truth.parameters import STATE_KINDS, Parameter, list_parameters, perturb
-from plumbline.truth.perturbed_motions import (
+from plumbline.truth.predictability_horizon import project_to_manifold
+from plumbline.truth.reference_motions import (
     MOTION_MISTAKE,
     AccurateMotion,
     PerturbedMotion,
@@ -42,7 +43,6 @@ from plumbline.truth.perturbed_motions import (
     perturbed_motions,
     resolved_motions,
 )
-from plumbline.truth.predictability_horizon import project_to_manifold
 from plumbline.truth.rounding_bound import EPS, remembered_rounding_bound
 from plumbline.truth.step_comparison import FormulaSteps
 

@@ -157,7 +157,7 @@ def perturbed_states(
         omega = state.omega + spread * rng.normal(size=(model.n, 3))
         u = state.u + cross(perturbation_size * rng.normal(size=(model.n, 3)), state.u)
         udot = state.udot + cross(spread * rng.normal(size=(model.n, 3)), state.u)
-        others = state.x, state.r, state.xdot, state.v
+        others: tuple[Array, ...] = state.x, state.r, state.xdot, state.v
         if not all(kind.holds_no_turn for kind in model.kinds[: model.n]):  # these are coordinates too
             sizes = (perturbation_size, perturbation_size, spread, spread)
             others = tuple(y + size * rng.normal(size=y.shape) for y, size in zip(others, sizes, strict=True))

@@ -314,7 +314,11 @@ def _numbers_and_coordinates(
 
     Gravity enters as a force.  ``reach`` leads from the near point of the far body to the joint's far point.
     """
-    precise, n, lift = _PreciseTree(mp, model, state), model.n, np.vectorize(mp.mpf, otypes=[object])
+    precise, n, lift = (
+        _PreciseTree(mp, model, state),
+        model.n,
+        np.vectorize(lambda x: mp.mpf(float(x)), otypes=[object]),
+    )
     numbers = {name: lift(getattr(model, name)) for name in PLAIN_NUMBERS}
     point, mass = numbers["point"], numbers["mass"]
     weight = mass[:, None] * numbers["gravity"]

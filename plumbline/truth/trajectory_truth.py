@@ -1,7 +1,7 @@
 """Truth along a trajectory; its uncertainty is the difference of two methods that share no equation.
 
 The first is heyoka's Taylor method in minimal coordinates (`taylor`), the second the notes' equations on the
-constraint manifold by collocation (`notes_motion`): other equations, other coordinates, another integrator.
+constraint manifold by collocation (`reference_motions`): other equations, other coordinates, another integrator.
 Their difference is the rounding of the second: in extended precision the first is far more accurate, as a
 comparison with quad precision shows (tests).
 """
@@ -19,8 +19,8 @@ from plumbline.model.invariants import motion_error, motion_errors, motion_sampl
 from plumbline.model.kinematics import angular_velocity, quaternion_rate
 from plumbline.truth import TruthUnavailable
 from plumbline.truth.certificate_proof import prove_motion
-from plumbline.truth.notes_motion import simulate_notes_form
 from plumbline.truth.proved_motion import ProvedMotion, round_enclosure
+from plumbline.truth.reference_motions import simulate_notes_form
 from plumbline.truth.taylor import Precision, simulate_taylor
 
 if TYPE_CHECKING:

@@ -22,7 +22,7 @@ from plumbline.scenario import loader as scenarios
 from plumbline.studies.coverage_study import blind_spots, summarize_coverage
 from plumbline.truth.parameter_effects import effects_at_states
 from plumbline.truth.parameters import STATE_KINDS, list_parameters, perturb
-from plumbline.truth.perturbed_motions import accurate_runs, perturbed_motions, resolved_motions
+from plumbline.truth.reference_motions import accurate_runs, perturbed_motions, resolved_motions
 from plumbline.truth.rounding_bound import EPS, state_rounding_bound
 from tests.helpers.coverage_confirmation import coverage, is_reported, scenario, states
 

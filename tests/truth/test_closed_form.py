@@ -13,7 +13,7 @@ from plumbline.model.datatypes import Model, State
 from plumbline.model.invariants import attitude_error, position_error
 from plumbline.model.kinematics import quaternion_product, rotation_matrix, state_from_minimal
 from plumbline.truth.closed_form import CLOSED_FORMS, ClosedFormMismatch, closed_form_motion
-from plumbline.truth.elliptic import elliptic_f, elliptic_pi, jacobi
+from plumbline.truth.closed_form.tops_and_pendulums import elliptic_f, elliptic_pi, jacobi
 from tests.helpers.catalogue import catalogue_scenarios
 from tests.helpers.relative_equilibria import relative_equilibrium
 

@@ -11,8 +11,8 @@ from plumbline.model.kinematics import complete_state, with_joint_coordinates
 from plumbline.model.loops import assembled, loop_gaps, smallest_singular_value
 from plumbline.model.random_mechanisms import random_loop_mechanism
 from plumbline.truth.ground_truth import motion_truth, perturbed_models
-from plumbline.truth.notes_motion import simulate_notes_form
 from plumbline.truth.predictability_horizon import perturbation_growth, perturbed_states
+from plumbline.truth.reference_motions import simulate_notes_form
 from plumbline.truth.regular_motion import RTOL, first_doubt, regular_motion
 from plumbline.truth.taylor import simulate_taylor
 from plumbline.truth.trajectory_truth import trajectory_truth

@@ -9,7 +9,6 @@ from plumbline.model.invariants import attitude_error, position_error
 from plumbline.model.kinematics import quaternion_rate, state_from_minimal
 from plumbline.scenario.loader import find_scenario_file, load_scenario
 from plumbline.truth.ground_truth import RUN_ROUNDING, stretched_length
-from plumbline.truth.notes_motion import simulate_notes_form
 from plumbline.truth.predictability_horizon import (
     HORIZON_TOLERANCE,
     PERTURBATION_COUNT,
@@ -23,6 +22,7 @@ from plumbline.truth.predictability_horizon import (
     predictability_horizon,
     project_to_manifold,
 )
+from plumbline.truth.reference_motions import simulate_notes_form
 from tests.helpers import pendulums
 from tests.helpers.catalogue import catalogue_scenarios
 from tests.helpers.random_chains import random_chain

@@ -1,7 +1,7 @@
 """Closed-form motions, independent of every engine and of the notes' equations.
 
 `closed_form_motion` takes a scenario that names its closed form, checks that the scenario fulfils the
-conditions of that motion, and returns the motion as a function of time.  One module per family: planar
+conditions of that motion, and returns the motion as a function of time.  The families: planar
 pendulum, heavy symmetric top (and spherical pendulum), free top, steady motions (equilibria and conical
 motions), small oscillations, damped oscillator.  After 2 s the results are accurate to 3e-15 m and 2e-14 rad
 for the scenarios of the catalogue; an axis that passes the vertical at an angle δ loses a factor 1/δ² in its
@@ -14,13 +14,19 @@ from collections.abc import Callable
 from typing import Protocol
 
 from plumbline.model.datatypes import Array, Model, State
-from plumbline.truth.closed_form.free_top import free_top
-from plumbline.truth.closed_form.heavy_top import lagrange_top, spherical_pendulum
+from plumbline.truth.closed_form.linear_and_steady_motions import (
+    damped_oscillator,
+    equilibrium,
+    small_oscillation,
+    steady_rotation,
+)
 from plumbline.truth.closed_form.motion import ClosedFormMismatch, ClosedFormMotion
-from plumbline.truth.closed_form.oscillator import damped_oscillator
-from plumbline.truth.closed_form.planar_pendulum import planar_pendulum
-from plumbline.truth.closed_form.small_oscillation import small_oscillation
-from plumbline.truth.closed_form.steady_motion import equilibrium, steady_rotation
+from plumbline.truth.closed_form.tops_and_pendulums import (
+    free_top,
+    lagrange_top,
+    planar_pendulum,
+    spherical_pendulum,
+)
 
 __all__ = [
     "CLOSED_FORMS", "ClosedFormMismatch", "ClosedFormMotion", "ClosedFormScenario", "closed_form_motion",
