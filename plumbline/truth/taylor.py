@@ -294,13 +294,18 @@ def _bare_joints(model: Model) -> list[int]:
     return [int(k) for k in np.flatnonzero(bare)]
 
 
+def _exactly(mp: Any) -> Callable[[Any], Any]:
+    """The map from doubles and integers to numbers of mpmath."""
+    return lambda x: mp.mpf(float(x))
+
+
 class _PreciseTree(tree.Tree):
     """A tree in numbers of mpmath, with the turns θ of joints with springs."""
 
     def __init__(self, mp: Any, model: Model, state: State) -> None:
         self.angles: dict[int, Any] = {}
         self.mp = mp
-        super().__init__(objects.objects(mp, mp.mpf), model, state)
+        super().__init__(objects.objects(mp, _exactly(mp)), model, state)
 
     def turn_over_sine(self, k: int, sine: Any, cosine: Any) -> Any:
         self.angles[k] = self.mp.atan2(self.mp.norm([*sine[:, 0]]), cosine)
@@ -314,11 +319,7 @@ def _numbers_and_coordinates(
 
     Gravity enters as a force.  ``reach`` leads from the near point of the far body to the joint's far point.
     """
-    precise, n, lift = (
-        _PreciseTree(mp, model, state),
-        model.n,
-        np.vectorize(lambda x: mp.mpf(float(x)), otypes=[object]),
-    )
+    precise, n, lift = _PreciseTree(mp, model, state), model.n, np.vectorize(_exactly(mp), otypes=[object])
     numbers = {name: lift(getattr(model, name)) for name in PLAIN_NUMBERS}
     point, mass = numbers["point"], numbers["mass"]
     weight = mass[:, None] * numbers["gravity"]
