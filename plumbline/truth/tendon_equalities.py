@@ -12,16 +12,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from plumbline.equations.arithmetic import floats
+from plumbline.equations.tree import Tree
 from plumbline.model.datatypes import Array, Model, State
-from plumbline.model.kinematics import (
-    JointFrame,
-    angular_velocity,
-    cross,
-    joint_coordinates,
-    quaternion_rate,
-    rotate_vectors,
-    rotation_matrix,
-)
+from plumbline.model.kinematics import angular_velocity, joint_coordinates, quaternion_rate, rotate_vectors
 from plumbline.model.loops import cut_open, determinate_projectors, wrench_length
 from plumbline.model.redescription import rods_taken_out
 from reference_impl.direct import DirectSystem
@@ -68,43 +62,14 @@ def _lengthening(model: Model, state: State, u: Array, udot: Array) -> dict[int,
     if tree.has_loops:
         cut = cut_open(tree)
         tree, there, place = cut.model, cut.state(there), np.append(cut.place, -1)[place]
-    A, spin, a, alpha = _at_constant_rates(tree, there)
-    found = {}
+    found, bodies = dict[int, float](), Tree(floats(), tree, there)
+    a, alpha = bodies.coasting()  # at q̈ = 0
     for k in np.flatnonzero(model.rods):
         ends = np.zeros((2, 3))
         for side, (body, point) in enumerate(zip(model.body[k], model.point[k], strict=True)):
             if body >= 0:
                 b = place[body]
-                ends[side] = a[b] + _carried(alpha[b], spin[b], A[b] @ point)
+                arm, num = bodies.A[b] @ point[:, None], bodies.num
+                ends[side] = (a[b] + num.cross(alpha[b], arm) + bodies.centripetal(b, point, arm))[:, 0]
         found[int(k)] = float(u[k] @ (ends[1] - ends[0]) + model.length[k] * np.sum(udot[k] ** 2))
     return found
-
-
-def _at_constant_rates(tree: Model, state: State) -> tuple[Array, Array, Array, Array]:
-    """Attitudes (N, 3, 3), ω, r̈ and ω̇ (N, 3) of all bodies, world axes, where all coordinates have q̈ = 0."""
-    A = rotation_matrix(state.p)
-    spin = rotate_vectors(A, state.omega)
-    a, alpha = np.zeros((tree.n, 3)), np.zeros((tree.n, 3))
-    for k, (kind, far) in enumerate(zip(tree.kinds, tree.body[:, 0], strict=True)):
-        if kind.holds_nothing:
-            continue
-        above, turning, swing, tip = np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3)
-        if far >= 0:
-            above, turning, swing = A[far], spin[far], alpha[far]
-            tip = a[far] + _carried(swing, turning, above @ tree.point[k, 0])
-        if kind.is_spherical:
-            swing = swing + cross(turning, spin[k])
-        for i, (what, axis) in enumerate(JointFrame(tree, k, above).axes(state.x[k])):
-            rate, shift = axis * state.xdot[k, i], axis * state.x[k, i]
-            if what == "turn":
-                swing, turning = swing + cross(turning, rate), turning + rate
-            else:
-                tip = tip + _carried(swing, turning, shift) + 2 * cross(turning, rate)
-        alpha[k] = swing
-        a[k] = tip - _carried(swing, spin[k], A[k] @ tree.proximal[k])
-    return A, spin, a, alpha
-
-
-def _carried(alpha: Array, omega: Array, s: Array) -> Array:
-    """Acceleration of a point at s from another one of the same body."""
-    return cross(alpha, s) + cross(omega, cross(omega, s))

@@ -1,7 +1,8 @@
 """Truth along a trajectory; its uncertainty is the difference of two methods that share no equation.
 
 The first is heyoka's Taylor method in minimal coordinates (`taylor`), the second the notes' equations on the
-constraint manifold by collocation (`reference_motions`): other equations, coordinates and integrator.  Their difference is the rounding of the second: in extended precision the first is far more accurate, as a
+constraint manifold by collocation (`reference_motions`): other equations, coordinates and integrator. Their
+difference is the rounding of the second: in extended precision the first is far more accurate, as a
 comparison with quad precision shows (tests).
 """
 
