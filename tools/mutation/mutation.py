@@ -65,7 +65,6 @@ TARGETS = {
         *(
             f"plumbline/judging/{name}.py"
             for name in (
-                "coverage",
                 "identity",
                 "invariant_drift",
                 "known_issues",
@@ -73,9 +72,10 @@ TARGETS = {
                 "outlier",
                 "refinement_analysis",
                 "relation_rows",
-                "state",
-                "step",
-                "trajectory",
+                "smallest_detectable_mistake",
+                "state_level",
+                "step_level",
+                "trajectory_level",
             )
         ),
         *(
@@ -88,7 +88,10 @@ TARGETS = {
                 "single_steps",
             )
         ),
-        *(f"plumbline/truth/{name}.py" for name in ("ground_truth", "rounding_bound", "sensitivity")),
+        *(
+            f"plumbline/truth/{name}.py"
+            for name in ("ground_truth", "rounding_bound", "predictability_horizon")
+        ),
         *(f"plumbline/diagnosis/{name}.py" for name in ("diagnose", "fit")),
         "plumbline/model/invariants.py",
     ],
@@ -110,13 +113,13 @@ TEST_FILES = {  # by target or top folder, the tests that must notice its mutant
         *(
             f"tests/judging/test_{name}.py"
             for name in (
-                "coverage",
                 "identity",
                 "known_issues",
                 "long_runs",
                 "outlier",
-                "state",
-                "step",
+                "smallest_detectable_mistake",
+                "state_level",
+                "step_level",
                 "trajectory*",
             )
         ),
@@ -124,7 +127,10 @@ TEST_FILES = {  # by target or top folder, the tests that must notice its mutant
             f"tests/measurements/test_{name}.py"
             for name in ("order_and_limit", "refinement_study", "relation*")
         ),
-        *(f"tests/truth/test_{name}.py" for name in ("ground_truth", "rounding_bound", "sensitivity")),
+        *(
+            f"tests/truth/test_{name}.py"
+            for name in ("ground_truth", "rounding_bound", "predictability_horizon")
+        ),
         "tests/diagnosis/test_diagnose.py",
         "tests/model/test_invariants.py",
         "tests/execution/test_planted_defects.py",
