@@ -17,9 +17,9 @@ from plumbline.model.invariants import (
     invariant_scales,
     kinetic_energy,
 )
-from plumbline.model.kinematics import angular_velocity
+from plumbline.model.kinematics import angular_velocity, stretched_length
 from plumbline.processes.exceptions import describe_exception
-from plumbline.truth.ground_truth import singular_note, stretched_length
+from plumbline.truth.ground_truth import singular_note
 
 # By order: coarsest and finest step, as -log2 of the `step_unit`.
 LONG_RUN_STEP_EXPONENTS = {1: (9, 11), 2: (7, 9), 4: (7, 9)}

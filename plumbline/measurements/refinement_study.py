@@ -25,7 +25,8 @@ from plumbline.engines.engine_calls import RefinementRun, RefinementStudy
 from plumbline.measurements.order_and_limit import ORDER_MARGIN, max_norm, observed_order, romberg
 from plumbline.model.datatypes import Array, Float, Integrator, Model, State
 from plumbline.model.invariants import INVARIANT_UNITS, compute_invariants, invariant_scales
-from plumbline.truth.ground_truth import RUN_ROUNDING, stretched_length  # constants, no truth
+from plumbline.model.kinematics import stretched_length
+from plumbline.truth.ground_truth import RUN_ROUNDING  # a constant, no truth
 
 ROUNDING_PER_STEP = 8 * 2.0**-52  # of an invariant, relative to its scale: a handful of operations
 STOP_MARGIN = 1 / 8  # μ: what a finer step could lower a bound by, relative to the bound

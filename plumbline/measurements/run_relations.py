@@ -18,9 +18,9 @@ from plumbline.engines.metamorphic_hooks import MetamorphicHooks
 from plumbline.measurements.relation_result import OPTION_PREFIX, Refusal, RelationResult
 from plumbline.model.datatypes import EngineFailure, Integrator, Model, State, Trajectory, Unsupported
 from plumbline.model.invariants import attitude_error, position_error
-from plumbline.model.kinematics import angular_velocity
+from plumbline.model.kinematics import angular_velocity, stretched_length
 from plumbline.processes.exceptions import describe_exception
-from plumbline.truth.ground_truth import RUN_ROUNDING, stretched_length
+from plumbline.truth.ground_truth import RUN_ROUNDING
 from plumbline.truth.rounding_bound import state_rounding_bound
 
 REVERSED_IN_TIME = "reversed in time"

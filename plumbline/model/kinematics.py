@@ -619,3 +619,23 @@ def _coordinates(motions: tuple[tuple[str, int], ...], shift: Array, relative: A
             angles.append(float(np.arctan2(relative[0, 2], relative[0, 0])))
     found = iter(angles)
     return [float(shift[axis]) if what == "slide" else next(found) for what, axis in motions]
+
+
+def stretched_length(model: Model) -> Array:
+    """Measure how far each body and its rod extend the stretched mechanism.
+
+    Returns:
+        (N,) [m] rod length, and the far point's distance from the world's origin where the joint is on the
+        world, plus the largest of: distance from the near point to the far points of the joints beyond,
+        distance from the near point to the centre of mass, radius of gyration.
+
+    """
+    model = model.tree
+    span, far = np.zeros(model.n), model.body[:, 0]
+    on_body = far >= 0
+    distance = np.linalg.norm(model.proximal[far[on_body]] - model.point[on_body, 0], axis=1)
+    np.maximum.at(span, far[on_body], distance)
+    gyration = np.sqrt(np.trace(model.inertia, axis1=1, axis2=2) / (2 * model.mass))
+    sizes = [span, np.linalg.norm(model.proximal, axis=1), gyration]
+    from_origin = np.where(on_body, 0.0, np.linalg.norm(model.point[:, 0], axis=1))
+    return np.asarray(model.length + np.max(sizes, axis=0) + from_origin)

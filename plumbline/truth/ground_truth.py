@@ -16,7 +16,7 @@ import numpy as np
 from plumbline.engines.registry import load_adapter
 from plumbline.model.datatypes import KINDS, Array, EngineFailure, Model, State, StateQuantities, Trajectory
 from plumbline.model.invariants import MOTION_UNITS, motion_errors, motion_scales
-from plumbline.model.kinematics import complete_state
+from plumbline.model.kinematics import complete_state, stretched_length
 from plumbline.model.loops import MIN_MOTION_SINGULAR_VALUE, assembled
 from plumbline.model.sampling import derive_seed
 from plumbline.truth import TruthUnavailable
@@ -190,26 +190,6 @@ def singular_note(end: float) -> str:
         f"singular: from t = {end:.4g} s on the smallest singular value of the rows that close the "
         f"loops is below {MIN_MOTION_SINGULAR_VALUE:g}; at a singular pose accelerations are not unique"
     )
-
-
-def stretched_length(model: Model) -> Array:
-    """Measure how far each body and its rod extend the stretched mechanism.
-
-    Returns:
-        (N,) [m] rod length, and the far point's distance from the world's origin where the joint is on the
-        world, plus the largest of: distance from the near point to the far points of the joints beyond,
-        distance from the near point to the centre of mass, radius of gyration.
-
-    """
-    model = model.tree
-    span, far = np.zeros(model.n), model.body[:, 0]
-    on_body = far >= 0
-    distance = np.linalg.norm(model.proximal[far[on_body]] - model.point[on_body, 0], axis=1)
-    np.maximum.at(span, far[on_body], distance)
-    gyration = np.sqrt(np.trace(model.inertia, axis1=1, axis2=2) / (2 * model.mass))
-    sizes = [span, np.linalg.norm(model.proximal, axis=1), gyration]
-    from_origin = np.where(on_body, 0.0, np.linalg.norm(model.point[:, 0], axis=1))
-    return np.asarray(model.length + np.max(sizes, axis=0) + from_origin)
 
 
 def perturbed_models(model: Model, state: State) -> list[tuple[Model, State]]:

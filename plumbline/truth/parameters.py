@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from plumbline.model.datatypes import JOINT_ELEMENTS, SPRING_FIELDS, Array, Model, State
-from plumbline.model.kinematics import complete_state, quaternion_product
-from plumbline.truth.ground_truth import stretched_length
+from plumbline.model.kinematics import complete_state, quaternion_product, stretched_length
 
 AXES = ("x", "y", "z")
 INERTIA_ENTRIES = {"xx": (0, 0), "yy": (1, 1), "zz": (2, 2), "xy": (0, 1), "xz": (0, 2), "yz": (1, 2)}

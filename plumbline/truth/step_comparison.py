@@ -33,12 +33,12 @@ from plumbline.model.kinematics import (
     angular_velocity,
     complete_state,
     mass_matrix,
+    stretched_length,
     velocity_jacobian,
 )
 from plumbline.model.loops import RANK_TOLERANCE, cut_open
 from plumbline.model.sampling import derive_seed
 from plumbline.model.step_methods import ConstrainedMethod, JointSpaceMethod, StepMethod
-from plumbline.truth.ground_truth import stretched_length
 from plumbline.truth.rounding_bound import EPS, RoundingBound, remembered_rounding_bound
 from plumbline.truth.step_charts import BodyStates
 from plumbline.truth.step_formulas import (

@@ -13,8 +13,14 @@ from plumbline.measurements.order_and_limit import romberg
 from plumbline.measurements.refinement_study import ROUNDING_PER_STEP
 from plumbline.model.datatypes import Integrator, Trajectory
 from plumbline.model.invariants import compute_invariants, motion_samples
-from plumbline.model.kinematics import angular_velocity, quaternion_product, rotate_vectors, rotation_matrix
-from plumbline.truth.ground_truth import RUN_ROUNDING, MotionTruth, stretched_length
+from plumbline.model.kinematics import (
+    angular_velocity,
+    quaternion_product,
+    rotate_vectors,
+    rotation_matrix,
+    stretched_length,
+)
+from plumbline.truth.ground_truth import RUN_ROUNDING, MotionTruth
 from tests.helpers import pendulums
 
 TIMES = np.linspace(0, 2, 17)

@@ -181,5 +181,5 @@ def test_the_rule_cannot_see_the_truth():
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("plumbline.truth")
         for alias in node.names
     }
-    assert imported == {"RUN_ROUNDING", "stretched_length"}, "a constant, and the size of the model"
+    assert imported == {"RUN_ROUNDING"}, "a constant"
     assert make_truth().growth.min() >= 1, "the derivation takes G ≥ 1"

@@ -29,9 +29,9 @@ from plumbline.measurements.state_relations import (
     unchanged,
 )
 from plumbline.model.datatypes import EngineFailure, Integrator, StateQuantities, Trajectory, Unsupported
-from plumbline.model.kinematics import angular_velocity, quaternion_product, quaternion_rate
+from plumbline.model.kinematics import angular_velocity, quaternion_product, quaternion_rate, stretched_length
 from plumbline.scenario.loader import find_scenario_file, load_scenario
-from plumbline.truth.ground_truth import RUN_ROUNDING, stretched_length
+from plumbline.truth.ground_truth import RUN_ROUNDING
 from plumbline.truth.predictability_horizon import perturbation_growth
 from plumbline.truth.rounding_bound import state_rounding_bound
 from tests.helpers import pendulums

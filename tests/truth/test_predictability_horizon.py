@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from plumbline.model.invariants import attitude_error, position_error
-from plumbline.model.kinematics import quaternion_rate, state_from_minimal
+from plumbline.model.kinematics import quaternion_rate, state_from_minimal, stretched_length
 from plumbline.scenario.loader import find_scenario_file, load_scenario
-from plumbline.truth.ground_truth import RUN_ROUNDING, stretched_length
+from plumbline.truth.ground_truth import RUN_ROUNDING
 from plumbline.truth.predictability_horizon import (
     HORIZON_TOLERANCE,
     PERTURBATION_COUNT,
