@@ -237,7 +237,7 @@ class Mechanism:
     @property
     def columns(self) -> int:
         """Columns of joint coordinates and elements: 2, or as many as a joint has motions."""
-        return int(self.armature.shape[1])
+        return int(self.armature.shape[-1])
 
     @property
     def rods(self) -> Bool[Flags, "joints"]:

@@ -1,6 +1,7 @@
-"""Diagnosis: which single defect would make an engine return what it returned.
+"""Why an engine differs from the truth, as records of causes.
 
-Takes a model, the quantities that an engine reported at several states and their truth; returns a sentence
-that names the defect, or states that no single change explains the difference.  `defect_model` evaluates a
-mechanism with a given defect, `hypotheses` and `output_defects` list them, `fit` and `diagnose` select.
+`edits` lists wrong numbers, `readings` what may be read in another frame, `terms` what is linear in the
+equations, `outputs` what may be returned in place of a quantity.  `prediction` evaluates many of them at
+once, `fit` finds amounts, `diagnose` selects; `integrator_search` does the same for steps.  `cause` makes
+sentences.
 """

@@ -1,10 +1,9 @@
-"""Find the one change of a number, a term, a convention or a returned quantity that explains a difference.
+"""Find what explains how an engine differs from the truth at states of any mechanism.
 
-Every cause of `hypotheses` is evaluated with `defect_model` and fitted (`fit`); all causes that explain every
-quantity are named, because the data cannot distinguish them.  Where there is none, each wrong quantity is
-compared with the table of `output_defects`, and those without a match are explained together, because a
-defect may be in the accelerations and not in the energies.  An error that scatters where little more than the
-last bits of the problem change has no such cause: `digit_loss`.
+Edits of numbers, terms, readings and outputs are tried together (`fit`, `outputs`).  All single causes that
+explain every quantity are named, because the data cannot distinguish them.  Where there is none, quantities
+are explained one by one or in groups, then pairs of causes, then the place of unknown forces.  An error that
+scatters where little more than the last bits of the problem change has no such cause: `digit_loss`.
 """
 
 from __future__ import annotations
@@ -14,42 +13,27 @@ from dataclasses import replace
 
 import numpy as np
 
-from plumbline.diagnosis.defect_model import evaluate_case, make_defect_case
-from plumbline.diagnosis.digit_loss import (
-    DigitLoss,
-    Evaluate,
-    describe_scatter,
-    find_digit_loss,
-    measure_scatter,
-)
-from plumbline.diagnosis.fit import (
-    MAX_EXPLAINED_RATIO,
-    MIN_CHANGE_RATIO,
-    TINY,
-    ObservedDifference,
-    find_explanations,
-    max_error_ratio,
-    per_entry,
-)
-from plumbline.diagnosis.hypotheses import format_significant
-from plumbline.diagnosis.joint_diagnosis import diagnose_joints
-from plumbline.diagnosis.output_defects import output_defects
-from plumbline.diagnosis.result import Diagnosis
+from plumbline.diagnosis.cause import Cause, Diagnosis
+from plumbline.diagnosis.digit_loss import Evaluate, Problem, find_digit_loss, measure_scatter, scatter_cause
+from plumbline.diagnosis.fit import ACCEPTED_RATIO, Difference, Explanation, Mask, Search
+from plumbline.diagnosis.outputs import Outputs, error_ratio
+from plumbline.diagnosis.prediction import QUANTITIES, SUMS, VECTORS, WRENCHES, Answers, Case, Predictor, View
+from plumbline.diagnosis.readings import other_branches
+from plumbline.diagnosis.terms import Terms, force_places, is_spanned
 from plumbline.engines.registry import load_adapter
 from plumbline.model.datatypes import Array, Model, State, StateQuantities
-from plumbline.model.kinematics import state_from_minimal
+from plumbline.model.kinematics import complete_state, stack_states, state_from_minimal
 from plumbline.truth.ground_truth import StateTruth
 from plumbline.truth.rounding_bound import rounding_bounds
 
-QUANTITIES = (
-    "acceleration", "angular_acceleration", "joint_reaction", "kinetic_energy", "potential_energy",
-    "angular_momentum",
-)  # fmt: skip
-MAX_STATES = 8  # examined; fewer for long chains
-SINGLE_ROUNDING = 1e-5  # of the largest value: what computing in single precision may cost
+MIN_DIAGNOSABLE_RATIO = 8.0  # in bounds: of hundreds of fitted causes, some explain less by chance
 MAX_LOCATED = 4  # states at which the difference is looked for at rest, without gravity and without loads
-# in bounds: of a hundred fitted causes, some explain a smaller difference by chance
-MIN_DIAGNOSABLE_RATIO = 8.0
+LOOP_VIEWS = (
+    View(are_bodies_kept=True),
+    # an engine's forces that close an open loop act on both ends, its own wrenches count them at one
+    View((*VECTORS[:2], *SUMS), end_rows="twists"),
+)
+JUDGED = (*QUANTITIES, "mass_matrix")
 
 
 def explain_disagreement(
@@ -61,18 +45,14 @@ def explain_disagreement(
         engine_quantities: what the engine returned at the states of ``truth``.
         is_known: whether the cause is on record as rounding: then only the scatter of the error is measured.
 
-    Returns:
-        The sentence of `diagnose`, or the scatter of the error.
-
     """
-    if not model.is_chain:
-        return Diagnosis("" if is_known else diagnose_joints(model, engine_quantities, truth))
     evaluate = load_adapter(engine).evaluate
     if not is_known:
-        return Diagnosis(diagnose(model, engine_quantities, truth, evaluate))
-    difference = observe_difference(model, engine_quantities, truth)
-    scatter = measure_scatter(difference.of_quantities(difference.wrong_quantities()), model, evaluate)
-    return Diagnosis("" if scatter is None else describe_scatter(scatter), scatter)
+        return diagnose(model, engine_quantities, truth, evaluate)
+    problem = Problem.worst(model, engine_quantities, truth)
+    scatter = measure_scatter(problem, evaluate)
+    causes = () if scatter is None else (scatter_cause(list(problem.right), scatter),)
+    return Diagnosis(causes, scatter=scatter)
 
 
 def diagnose(
@@ -80,258 +60,378 @@ def diagnose(
     reported: Sequence[StateQuantities],
     truth: StateTruth,
     evaluate: Evaluate | None = None,
-) -> str:
-    """Name the defect that explains how an engine differs from the truth.
+) -> Diagnosis:
+    """Name the causes that explain how an engine differs from the truth.
 
     Args:
         reported: what the engine returned at the states of ``truth``.
-        evaluate: evaluates the engine again, at rest, without gravity, without loads and drag, to localise
-            the difference; None to skip that.
-
-    Returns:
-        A sentence: "behaves as if …" or that no single change explains the difference, and where it persists.
+        evaluate: evaluates the engine again, at turned problems and at rest, without gravity, without loads
+            and drag, to find loss of digits and to localise the difference; None to skip that.
 
     """
-    difference = observe_difference(model, reported, truth)
-    ratio = difference.error_ratio(difference.expected)
-    if ratio <= MAX_EXPLAINED_RATIO:
-        return "the difference is in the mass matrix alone; all other quantities are right"
-    if ratio <= MIN_DIAGNOSABLE_RATIO:
-        text = "the difference is too close to the rounding bound to name a single term"
-    else:
-        text = _describe_cause(difference, model, evaluate)
-    return text + (f" ({_localise_difference(model, difference, evaluate)})" if evaluate else "")
+    search = _Diagnosing(model, reported, truth, evaluate)
+    causes = search.causes()
+    persistence = search.persistence() if evaluate and search.largest > 1 else {}
+    return Diagnosis(causes, persistence)
 
 
-def _describe_cause(difference: ObservedDifference, model: Model, evaluate: Evaluate | None) -> str:
-    """Sentence on what explains the difference: of all quantities together, of each, or as loss of digits."""
-    loss = _digit_loss(difference, difference.wrong_quantities(MIN_DIAGNOSABLE_RATIO), model, evaluate)
-    text = _describe_explanations(difference, loss is not None)
-    if text:
-        return text
-    named, unnamed = _name_quantities(difference)
-    close = [q for q in difference.wrong_quantities() if q not in named and q not in unnamed]
-    parts = ["behaves as if " + "; and ".join(dict.fromkeys(named.values()))] if named else []
-    if unnamed:
-        loss = loss or (_digit_loss(difference, unnamed, model, evaluate) if named else None)
-        together = "" if loss else _describe_part(difference, [*unnamed, *close])
-        if together:
-            parts.append(together)
-            close = []
-        elif loss and loss.grows:
-            parts.append(loss.describe())
-        else:
-            parts.append(
-                "no single change of a parameter, term or convention explains the " + _enumerate(unnamed)
-            )
-            if loss:
-                parts.append(loss.describe())
-    if close:
-        parts.append(
-            f"the difference of the {_enumerate(close)} is too close to the rounding bound to name a term"
-        )
-    return "; ".join(parts)
+def state_count(model: Model) -> int:
+    """Return at how many states causes are evaluated: fewer of large mechanisms."""
+    return 6 if model.n <= 6 else 4 if model.n <= 12 else 2
 
 
-def _digit_loss(
-    difference: ObservedDifference, quantities: Sequence[str], model: Model, evaluate: Evaluate | None
-) -> DigitLoss | None:
-    """How the error of some quantities scatters; None where it does not or nothing can be evaluated."""
-    return find_digit_loss(difference.of_quantities(quantities), model, evaluate) if evaluate else None
+def error_ratios(reported: Sequence[StateQuantities], truth: StateTruth, quantity: str) -> Array:
+    """Return the errors (S,) of a quantity in bounds, of the worst body; 0 where there is none."""
+    found = np.zeros(len(reported))
+    for i, (answer, true, bound) in enumerate(zip(reported, truth.quantities, truth.bounds, strict=True)):
+        value, right = getattr(answer, quantity), getattr(true, quantity)
+        if value is None or right is None:
+            continue
+        limit = np.asarray(bound.tolerance(quantity)) + (answer.limit_error or {}).get(quantity, 0.0)
+        off = np.asarray(value, float) - right
+        off = np.linalg.norm(off, axis=-1) if quantity in (*VECTORS, "angular_momentum") else np.abs(off)
+        found[i] = np.max(off / np.maximum(limit, np.finfo(float).tiny), initial=0.0)
+    return np.nan_to_num(found, nan=np.inf)
 
 
-def _enumerate(quantities: Sequence[str]) -> str:
+def _words(quantities: Sequence[str]) -> str:
     return " and ".join(q.replace("_", " ") for q in quantities)
 
 
-def observe_difference(
-    model: Model, reported: Sequence[StateQuantities], truth: StateTruth
-) -> ObservedDifference:
-    """Select consecutive states around the one with the largest error, so that stale fields can be detected.
+class _Diagnosing:
+    """One diagnosis: the difference at states that show it, and what was tried."""
 
-    Args:
-        reported: what the engine returned at the states of ``truth``.
+    def __init__(
+        self, model: Model, reported: Sequence[StateQuantities], truth: StateTruth, evaluate: Evaluate | None
+    ) -> None:
+        self.model, self.reported, self.truth, self.evaluate = model, reported, truth, evaluate
+        self.ratios = {q: error_ratios(reported, truth, q) for q in JUDGED}
+        worst = np.max([self.ratios[q] for q in QUANTITIES], axis=0)
+        self.largest = float(np.max(worst))
+        order = np.argsort(-worst).tolist()
+        count = state_count(model)
+        first = order[: (count + 1) // 2]
+        rest = order[len(first) :]
+        spread = np.linspace(0, len(rest) - 1, min(len(rest), count - len(first))).round().astype(int)
+        self.order, self.places = order, sorted([*first, *(rest[i] for i in spread)])
+        self.searches: dict[View, Search] = {}
+        self.loss: Cause | None = None
+        self.named: dict[str, Cause] = {}
 
-    Returns:
-        The data to be explained: at most `MAX_STATES` states, the quantities that the engine offers at all.
+    def wrong(self, ratio: float = 1.0) -> list[str]:
+        """List the quantities whose error exceeds a number of bounds."""
+        return [q for q in QUANTITIES if np.max(self.ratios[q]) > ratio]
 
-    """
-    quantities = [q for q in QUANTITIES if all(getattr(a, q) is not None for a in reported)]
-    count = min(len(reported), MAX_STATES if model.n <= 6 else 4 if model.n <= 12 else 2)
-    everywhere = range(len(reported))
+    def _places(self, view: View) -> list[int]:
+        """States of the fit: of views that are evaluated one by one the two worst."""
+        return self.places if view == View() else self.order[:2]
 
-    def column(answers: Sequence[StateQuantities], q: str, states: Sequence[int]) -> Array:
-        return np.array([np.asarray(getattr(answers[i], q), float) for i in states])
+    def search(self, view: View) -> Search:
+        """The candidates of a view, screened once."""
+        if view not in self.searches:
+            difference = Difference(self.model, self.reported, self.truth, view, self._places(view))
+            self.searches[view] = Search(difference)
+        return self.searches[view]
 
-    def bounds(q: str, states: Sequence[int]) -> Array:
-        return np.array([truth.bounds[i].tolerance(q) for i in states])
-
-    ratios = [
-        max(
-            max_error_ratio(column(reported, q, [i]) - column(truth.quantities, q, [i]), bounds(q, [i]))
-            for q in quantities
-        )
-        for i in everywhere
-    ]
-    first = int(np.clip(int(np.argmax(ratios)) - count // 2, 0, len(reported) - count))
-    window = everywhere[first : first + count]
-    return ObservedDifference(
-        make_defect_case(model, [truth.states[i] for i in window]),
-        {q: column(reported, q, window) for q in quantities},
-        {q: column(truth.quantities, q, window) for q in quantities},
-        {q: bounds(q, window) for q in quantities},
-        {q: column(truth.quantities, q, [i - 1 for i in window]) for q in quantities},
-    )
-
-
-# --- causes -------------------------------------------------------------------------------------
-
-
-def _describe_explanations(difference: ObservedDifference, are_conventions_only: bool = False) -> str:
-    """Sentence that names every cause that explains all quantities; empty where there is none."""
-    found = find_explanations(difference, are_conventions_only=are_conventions_only)
-    if not found:
-        return ""
-    first, *others = (fit.cause.describe(fit.fitted_amount, fit.resolution) for fit, _ in found)
-    text = f"behaves as if {first}"
-    if others:
-        text += f"; the data cannot distinguish this from: {'; '.join(others)}"
-    return (
-        text + f"; this explains the difference to {max(left for _, left in found):.2g} of the rounding bound"
-    )
-
-
-def _describe_part(difference: ObservedDifference, quantities: Sequence[str]) -> str:
-    """Sentence that names a cause which acts on some quantities alone; empty where there is none."""
-    if len(quantities) == len(difference.reported):
-        return ""
-    text = _describe_explanations(difference.of_quantities(quantities))
-    return text and f"in the {_enumerate(quantities)} alone it {text}"
-
-
-# --- returned quantities -------------------------------------------------------------------------
-
-
-def _name_quantities(difference: ObservedDifference) -> tuple[dict[str, str], list[str]]:
-    """What was returned in place of each wrong quantity, and the quantities without a name."""
-    wrong = difference.wrong_quantities(MIN_DIAGNOSABLE_RATIO)
-    texts = {q: diagnose_quantity(difference, q) for q in wrong}
-    return {q: text for q, text in texts.items() if text}, [q for q, text in texts.items() if not text]
-
-
-def diagnose_quantity(difference: ObservedDifference, quantity: str) -> str | None:
-    """Find what an engine returned in place of one quantity.
-
-    Args:
-        quantity: name of the wrong quantity.
-
-    Returns:
-        The completion of "behaves as if …"; None where no known defect explains the quantity.
-
-    """
-    every = _diagnose_bodies(difference, quantity, None, "")
-    reported, bound = difference.reported[quantity], difference.bounds[quantity]
-    if every or bound.ndim < 2 or bound.shape[1] < 2:
-        return every
-    off = reported - difference.expected[quantity]
-    wrong = [
-        k for k in range(bound.shape[1]) if max_error_ratio(off[:, k], bound[:, k]) > MAX_EXPLAINED_RATIO
-    ]
-    if not wrong or len(wrong) == bound.shape[1]:
-        return None
-    of = f" of bod{'y' if len(wrong) == 1 else 'ies'} {' and '.join(str(k + 1) for k in wrong)}"
-    return _diagnose_bodies(difference, quantity, wrong, of)
-
-
-def _diagnose_bodies(
-    difference: ObservedDifference, quantity: str, bodies: list[int] | None, of: str
-) -> str | None:
-    """What was returned in place of one quantity of all or of some bodies, which ``of`` names."""
-    name = quantity.replace("_", " ") + of
-
-    def rows_of_bodies(x: Array) -> Array:
-        return x if bodies is None else x[:, bodies]
-
-    reported, expected = (rows_of_bodies(x[quantity]) for x in (difference.reported, difference.expected))
-    bound = rows_of_bodies(difference.bounds[quantity])
-
-    def matches(x: Array, rows: slice = slice(None)) -> bool:
-        """Whether x is what was reported, and differs from what is right by more than both bounds."""
-        is_near = max_error_ratio((reported - x)[rows], (2 * bound)[rows]) <= MAX_EXPLAINED_RATIO
-        return is_near and max_error_ratio((x - expected)[rows], (2 * bound)[rows]) > MIN_CHANGE_RATIO
-
-    if len(reported) > 2 and matches(rows_of_bodies(difference.previous_expected[quantity]), slice(1, None)):
-        return f"it returned the {name} of the previous state (a stale field)"
-    if bodies is not None and len(bodies) == 1:
-        for k in range(difference.case.n):
-            if k not in bodies and matches(difference.expected[quantity][:, [k]]):
-                return f"it returned the {quantity.replace('_', ' ')} of body {k + 1} as that{of}"
-    for defect in output_defects(difference.case, quantity):
-        if matches(rows_of_bodies(defect.compute(difference.case, difference.expected))):
-            return defect.description.format(of=of)
-    weight = 1 / per_entry(bound, reported)
-    square = max(float(np.sum((expected * weight) ** 2)), TINY)
-    factor = float(np.sum(reported * expected * weight**2) / square)
-    if matches(factor * expected):
-        if abs(factor + 1) < 1e-9:
-            return f"it returned the {name} with the opposite sign"
-        return f"it returned the {name} multiplied by {format_significant(factor, 1.0, 0.0)}"
-    is_near = np.max(np.abs(reported - expected)) <= SINGLE_ROUNDING * np.max(np.abs(expected))
-    if is_near and np.all(reported == np.asarray(reported, np.float32)):
-        return f"it rounded the {name} to single precision"
-    offset = np.mean(reported - expected, axis=0)
-    if len(reported) > 2 and matches(expected + offset):
-        if quantity == "potential_energy":
-            return f"the origin of the potential energy were elsewhere: {offset:+.6g} J at every state"
-        return f"it added a constant to the {name} at every state"
-    return None
-
-
-# --- where the difference persists ----------------------------------------------------------------
-
-
-def _localise_difference(model: Model, difference: ObservedDifference, evaluate: Evaluate) -> str:
-    """Sentence on where the difference persists: at rest, without gravity, without loads and drag.
-
-    Only states at which the difference shows are tried, and nothing follows where it does not show again.
-    """
-    case, count = difference.case, len(difference.case.p)
-    ratios = [difference.at_state(i).error_ratio(difference.at_state(i).expected) for i in range(count)]
-    worst = [int(i) for i in np.argsort(ratios)[::-1][:MAX_LOCATED] if ratios[i] > MAX_EXPLAINED_RATIO]
-    states = [case.model_and_state(i)[1] for i in worst]
-
-    def persists(changed: Model, at: list[State]) -> bool:
-        answers = evaluate(changed, at)
-        expected = evaluate_case(make_defect_case(changed, at))
-        bounds = rounding_bounds(changed, at)
-        return any(
-            not max_error_ratio(
-                np.array([np.asarray(getattr(a, q), float) for a in answers]) - expected[q],
-                np.array([b.tolerance(q) for b in bounds]),
+    def causes(self) -> tuple[Cause, ...]:
+        """Find the causes, or say that there are none."""
+        if self.largest <= 1:
+            return (Cause("output", "mass matrix", "", "wrong; all other quantities are right"),)
+        if self.largest <= MIN_DIAGNOSABLE_RATIO or not np.isfinite(self.largest):
+            return (
+                self._close(self.wrong()) if np.isfinite(self.largest) else self._unexplained(self.wrong()),
             )
-            <= MAX_EXPLAINED_RATIO
-            for q in difference.reported
+        wrong = self.wrong(MIN_DIAGNOSABLE_RATIO)
+        self.loss = self._digit_loss(wrong)
+        found = self._single(View()) or self._outputs_alone(wrong)
+        if not found and self.loss:
+            return (*dict.fromkeys(self.named.values()), self.loss)
+        return (
+            found
+            or self._single(View(), are_sums_apart=True)
+            or self._single_of_loops()
+            or self._with_outputs(wrong)
+            or self._pairs()
+            or self._forces()
+            or self._partly(wrong)
+            or (self._unexplained(wrong),)
         )
 
-    at_rest = [state_from_minimal(model, s.p, 0 * s.omega, s.u, 0 * s.udot) for s in states]
-    trials = [
-        ("at rest", model, at_rest),
-        ("without gravity", replace(model, gravity=0 * model.gravity), states),
-    ]
-    if model.has_loads or model.has_drag:
-        unloaded = {k: 0 * getattr(model, k) for k in ("force", "moment", "drag_force", "drag_moment")}
-        trials.append(("without loads and drag", replace(model, **unloaded), states))
-    where = "the state" if len(states) == 1 else f"the {len(states)} states"
-    where += " where it is largest, the difference "
-    findings = []
-    for name, changed, at in [("", model, states), *trials]:
-        try:
-            is_there = persists(changed, at)
-        except Exception as error:  # an engine may raise anything; a failure here is information too
-            findings.append(f"fails {name or 'again'}: {' '.join(str(error).split())[:80]}")
-            continue
-        if name:
-            findings.append(f"{'persists' if is_there else 'vanishes'} {name}")
-        elif not is_there:
-            return f"at {where}does not show again when these are evaluated alone"
-    return f"at {where}" + ", ".join(findings)
+    def _close(self, quantities: Sequence[str]) -> Cause:
+        return Cause("unexplained", _words(quantities), "", "close")
+
+    def _unexplained(self, quantities: Sequence[str]) -> Cause:
+        return Cause("unexplained", _words(quantities))
+
+    def _digit_loss(self, quantities: Sequence[str]) -> Cause | None:
+        if not self.evaluate or self.model.has_loops:
+            return None
+        problem = Problem.worst(self.model, self.reported, self.truth, quantities)
+        loss = find_digit_loss(problem, self.evaluate)
+        return None if loss is None else loss.cause(quantities)
+
+    # -- causes in what is evaluated -----------------------------------------------------------------
+
+    def _of_sums(self, difference: Difference) -> Mask | None:
+        """The mask of energies and momentum, where they are right: they may be found from other numbers."""
+        sums = difference.of(SUMS)
+        return sums if np.all(np.abs(difference.values[sums]) <= ACCEPTED_RATIO) else None
+
+    def _single(self, view: View, are_sums_apart: bool = False) -> tuple[Cause, ...]:
+        """Every single cause of all quantities; or of the vectors alone, where the sums are right."""
+        search = self.search(view)
+        difference, mask = search.difference, search.difference.everything
+        if are_sums_apart:
+            sums = self._of_sums(difference)
+            if sums is None:
+                return ()
+            mask = ~sums
+        if np.max(np.abs(difference.values[mask]), initial=0.0) <= ACCEPTED_RATIO:
+            return ()
+        found = search.explain(mask)
+        if self.loss:  # no number explains what scatters
+            found = [one for one in found if not np.any(one.uncertainty)]
+        elif not found and not are_sums_apart:
+            branch = self._branch(difference) if self.model.has_loops and view == View() else ()
+            if branch:
+                return branch
+            found = search.explain_by_vectors(mask)
+        found = self._proved(view, found, mask)
+        return self._named(found) if found else ()
+
+    def _single_of_loops(self) -> tuple[Cause, ...]:
+        """The same of engines that take a state of a mechanism with loops in another way."""
+        for view in LOOP_VIEWS if self.model.has_loops else ():
+            for are_sums_apart in (False, True):
+                if found := self._single(view, are_sums_apart):
+                    return found
+        return ()
+
+    def _named(self, found: Sequence[Explanation]) -> tuple[Cause, ...]:
+        """The causes of one explanation, with those from which the data cannot distinguish them."""
+        alone = [one.causes(len(self.places)) for one in found]
+        if len(alone[0]) == 1:
+            first, *equal = (causes[0] for causes in alone if len(causes) == 1)
+            return (replace(first, equal=tuple(equal)),)
+        return alone[0]
+
+    def _proved(self, view: View, found: Sequence[Explanation], mask: Mask) -> list[Explanation]:
+        """Those that explain the difference at further states too."""
+        others = [i for i in self.order if i not in self._places(view)][: 2 * state_count(self.model)]
+        if not found or not others:
+            return list(found)
+        there = Difference(self.model, self.reported, self.truth, view, others)
+        quantities = set(self.search(view).difference.quantity[mask])
+        kept = there.of(quantities)
+        accepted = max(self.search(view).difference.accepted(mask), there.accepted(kept))
+        with_changes = [one for one in found if all(c.change is not None for c in one.combination)]
+        effects = there.evaluate([(one.combination, one.amounts) for one in with_changes])
+        left = np.abs(there.values - effects)[:, kept] if len(effects) else np.zeros((0, 1))
+        refuted = [
+            one for one, x in zip(with_changes, left, strict=True) if not np.max(x, initial=0.0) <= accepted
+        ]
+        return [one for one in found if one not in refuted]
+
+    def _branch(self, difference: Difference) -> tuple[Cause, ...]:
+        """Loops that are closed on another branch at some states."""
+        predictor = difference.predictor
+        wanted, accepted = difference.values, difference.accepted(difference.everything)
+        for cause, poses in other_branches(self.model):
+            is_explained = np.array(
+                [np.max(np.abs(wanted[difference.state == s])) <= accepted for s in range(predictor.count)]
+            )
+            for pose in poses:
+                effect = difference.effects_elsewhere(pose)
+                for s in range(predictor.count):
+                    here = difference.state == s
+                    with np.errstate(all="ignore"):
+                        is_explained[s] |= bool(np.max(np.abs(wanted - effect)[here]) <= accepted)
+            if np.all(is_explained):
+                return (replace(cause, states=predictor.count),)
+        return ()
+
+    # -- causes in outputs ---------------------------------------------------------------------------
+
+    def _at(self, quantity: str, quantities: Sequence[StateQuantities], shift: int = 0) -> Array:
+        return np.array([np.asarray(getattr(quantities[i - shift], quantity), float) for i in self.places])
+
+    def outputs(self, case: Case | None = None, right: Answers | None = None) -> Outputs:
+        """The table of outputs at the states, of the truth or of an altered mechanism."""
+        truth = self.truth
+        names = [q for q in QUANTITIES if getattr(truth.quantities[0], q) is not None]
+        true = {q: self._at(q, truth.quantities) for q in names}
+        return Outputs(
+            case or Case(self.model, stack_states([truth.states[i] for i in self.places])),
+            true if right is None else true | {q: x for q, x in right.items() if q in true},
+            {q: self._at(q, truth.quantities, 1) for q in names},
+            {q: np.array([np.asarray(truth.bounds[i].tolerance(q)) for i in self.places]) for q in names},
+        )
+
+    def _name_outputs(self, quantities: Sequence[str], outputs: Outputs) -> dict[str, Cause]:
+        named = {}
+        for quantity in quantities:
+            found = outputs.name(quantity, self._at(quantity, self.reported))
+            if found is not None:
+                named[quantity] = replace(found, states=len(self.places))
+        return named
+
+    def _outputs_alone(self, wrong: Sequence[str]) -> tuple[Cause, ...]:
+        """One cause in each wrong quantity; none where a quantity has no name."""
+        self.named = self._name_outputs(wrong, self.outputs())
+        return tuple(dict.fromkeys(self.named.values())) if len(self.named) == len(wrong) else ()
+
+    def _with_outputs(self, wrong: Sequence[str]) -> tuple[Cause, ...]:
+        """One cause in what is evaluated, and others in some outputs."""
+        groups: list[tuple[str, ...]] = [tuple(self.named)] if self.named else []
+        groups += [(q,) for q in wrong if (q,) not in groups]
+        groups += [
+            some for some in (WRENCHES, SUMS, SUMS[:2]) if set(some) & set(wrong) and some not in groups
+        ]
+        search = self.search(View())
+        for left_out in groups:
+            mask = ~search.difference.of(left_out)
+            values = search.difference.values[mask]
+            if np.max(np.abs(values), initial=0.0) <= ACCEPTED_RATIO:
+                continue
+            found = self._proved(View(), search.explain(mask), mask)
+            for one in found:
+                case, right = self._altered(search, one)
+                remaining = [q for q in left_out if q in right and not self._explains(q, right[q])]
+                outputs = self._name_outputs(remaining, self.outputs(case, right))
+                if len(outputs) == len(remaining):
+                    causes = self._named(found if not remaining else [one])
+                    return (*causes, *dict.fromkeys(outputs.values()))
+        return ()
+
+    def _explains(self, quantity: str, right: Array) -> bool:
+        bounds = np.array([np.asarray(self.truth.bounds[i].tolerance(quantity)) for i in self.places])
+        return error_ratio(self._at(quantity, self.reported) - right, bounds) <= ACCEPTED_RATIO
+
+    def _altered(self, search: Search, found: Explanation) -> tuple[Case | None, Answers]:
+        """The mechanism with a cause, and the quantities that follow."""
+        difference = search.difference
+        effect = difference.evaluate([(found.combination, found.amounts)])[0] * difference.weight
+        right = {}
+        for q in difference.names:
+            values = self._at(q, self.truth.quantities)
+            right[q] = values + effect[difference.quantity == q].reshape(values.shape)
+        (candidate,) = found.combination
+        if candidate.change is None:
+            return None, right
+        case = candidate.change(difference.predictor.case, found.amounts)
+        model, state = case
+        if any(
+            np.ndim(x) > np.ndim(getattr(self.model, name))
+            for name, x in vars(model).items()
+            if name != "kind"
+        ):
+            return None, right
+        return Case(model, complete_state(model, state)), right
+
+    def _pairs(self) -> tuple[Cause, ...]:
+        """Two causes in what is evaluated, together."""
+        search = self.search(View())
+        sums = self._of_sums(search.difference)
+        masks = [search.difference.everything, *([] if sums is None else [~sums])]
+        for mask in masks:
+            found = self._proved(View(), search.explain_by_pairs(mask), mask)
+            if found:
+                return self._named(found[:1])
+        return ()
+
+    def _forces(self) -> tuple[Cause, ...]:
+        """The only place of unknown forces of a tree; where sums are right and accelerations are not."""
+        difference = self.search(View()).difference
+        if self.model.has_loops or np.any(np.abs(difference.values[difference.of(SUMS)]) > ACCEPTED_RATIO):
+            return ()
+        if np.max(np.abs(difference.values[difference.of(VECTORS[:2])])) <= ACCEPTED_RATIO:
+            return ()
+        mask = difference.of(VECTORS)
+        wanted, states, accepted = difference.values[mask], difference.state[mask], difference.accepted(mask)
+        for places in force_places(self.model):
+            edits = [edit for _, some in places for edit in some]
+            effects = iter(
+                difference.effects([e.change(difference.predictor.case, e.nominal) for e in edits])
+            )
+            found = []
+            for cause, some in places:
+                basis = np.stack([next(effects)[mask] for _ in some], axis=1)
+                if is_spanned(basis, wanted, states, accepted):
+                    found.append(cause)
+            if found:
+                return (found[0],) if len(found) == 1 else ()
+        return self._other_velocity_term(difference, mask)
+
+    def _other_velocity_term(self, difference: Difference, mask: Mask) -> tuple[Cause, ...]:
+        terms, found = Terms(difference.predictor), []
+        for k in np.flatnonzero(~self.model.free).tolist():
+            effects = [difference.flat_vectors(one)[mask] for one in terms.unit_velocity_terms(k)]
+            states, accepted = difference.state[mask], difference.accepted(mask)
+            if effects and is_spanned(np.stack(effects, axis=1), difference.values[mask], states, accepted):
+                found.append(Cause("term", "velocity term", f"joint {k + 1}", "another at each state"))
+        return (found[0],) if len(found) == 1 else ()
+
+    def _partly(self, wrong: Sequence[str]) -> tuple[Cause, ...]:
+        """The quantities that have a name, and the rest without one."""
+        # a fitted share of a part may be what follows of a wrong number
+        known = {q: cause for q, cause in self.named.items() if cause.nominal or not cause.amount}
+        if not known:
+            return ()
+        rest = [q for q in wrong if q not in known]
+        close = [q for q in self.wrong() if q not in known and q not in rest]
+        named = tuple(dict.fromkeys(known.values()))
+        return (
+            *named,
+            *([self._unexplained(rest)] if rest else []),
+            *([self._close(close)] if close else []),
+        )
+
+    # -- where the difference persists ---------------------------------------------------------------
+
+    def persistence(self) -> dict[str, str]:
+        """Evaluate again where the difference is largest: at rest, without gravity, without loads."""
+        assert self.evaluate
+        model = self.model
+        worst = np.max([self.ratios[q] for q in QUANTITIES], axis=0)
+        states = [self.truth.states[i] for i in self.order[:MAX_LOCATED] if worst[i] > 1]
+        trials: list[tuple[str, Model, list[State]]] = [("again", model, states)]
+        if not model.has_loops:
+            at_rest = [
+                state_from_minimal(model, s.p, 0 * s.omega, s.u, 0 * s.udot, s.x, 0 * s.xdot, s.r, 0 * s.v)
+                for s in states
+            ]
+            trials.append(("at rest", model, at_rest))
+        trials.append(("without gravity", replace(model, gravity=0 * model.gravity), states))
+        if model.has_loads or model.has_drag:
+            unloaded = {k: 0 * getattr(model, k) for k in ("force", "moment", "drag_force", "drag_moment")}
+            trials.append(("without loads and drag", replace(model, **unloaded), states))
+        found: dict[str, str] = {}
+        for name, changed, at in trials:
+            try:
+                is_there = self._persists(changed, at)
+            except Exception as error:  # an engine may raise anything; a failure here is information too
+                found[name] = f"fails ({' '.join(str(error).split())[:80]})"
+                continue
+            if name != "again":
+                found[name] = "persists" if is_there else "vanishes"
+            elif not is_there:
+                return {"when the states are evaluated alone": "does not show again"}
+        return found
+
+    def _persists(self, model: Model, states: list[State]) -> bool:
+        assert self.evaluate
+        answers, right = self.evaluate(model, states), Predictor(model, states, View()).right
+        bounds = rounding_bounds(model, states)
+        names = [
+            q
+            for q in QUANTITIES
+            if getattr(self.reported[0], q) is not None and getattr(self.truth.quantities[0], q) is not None
+        ]
+        return any(
+            not error_ratio(
+                np.array([np.asarray(getattr(a, q), float) for a in answers]) - right[q],
+                np.array([np.asarray(b.tolerance(q)) for b in bounds]),
+            )
+            <= 1
+            for q in names
+        )

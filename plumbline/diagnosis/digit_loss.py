@@ -7,13 +7,14 @@ Rounding that an algorithm amplifies gives another error each time.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from plumbline.diagnosis.defect_model import evaluate_case, make_defect_case
-from plumbline.diagnosis.fit import Answers, ObservedDifference, max_error_ratio
+from plumbline.diagnosis.cause import Cause
+from plumbline.diagnosis.outputs import error_ratio
+from plumbline.diagnosis.prediction import QUANTITIES, Answers, Predictor, View
 from plumbline.model.datatypes import Array, Model, State, StateQuantities, StepRun
 from plumbline.model.equivalent import (
     BODY_VECTORS,
@@ -24,7 +25,8 @@ from plumbline.model.equivalent import (
     unrotate,
 )
 from plumbline.model.step_methods import JointSpaceMethod
-from plumbline.truth.rounding_bound import state_rounding_bound
+from plumbline.truth.ground_truth import StateTruth
+from plumbline.truth.rounding_bound import RoundingBound, state_rounding_bound
 from plumbline.truth.step_comparison import FormulaSteps
 
 COPIES = 8
@@ -36,18 +38,11 @@ MIN_GROWTH = 4.0  # of the error in rounding bounds, from half of the chain to t
 Evaluate = Callable[[Model, list[State]], list[StateQuantities]]
 
 
-def describe_scatter(scatter: float) -> str:
-    """Describe how an error scatters.
-
-    Args:
-        scatter: of `measure_scatter`.
-
-    Returns:
-        A sentence without subject.
-
-    """
-    verb = "loses digits: the answer scatters" if scatter >= MIN_SCATTER else "has a cause: it scatters"
-    return f"{verb} by {scatter:.2g} of its error when world and body axes are turned by {TURN:g} rad"
+def scatter_cause(quantities: Sequence[str], scatter: float) -> Cause:
+    """State how an error scatters."""
+    verb = "lose digits: they scatter" if scatter >= MIN_SCATTER else "have a cause: they scatter"
+    change = f"{verb} by {scatter:.2g} of their error when world and body axes are turned by {TURN:g} rad"
+    return Cause("rounding", " and ".join(q.replace("_", " ") for q in quantities), "", change, (scatter,))
 
 
 @dataclass(frozen=True)
@@ -63,25 +58,66 @@ class DigitLoss:
         ratios = list(self.ratio_by_length.values())
         return len(ratios) > 1 and ratios[0] > MIN_GROWTH * ratios[1]
 
-    def describe(self) -> str:
-        """Describe the loss.
-
-        Returns:
-            A sentence without subject.
-
-        """
-        text = (
-            f"loses digits: the answer scatters by {self.scatter:.2g} of its error when world and body "
-            f"axes are turned by {TURN:g} rad"
-        )
+    def cause(self, quantities: Sequence[str]) -> Cause:
+        """State the loss."""
+        found = scatter_cause(quantities, self.scatter)
+        text = "; rounding or noise in the algorithm"
         if self.grows:
             lengths = ", ".join(f"{ratio:.2g} for {n}" for n, ratio in self.ratio_by_length.items())
-            text += f", and the error grows with the chain (in rounding bounds: {lengths} bodies)"
-            return text + "; rounding in the algorithm"
-        return text + "; rounding or noise in the algorithm"
+            text = f", and the error grows with the chain (in rounding bounds: {lengths} bodies)"
+            text += "; rounding in the algorithm"
+        return replace(found, change=found.change + text)
 
 
-def find_digit_loss(difference: ObservedDifference, model: Model, evaluate: Evaluate) -> DigitLoss | None:
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """The state at which an engine's error is largest, the truth and its bounds, for some quantities."""
+
+    model: Model
+    state: State
+    error: Answers
+    right: Answers
+    bound: RoundingBound
+
+    @classmethod
+    def worst(
+        cls,
+        model: Model,
+        reported: Sequence[StateQuantities],
+        truth: StateTruth,
+        quantities: Sequence[str] = QUANTITIES,
+    ) -> Problem:
+        """Choose the state and the quantities that the engine offers."""
+        true = truth.quantities
+        names = [
+            q for q in quantities if getattr(reported[0], q) is not None and getattr(true[0], q) is not None
+        ]
+        problems = []
+        for answer, exact, bound, state in zip(reported, true, truth.bounds, truth.states, strict=True):
+            right = {q: np.asarray(getattr(exact, q), float) for q in names}
+            error = {q: np.asarray(getattr(answer, q), float) - right[q] for q in names}
+            problems.append(cls(model, state, error, right, bound))
+        wrong = [p for p in problems if not p.ratio() <= 1] or problems
+        return max(wrong, key=lambda problem: np.nan_to_num(problem.ratio(), nan=0.0))
+
+    def ratio(self) -> float:
+        """The largest error in bounds."""
+        return max(_ratio(error, q, self.bound) for q, error in self.error.items())
+
+    def weighted(self, errors: Answers) -> Array:
+        """All entries in bounds."""
+        found = []
+        for q, error in errors.items():
+            bound = np.maximum(self.bound.tolerance(q), np.finfo(float).tiny)
+            found.append((error / (bound[..., None] if np.ndim(error) else bound)).ravel())
+        return np.concatenate(found)
+
+
+def _ratio(error: Array, quantity: str, bound: RoundingBound) -> float:
+    return error_ratio(error[None], np.asarray(bound.tolerance(quantity))[None])
+
+
+def find_digit_loss(problem: Problem, evaluate: Evaluate) -> DigitLoss | None:
     """Test whether the error at the worst state scatters when all axes are turned by a tiny angle.
 
     Returns:
@@ -89,13 +125,13 @@ def find_digit_loss(difference: ObservedDifference, model: Model, evaluate: Eval
 
     """
     try:
-        scatter, here, state = _measure_scatter(difference, model, evaluate)
-        return DigitLoss(scatter, _ratios(here, model, state, evaluate)) if scatter >= MIN_SCATTER else None
+        scatter = _measure_scatter(problem, evaluate)
+        return DigitLoss(scatter, _ratios(problem, evaluate)) if scatter >= MIN_SCATTER else None
     except Exception:  # an engine may raise anything; then nothing is known about its digits
         return None
 
 
-def measure_scatter(difference: ObservedDifference, model: Model, evaluate: Evaluate) -> float | None:
+def measure_scatter(problem: Problem, evaluate: Evaluate) -> float | None:
     """Measure how the error at the worst state scatters when all axes are turned by a tiny angle.
 
     Returns:
@@ -103,7 +139,7 @@ def measure_scatter(difference: ObservedDifference, model: Model, evaluate: Eval
 
     """
     try:
-        return _measure_scatter(difference, model, evaluate)[0]
+        return _measure_scatter(problem, evaluate)
     except Exception:  # as above
         return None
 
@@ -139,13 +175,8 @@ def measure_step_scatter(
         return None
 
 
-def _measure_scatter(
-    difference: ObservedDifference, model: Model, evaluate: Evaluate
-) -> tuple[float, ObservedDifference, State]:
-    """The scatter at the worst state, the difference there, and the state."""
-    each = [difference.at_state(i) for i in range(len(difference.case.p))]
-    worst = int(np.argmax([here.error_ratio(here.expected) for here in each]))
-    here, (_, state) = each[worst], difference.case.model_and_state(worst)
+def _measure_scatter(problem: Problem, evaluate: Evaluate) -> float:
+    model, state = problem.model, problem.state
     rng = np.random.default_rng(0)
     errors = []
     evaluate(model, [state])  # an engine that keeps something of the call before keeps it of this problem
@@ -153,9 +184,10 @@ def _measure_scatter(
         world, body = (_tiny_rotation(rng) for _ in range(2))
         turned, turned_state = rotate_body_frames(*rotate_world(model, state, world), body)
         (answer,) = evaluate(turned, [turned_state])
-        values = unrotate(unrotate(_values(answer, here), WORLD_VECTORS, world), BODY_VECTORS, body)
-        errors.append(here.weighted_vector({name: x - here.expected[name] for name, x in values.items()}))
-    return _scatter(np.array(errors), here.residual(here.expected)), here, state
+        values = {name: np.asarray(getattr(answer, name), float)[None] for name in problem.right}
+        values = unrotate(unrotate(values, WORLD_VECTORS, world), BODY_VECTORS, body)
+        errors.append(problem.weighted({name: x[0] - problem.right[name] for name, x in values.items()}))
+    return _scatter(np.array(errors), problem.weighted(problem.error))
 
 
 def _tiny_rotation(rng: np.random.Generator) -> Array:
@@ -178,19 +210,15 @@ def _scatter(errors: Array, error: Array) -> float:
     return float(np.median(distances)) / length if length > MIN_COPY_ERROR * np.linalg.norm(error) else 0.0
 
 
-def _values(answer: StateQuantities, here: ObservedDifference) -> Answers:
-    """The quantities of one answer as a batch of one state."""
-    return {name: np.asarray(getattr(answer, name), float)[None] for name in here.reported}
-
-
-def _ratios(here: ObservedDifference, model: Model, state: State, evaluate: Evaluate) -> dict[int, float]:
-    """Worst error, in rounding bounds, of the whole chain and of its first half and quarter."""
-    ratios = {model.n: here.error_ratio(here.expected)}
-    for n in sorted({-(-model.n // 2), -(-model.n // 4)} - {model.n}, reverse=True):
-        short, at = first_bodies(model, state, n)
-        right = evaluate_case(make_defect_case(short, [at]))
-        values, bound = _values(evaluate(short, [at])[0], here), state_rounding_bound(short, at)
+def _ratios(problem: Problem, evaluate: Evaluate) -> dict[int, float]:
+    """Worst error, in rounding bounds, of the whole mechanism and of its first half and quarter."""
+    model = problem.model
+    ratios = {model.n: problem.ratio()}
+    for n in sorted({-(-model.n // 2), -(-model.n // 4)} - {model.n}, reverse=True) if model.is_chain else ():
+        short, at = first_bodies(model, problem.state, n)
+        right, (answer,) = Predictor(short, [at], View()).right, evaluate(short, [at])
+        bound = state_rounding_bound(short, at)
         ratios[n] = max(
-            max_error_ratio(x - right[name], np.array([bound.tolerance(name)])) for name, x in values.items()
+            _ratio(np.asarray(getattr(answer, q), float) - right[q][0], q, bound) for q in problem.right
         )
     return ratios

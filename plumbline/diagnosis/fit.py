@@ -1,314 +1,446 @@
-"""Fit the amounts of causes to the difference between an engine and the truth, and test what they explain.
+"""Fit the amounts of edits to the difference between an engine and the truth, and prove what they explain.
 
-A cause with an amount is fitted by Gauss–Newton to all quantities at once, each in units of its rounding
-bound.  It explains the difference where it predicts what the engine reported within the rounding bounds, for
-every quantity, body and state.
+Edits are screened in the lanes of one batch: by their slopes, and at the amounts of words (missing, doubled,
+reversed).  Amounts of those that point along the difference are found by Newton's method, all in one batch,
+in units of the rounding bounds.  What is left is evaluated at every state of the difference.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
+from numpy.typing import NDArray
 
-from plumbline.diagnosis.defect_model import DefectCase, concatenate_cases, evaluate_case, select_states
-from plumbline.diagnosis.hypotheses import Cause, all_causes
-from plumbline.model.datatypes import Array
-from plumbline.truth.rounding_bound import state_rounding_bound
+from plumbline.diagnosis.cause import FACTORS, Cause
+from plumbline.diagnosis.edits import LENGTHS, number_edits, vector_edits
+from plumbline.diagnosis.prediction import VECTORS, Answers, Case, Predictor, View
+from plumbline.diagnosis.readings import reading_edits
+from plumbline.diagnosis.terms import Terms
+from plumbline.model.datatypes import Array, Model, State, StateQuantities
+from plumbline.truth.ground_truth import StateTruth
 
-MIN_SIGNIFICANT_RATIO = 3.0  # an amount must differ from its nominal by this many times its resolution
-MAX_EXPLAINED_RATIO = 1.0  # in bounds: a prediction agrees within the sum of both states' bounds
-MAX_ITERATIONS = 12
-MAX_CANDIDATES = 16
-DERIVATIVE_STEP = 1e-6  # of central differences, relative to the cause's scale
-MIN_CHANGE_RATIO = 2.0  # in bounds of both pendulums: a smaller difference would need no change
-TINY = float(np.finfo(float).tiny)
-
-Answers = dict[str, Array]
+ACCEPTED_RATIO = 4.0  # in bounds
+ACCEPTED_PART = 0.25  # of the difference, where it is small
+ACCEPTED_SHARE = 1e-6  # of the difference; evaluating in doubles leaves 1e-10 of it and less
+STEP = 1e-5  # of an edit's scale, in slopes
+MIN_SIMILARITY = 0.3  # cosine between the difference and an edit's slope, to be fitted at all
+MAX_CANDIDATES = 24
+MAX_PAIRS = 16
+MAX_STEPS = 12
+MIN_SIGNIFICANT = 3.0  # an amount must differ from its nominal by this many times its resolution
+MIN_PROGRESS = 0.9  # of what is left, in a step
+MAX_HALVINGS = 4
+MAX_STARTS = 8
+RANK_TOLERANCE = 1e-9  # of slopes: a direction that changes nothing
+MIN_RATIO_OF_VECTORS = 100.0  # in bounds: three numbers explain a smaller difference by chance
+QUARTER_TURNS = [  # rotation vectors of the turns of a cube, half turns twice
+    angle * np.array(axis) / np.linalg.norm(axis)
+    for axis in product((-1, 0, 1), repeat=3)
+    for angle in ((), (np.pi / 2, np.pi), (np.pi,), (2 * np.pi / 3,))[np.count_nonzero(axis)]
+]
+Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
-class ObservedDifference:
-    """What an engine reported at S states, the truth and the bounds, for the quantities that it offers."""
-
-    case: DefectCase
-    reported: Answers  # (S, …)
-    expected: Answers
-    bounds: Answers  # (S,) or (S, N)
-    previous_expected: Answers  # the truth at the state before each; the first has none
-
-    def error_ratio(self, predicted: Answers, bounds: Answers | None = None) -> float:
-        """Measure how well a prediction matches what the engine reported.
-
-        Args:
-            predicted: predicted quantities, by name.
-            bounds: bounds to divide by; default those of the states.
-
-        Returns:
-            The largest difference of any quantity, state and body, in bounds.
-
-        """
-        bounds = bounds or self.bounds
-        ratios = [max_error_ratio(self.reported[q] - predicted[q], bounds[q]) for q in self.reported]
-        return float(np.max(ratios))  # not a number where any of them is
-
-    def wrong_quantities(self, ratio: float = MAX_EXPLAINED_RATIO) -> list[str]:
-        """List the quantities whose error exceeds a number of bounds."""
-        return [
-            q
-            for q, x in self.expected.items()
-            if q in self.reported and not max_error_ratio(self.reported[q] - x, self.bounds[q]) <= ratio
-        ]
-
-    def at_state(self, i: int) -> ObservedDifference:
-        """Restrict the data to one state.
-
-        Args:
-            i: its index.
-
-        """
-        return self._restricted(slice(i, i + 1), self.reported)
-
-    def of_quantities(self, quantities: Sequence[str]) -> ObservedDifference:
-        """Restrict the data to some quantities."""
-        return self._restricted(slice(None), quantities)
-
-    def _restricted(self, states: slice, quantities: Iterable[str]) -> ObservedDifference:
-        parts = (self.reported, self.expected, self.bounds, self.previous_expected)
-        case = select_states(self.case, range(len(self.case.p))[states])
-        kept = ({q: part[q][states] for q in quantities if q in part} for part in parts)
-        return ObservedDifference(case, *kept)
-
-    def weighted_vector(self, x: Answers) -> Array:
-        """Flatten quantities into one vector without units.
-
-        Args:
-            x: quantities by name, shaped as ``reported``.
-
-        Returns:
-            (K,) all entries of all quantities, in bounds.
-
-        """
-        return np.concatenate([(x[q] / per_entry(self.bounds[q], x[q])).ravel() for q in self.reported])
-
-    def residual(self, predicted: Answers) -> Array:
-        """Return what a prediction leaves unexplained.
-
-        Args:
-            predicted: predicted quantities, by name.
-
-        Returns:
-            (K,) reported minus predicted, in bounds.
-
-        """
-        return self.weighted_vector({q: self.reported[q] - predicted[q] for q in self.reported})
-
-
-@dataclass(frozen=True)
-class FittedCause:
-    """A cause with the amount that fits best."""
+class Candidate:
+    """An edit of what is evaluated, or a term with an effect (m,) per unit of its amount, or whole."""
 
     cause: Cause
-    fitted_amount: float
-    resolution: float  # change of the amount that moves the prediction by one rounding bound
+    change: Callable[[Case, Array], Case] | None = None
+    effect: Array | None = None
+    scale: float = 1.0
+    can_vanish: bool = True
+    fields: tuple[str, ...] = ()  # of the model, of which numbers are changed
+
+    @property
+    def nominal(self) -> Array:
+        """The right numbers; none of what has no amount."""
+        return np.array(self.cause.nominal)
 
 
-def max_error_ratio(difference: Array, bound: Array) -> float:
-    """Return the largest ‖difference‖/bound.
-
-    Args:
-        difference: (S,) scalars, or (S, ..., 3) vectors.
-        bound: tolerances, of the shape of the norms.
-
-    Returns:
-        The largest ratio over states and bodies.
-
-    """
-    size = np.abs(difference) if difference.ndim == 1 else np.linalg.norm(difference, axis=-1)
-    with np.errstate(over="ignore", invalid="ignore"):
-        return float(np.max(size / np.maximum(bound, TINY)))
+Combination = tuple[Candidate, ...]
 
 
-def per_entry(bound: Array, values: Array) -> Array:
-    """Broadcast bounds to the entries of a quantity.
+class Difference:
+    """How an engine differs from the truth at some states, and effects of edits, in bounds."""
 
-    Args:
-        bound: (S,) or (S, N) tolerances.
-        values: the quantity, (S, ...) scalars or vectors.
+    def __init__(
+        self,
+        model: Model,
+        reported: Sequence[StateQuantities],
+        truth: StateTruth,
+        view: View,
+        places: Sequence[int],
+    ) -> None:
+        """Compare at the states of some places."""
+        self.names = [
+            q for q in view.quantities
+            if all(getattr(x[i], q) is not None for x in (reported, truth.quantities) for i in places)
+        ]  # fmt: skip
+        off, weights, quantities, states = [], [], [], []
+        for q in self.names:
+            for s, i in enumerate(places):
+                wrong = np.asarray(getattr(reported[i], q), float) - getattr(truth.quantities[i], q)
+                bound = np.asarray(truth.bounds[i].tolerance(q)) + (reported[i].limit_error or {}).get(q, 0.0)
+                off.append(wrong.ravel())
+                weights.append(
+                    np.broadcast_to(bound[..., None] if wrong.ndim else bound, wrong.shape).ravel()
+                )
+                quantities += [q] * wrong.size
+                states += [s] * wrong.size
+        bounds = np.concatenate(weights)
+        self.quantity, self.state = np.array(quantities), np.array(states)
+        self.weight = np.where(bounds > 0, bounds, np.inf)  # 0 explains nothing
+        self.values = np.concatenate(off) / self.weight
+        self.view, self.model = view, model
+        self.predictor = Predictor(model, [truth.states[i] for i in places], view)
+        self._right = self._flat(self.predictor.right)
 
-    Returns:
-        Positive bounds that broadcast against ``values``.
+    @property
+    def everything(self) -> Mask:
+        """A mask of all quantities."""
+        return np.ones(len(self.values), bool)
 
-    """
-    bound = np.maximum(bound, TINY)
-    return bound[..., None] if values.ndim > bound.ndim else bound
+    def of(self, quantities: Iterable[str]) -> Mask:
+        """Return the mask of some quantities."""
+        return np.isin(self.quantity, list(quantities))
 
+    def accepted(self, mask: Mask) -> float:
+        """Return what may be left of the difference, in bounds."""
+        size = float(np.max(np.abs(self.values[mask]), initial=0.0))
+        return max(min(ACCEPTED_RATIO, ACCEPTED_PART * size), ACCEPTED_SHARE * size)
 
-def find_explanations(
-    difference: ObservedDifference, *, are_conventions_only: bool = False
-) -> list[tuple[FittedCause, float]]:
-    """Fit all causes and keep those that explain all quantities.
+    def _flat(self, answers: Answers) -> Array:
+        """(…, m) of quantities (…, S, …)."""
+        lead = answers["kinetic_energy"].shape[:-1]
+        return np.concatenate([answers[q].reshape(*lead, -1) for q in self.names], axis=-1)
 
-    Args:
-        are_conventions_only: whether to try only causes without an amount: where the error scatters, no
-            number explains it.
+    def flat_vectors(self, answers: Answers) -> Array:
+        """Return changes of vectors (S, …) as an effect (m,); the sums do not change."""
+        zeros = {name: 0 * x for name, x in self.predictor.right.items()}
+        return np.asarray(self._flat(zeros | answers) / self.weight)
 
-    Returns:
-        Causes, conventions before numbers, with the largest difference that they leave, in rounding bounds.
+    def effects(self, cases: Sequence[Case]) -> Array:
+        """Return what engines that evaluate other cases return besides the truth, (cases, m)."""
+        if not cases:
+            return np.zeros((0, len(self.values)))
+        return np.asarray((self._flat(self.predictor.predict(cases)) - self._right) / self.weight)
 
-    """
-    model_answers = evaluate_case(difference.case)
-    causes = list(all_causes(difference.case))
-    fits = [FittedCause(cause, cause.nominal, 0.0) for cause in causes if cause.scale is None]
-    if not are_conventions_only:
-        fits += fit_causes(difference, model_answers, [cause for cause in causes if cause.scale is not None])
-    found = [(fit, remaining_ratio(difference, model_answers, fit)) for fit in fits]
-    return [(fit, ratio) for fit, ratio in found if ratio <= MAX_EXPLAINED_RATIO]
+    def effects_elsewhere(self, pose: Callable[[State], State]) -> Array:
+        """Return the effect (m,) of other poses of loops; not numbers where there is none."""
+        predictor = self.predictor
+        found = {name: np.full(x.shape, np.nan) for name, x in predictor.right.items()}
+        for s, state in enumerate(predictor.states):
+            try:
+                there = Predictor(self.model, [pose(state)], self.view)
+                answers = there.right
+            except (ValueError, np.linalg.LinAlgError):
+                continue
+            for name, x in answers.items():
+                found[name][s] = x[0]
+        return np.asarray((self._flat(found) - self._right) / self.weight)
 
-
-def remaining_ratio(difference: ObservedDifference, model_answers: Answers, fit: FittedCause) -> float:
-    """Measure what a fitted cause leaves unexplained.
-
-    Args:
-        model_answers: quantities of the fast model without defect.
-
-    Returns:
-        The largest remaining difference over the bounds of the true and, where needed, also of the altered
-        mechanism; infinite where the altered numbers are no mechanism, or where these bounds would allow the
-        difference without any change. Above 1 it is that of the first state that is not explained.
-
-    """
-    altered = fit.cause.alter(difference.case, fit.fitted_amount)
-    with np.errstate(all="ignore"):  # the altered numbers may be no mechanism: a negative mass, for example
-        try:
-            predicted = _predict_answers(difference, model_answers, evaluate_case(altered))
-            ratio = difference.error_ratio(predicted)
-            if ratio <= MAX_EXPLAINED_RATIO:
-                return ratio
-            worst = change = 0.0
-            for i in range(len(altered.p)):  # the costly bounds one after the other, until one is exceeded
-                bound = state_rounding_bound(*altered.model_and_state(i))
-                both = {
-                    q: x[i : i + 1] + np.array([bound.tolerance(q)]) for q, x in difference.bounds.items()
-                }
-                here = difference.at_state(i)
-                ratio = here.error_ratio({q: x[i : i + 1] for q, x in predicted.items()}, both)
-                if not ratio <= MAX_EXPLAINED_RATIO:  # also where it is not a number
-                    return ratio if np.isfinite(ratio) else np.inf
-                worst = max(worst, ratio)
-                change = max(change, here.error_ratio(here.expected, both))
-        except np.linalg.LinAlgError:
-            return np.inf
-    # bounds that would allow the difference without any change explain nothing
-    return worst if change > MIN_CHANGE_RATIO else np.inf
+    def evaluate(self, lanes: Sequence[tuple[Combination, Array]]) -> Array:
+        """Return the effects of combinations of candidates with their amounts, (lanes, m)."""
+        cases, linear = list[Case](), np.zeros((len(lanes), len(self.values)))
+        for i, (combination, x) in enumerate(lanes):
+            case, first = self.predictor.case, 0
+            for one in combination:
+                own = x[first : first + len(one.cause.nominal)]
+                first += len(one.cause.nominal)
+                if one.effect is not None:
+                    linear[i] += one.effect * (own[0] - one.nominal[0] if len(own) else 1.0)
+                else:
+                    assert one.change is not None
+                    with np.errstate(all="ignore"):
+                        case = one.change(case, own)
+            cases.append(case)
+        changed = [i for i, case in enumerate(cases) if case is not self.predictor.case]
+        if changed:
+            linear[changed] += self.effects([cases[i] for i in changed])
+        return linear
 
 
-def derivatives_by_amount(difference: ObservedDifference, at: Sequence[tuple[Cause, float]]) -> Array:
-    """Differentiate the quantities by the amounts of causes, by central differences.
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """Candidates with amounts that leave little of a difference."""
 
-    Args:
-        at: causes with the amounts at which to differentiate.
+    combination: Combination
+    amounts: Array
+    uncertainty: Array
+    left: float
 
-    Returns:
-        (causes, K) in bounds per unit of each amount.
+    def causes(self, states: int) -> tuple[Cause, ...]:
+        """State the causes with their amounts and evidence."""
+        found, first = list[Cause](), 0
+        for one in self.combination:
+            count = len(one.cause.nominal)
+            cause = one.cause
+            if count:
+                own = slice(first, first + count)
+                cause = cause.with_amount(self.amounts[own], float(np.max(self.uncertainty[own])))
+            first += count
+            found.append(replace(cause, left=self.left, states=states))
+        return tuple(found)
 
-    """
-    columns: list[Array] = []
-    batch = max(1, 4096 // (len(difference.case.p) * difference.case.n**2))
-    for start in range(0, len(at), batch):
-        causes = at[start : start + batch]
-        steps = [DERIVATIVE_STEP * (cause.scale or 1.0) for cause, _ in causes]
-        sides = [
-            cause.alter(difference.case, x + sign * h)
-            for (cause, x), h in zip(causes, steps, strict=True)
-            for sign in (1, -1)
+
+def _simplest(found: list[Explanation]) -> list[Explanation]:
+    """Leave out factors where one number of the same field explains it, and readings where one is missing."""
+    causes = [one.combination[0] for one in found]
+    entries = {one.fields for one in causes if one.cause.unit != "×" and one.fields}
+    are_numbers = any(one.amounts.size and not np.any(one.uncertainty) for one in found)
+    return [
+        one
+        for one, candidate in zip(found, causes, strict=True)
+        if not (candidate.cause.unit == "×" and candidate.fields in entries)
+        and not (are_numbers and candidate.cause.kind == "frame")
+    ]
+
+
+class Search:
+    """All candidates of a view, screened against a difference."""
+
+    def __init__(self, difference: Difference) -> None:
+        """List the candidates and evaluate their slopes and whole effects."""
+        self.difference = difference
+        view, model = difference.view, difference.model
+        case = difference.predictor.case
+        # other numbers act as in joint coordinates
+        is_of_lengths = view.are_bodies_kept or view.end_rows == "twists"
+        edits = [one for one in number_edits(case) if not is_of_lengths or one.cause.unit in LENGTHS]
+        self.numbers = [
+            Candidate(e.cause, e.change, scale=e.scale, can_vanish=e.can_vanish, fields=e.fields)
+            for e in edits
         ]
-        answers = _evaluate_together(sides)
-        columns += [
-            _slope(difference, up, down, h)
-            for up, down, h in zip(answers[::2], answers[1::2], steps, strict=True)
+        self.fixed = list[Candidate]()
+        if not is_of_lengths:
+            self.fixed = [Candidate(e.cause, e.change) for e in reading_edits(case)]
+            terms = Terms(difference.predictor)
+            flat = difference.flat_vectors
+            self.numbers += [Candidate(cause, effect=flat(effect)) for cause, effect in terms.linear()]
+            self.fixed += [Candidate(cause, effect=flat(effect)) for cause, effect in terms.fixed()]
+        elif view.are_bodies_kept:
+            self.fixed += self._missing_gammas(model)
+        steps = [one.nominal + STEP * one.scale for one in self.numbers]
+        slopes = difference.evaluate([((one,), x) for one, x in zip(self.numbers, steps, strict=True)])
+        scales = np.array([STEP * one.scale for one in self.numbers]).reshape(-1, 1)
+        self.slopes = np.where(np.isfinite(slopes), slopes, 0.0) / scales
+        self.whole = ([] if is_of_lengths else self._whole_numbers()) + [
+            ((one,), np.zeros(0)) for one in self.fixed
         ]
-    return np.array(columns)
+        self.effects = difference.evaluate(self.whole)
 
+    def _missing_gammas(self, model: Model) -> Iterator[Candidate]:
+        """γ of rows of joints that an engine in maximal coordinates leaves out."""
+        predictor = self.difference.predictor
+        at = list(predictor.each_state(predictor.case))
+        for k in range(len(model.kind)):
+            if not model.free[k]:
+                answers = predictor.of_bodies(at, k)
+                change = {name: answers[name] - predictor.right[name] for name in VECTORS}
+                cause = Cause("term", "γ of the rows", f"joint {k + 1}", "missing")
+                yield Candidate(cause, effect=self.difference.flat_vectors(change))
 
-def _slope(difference: ObservedDifference, up: Answers, down: Answers, h: float) -> Array:
-    """Central difference over ± h, in bounds per unit."""
-    return difference.weighted_vector({q: (up[q] - down[q]) / (2 * h) for q in difference.reported})
+    def _whole_numbers(self) -> list[tuple[Combination, Array]]:
+        """The amounts of words of numbers that may vanish."""
+        return [
+            ((one,), factor * one.nominal)
+            for one in self.numbers
+            if one.can_vanish and one.nominal[0]
+            for factor in FACTORS
+            if factor != 0.5
+        ]
 
+    def explain(self, mask: Mask) -> list[Explanation]:
+        """Return every single cause that explains the difference of some quantities."""
+        wanted, accepted = self.difference.values[mask], self.difference.accepted(mask)
+        with np.errstate(all="ignore"):
+            left = np.max(np.abs(self.effects[:, mask] - wanted), axis=1)
+        found = [
+            Explanation(*self.whole[i], np.zeros(len(self.whole[i][1])), float(left[i]))
+            for i in np.flatnonzero(left <= accepted)
+        ]
+        if any(
+            one.amounts.size for one in found
+        ):  # the same mechanism by a number that is missing or reversed
+            found = [one for one in found if one.combination[0].cause.kind != "frame"]
+        known = {id(one.combination[0]) for one in found}
+        slopes = self.slopes[:, mask]
+        cosine = np.abs(slopes @ wanted) / np.maximum(
+            np.linalg.norm(slopes, axis=1) * np.linalg.norm(wanted), 1e-300
+        )
+        order = [int(i) for i in np.argsort(-cosine)[:MAX_CANDIDATES] if cosine[i] > MIN_SIMILARITY]
+        starts = [
+            ((self.numbers[i],), self.numbers[i].nominal) for i in order if id(self.numbers[i]) not in known
+        ]
+        fits = self.fit(starts, mask)
+        order_of = {id(one): i for i, one in enumerate((*self.numbers, *self.fixed))}
+        # what has words, as missing, before fitted amounts
+        key = lambda one: (bool(np.any(one.uncertainty)), order_of[id(one.combination[0])])  # noqa: E731
+        return sorted(_simplest(found + fits), key=key)
 
-def _evaluate_together(cases: Sequence[DefectCase]) -> list[Answers]:
-    """Answers of batches of equal size, evaluated as one."""
-    size, answers = len(cases[0].p), evaluate_case(concatenate_cases(cases))
-    return [{q: x[i * size : (i + 1) * size] for q, x in answers.items()} for i in range(len(cases))]
+    def fit(self, starts: Sequence[tuple[Combination, Array]], mask: Mask) -> list[Explanation]:
+        """Fit amounts by Newton's method in one batch; keep combinations that explain the difference."""
+        fits = [_Fit(*start) for start in starts]
+        wanted, accepted = self.difference.values[mask], self.difference.accepted(mask)
+        for _ in range(MAX_STEPS):
+            active = [one for one in fits if one.is_active]
+            if not active:
+                break
+            lanes = [lane for one in active for lane in one.lanes()]
+            effects = self.difference.evaluate(lanes)[:, mask]
+            first = 0
+            for one in active:
+                count = 1 + len(one.x)
+                one.advance(wanted, effects[first : first + count], accepted)
+                first += count
+        return [found for one in fits if (found := one.result(accepted)) is not None]
 
+    def explain_by_vectors(self, mask: Mask) -> list[Explanation]:
+        """Return every cause of three numbers that explains the difference of some quantities."""
+        difference, wanted = self.difference, self.difference.values[mask]
+        if np.max(np.abs(wanted), initial=0.0) < MIN_RATIO_OF_VECTORS:
+            return []
+        every = [Candidate(e.cause, e.change, scale=e.scale) for e in vector_edits(difference.model)]
+        is_of_lengths = difference.view != View(difference.view.quantities)
+        every = [one for one in every if not is_of_lengths or one.cause.unit in LENGTHS]
+        lanes = [((one,), one.nominal + STEP * one.scale * e) for one in every for e in np.eye(3)]
+        slopes = difference.evaluate(lanes)[:, mask].reshape(len(every), 3, -1).mT
+        slopes = np.where(np.isfinite(slopes), slopes, 0.0)
+        shares = np.matvec(np.linalg.pinv(slopes, RANK_TOLERANCE), wanted)
+        left = np.linalg.norm(np.matvec(slopes, shares) - wanted, axis=1)
+        starts = [((every[i],), every[i].nominal) for i in np.argsort(left)[:MAX_STARTS]]
+        found = self.fit(starts, mask)
+        if not found and not difference.model.has_loops:
+            turns = [((one,), x) for one in every if one.cause.unit == " rad" for x in QUARTER_TURNS]
+            effects = difference.evaluate(turns)[:, mask]
+            left = np.nan_to_num(np.linalg.norm(effects - wanted, axis=1), nan=np.inf)
+            found = self.fit([turns[i] for i in np.argsort(left)[: 2 * MAX_STARTS]], mask)
+        return list({id(one.combination[0]): one for one in found}.values())
 
-def fit_causes(
-    difference: ObservedDifference, model_answers: Answers, causes: Sequence[Cause]
-) -> list[FittedCause]:
-    """Fit the causes whose first-order effect is most nearly parallel to the difference.
-
-    Args:
-        model_answers: quantities of the fast model without defect.
-        causes: causes with an amount.
-
-    Returns:
-        At most `MAX_CANDIDATES` causes that converged to a significant amount.
-
-    """
-    data = difference.residual(difference.expected)
-    slopes = derivatives_by_amount(difference, [(cause, cause.nominal) for cause in causes])
-    square = np.sum(slopes**2, axis=1)
-    scale = np.array([cause.scale or 1.0 for cause in causes])
-    visible = (
-        square * scale**2 > 1.0
-    )  # a change of the natural size moves the data by a rounding bound or more
-    alignment = np.where(visible, (slopes @ data) ** 2 / np.maximum(square, TINY), 0.0) / (data @ data)
-    best = [int(i) for i in np.argsort(-alignment)[:MAX_CANDIDATES] if alignment[i] > 0.01]
-    return [fit for i in best if (fit := fit_cause(difference, model_answers, causes[i], slopes[i]))]
-
-
-def fit_cause(
-    difference: ObservedDifference, model_answers: Answers, cause: Cause, slope: Array
-) -> FittedCause | None:
-    """Fit the amount of one cause by Gauss–Newton, starting from its nominal amount.
-
-    Args:
-        model_answers: quantities of the fast model without defect.
-        cause: a cause with an amount.
-        slope: (K,) derivative of the data by the amount at its nominal value, in bounds per unit.
-
-    Returns:
-        The fit; None where it diverges or the amount does not differ significantly from the nominal one.
-
-    """
-    amount, resolution, best = cause.nominal, np.inf, np.inf
-    h = DERIVATIVE_STEP * (cause.scale or 1.0)
-    for _ in range(MAX_ITERATIONS):
-        moved = amount != cause.nominal
-        try:
-            here, *sides = _evaluate_together(
-                [cause.alter(difference.case, amount + shift) for shift in (0.0, *((h, -h) if moved else ()))]
+    def explain_by_pairs(self, mask: Mask) -> list[Explanation]:
+        """Return pairs of causes that explain the difference together."""
+        wanted = self.difference.values[mask]
+        scale = float(np.linalg.norm(wanted))
+        slopes = self.slopes[:, mask]
+        size = np.linalg.norm(slopes, axis=1)
+        seen = np.flatnonzero(size * [one.scale for one in self.numbers] > 1.0)
+        units = slopes[seen] / size[seen, None]
+        effects = self.effects[:, mask]
+        effects = effects[np.all(np.isfinite(effects), axis=1)]
+        whole = [self.whole[i] for i in np.flatnonzero(np.all(np.isfinite(self.effects[:, mask]), axis=1))]
+        options = list[tuple[float, Combination, Array]]()
+        along, gram = units @ wanted, units @ units.T
+        with np.errstate(all="ignore"):  # of two amounts: what projection leaves
+            gain = (along[:, None] ** 2 + along**2 - 2 * gram * along[:, None] * along) / (1 - gram**2)
+        gain = np.triu(np.where(np.abs(gram) < 1 - 1e-9, gain, 0.0), 1)
+        for flat in np.argsort(-gain, axis=None)[:MAX_PAIRS]:
+            i, j = np.unravel_index(flat, gain.shape)
+            pair = self.numbers[seen[i]], self.numbers[seen[j]]
+            options.append(
+                (scale**2 - float(gain[i, j]), pair, np.concatenate([one.nominal for one in pair]))
             )
-        except np.linalg.LinAlgError:
-            return None
-        residual = difference.residual(_predict_answers(difference, model_answers, here))
-        if not np.all(np.isfinite(residual)) or float(residual @ residual) > best * 4:
-            return None
-        best = min(best, float(residual @ residual))
-        if moved:
-            slope = _slope(difference, sides[0], sides[1], h)
-        if not np.any(slope):  # the fit has reached amounts whose changes have no effect
-            return None
-        step = float(slope @ residual / (slope @ slope))
-        amount += step
-        resolution = 1 / float(np.linalg.norm(slope))
-        if abs(step) < 0.1 * resolution or abs(step) < 1e-15 * abs(amount):
-            break
-    significant = abs(amount - cause.nominal) > MIN_SIGNIFICANT_RATIO * resolution
-    return FittedCause(cause, amount, resolution) if significant else None
+        rest = wanted - effects  # of one whole effect and one amount
+        squares = np.sum(rest**2, axis=1)
+        left = squares[:, None] - (rest @ units.T) ** 2 if len(units) else squares[:, None]
+        for flat in np.argsort(left, axis=None)[: 2 * MAX_PAIRS] if len(units) and len(rest) else ():
+            i, j = np.unravel_index(flat, left.shape)
+            (one,), x = whole[i]
+            other = self.numbers[seen[j]]
+            if one is not other:
+                options.append((float(left[i, j]), (one, other), np.concatenate([x, other.nominal])))
+        both = (
+            squares[:, None] + squares - scale**2 + 2 * effects @ effects.T if len(rest) else np.zeros((0, 0))
+        )
+        both = np.where(np.triu(np.ones(both.shape, bool), 1), both, np.inf)
+        for flat in np.argsort(both, axis=None)[:MAX_PAIRS]:
+            i, j = np.unravel_index(flat, both.shape)
+            if whole[i][0][0] is not whole[j][0][0]:
+                x = np.concatenate([whole[i][1], whole[j][1]])
+                options.append((float(both[i, j]), (whole[i][0][0], whole[j][0][0]), x))
+        options.sort(key=lambda option: option[0])
+        return self.fit([(pair, x) for _, pair, x in options[: 3 * MAX_PAIRS]], mask)
 
 
-def _predict_answers(difference: ObservedDifference, model_answers: Answers, answers: Answers) -> Answers:
-    """The truth, changed as the fast model changes, so that the model's own rounding cancels."""
-    return {q: difference.expected[q] + (answers[q] - model_answers[q]) for q in difference.reported}
+class _Fit:
+    """Newton's method for the amounts of one combination."""
+
+    def __init__(self, combination: Combination, start: Array) -> None:
+        self.combination, self.x, self.is_active = combination, np.asarray(start, float), True
+        self.nominal = np.concatenate([one.nominal for one in combination])
+        scales = [np.full(len(one.cause.nominal), one.scale) for one in combination]
+        self.scale: Array = np.concatenate(scales)
+        self.length, self.left, self.halvings = np.inf, np.inf, 0
+        self.step = np.zeros_like(self.x)
+        self.resolution = np.full(len(self.x), np.inf)
+
+    def lanes(self) -> list[tuple[Combination, Array]]:
+        """The amounts, and those beside them for slopes."""
+        beside = self.x + STEP * np.diag(self.scale)
+        return [(self.combination, self.x), *((self.combination, x) for x in beside)]
+
+    def advance(self, wanted: Array, effects: Array, accepted: float) -> None:
+        """Go one step on, or half of the last step back."""
+        with np.errstate(all="ignore"):
+            off = wanted - effects[0]
+            length = float(np.linalg.norm(off))
+        if not len(self.x):
+            self.left, self.is_active = float(np.max(np.abs(off))), False
+            return
+        if not np.isfinite(length) or (length > MIN_PROGRESS * self.length and self.left > accepted):
+            self.halvings += 1
+            self.x = self.x - self.step / 2
+            self.step = self.step / 2
+            self.is_active = self.halvings <= MAX_HALVINGS and np.isfinite(self.length)
+            return
+        if length >= self.length:  # it explains already, and rounding is left
+            self.x, self.is_active = self.x - self.step, False
+            return
+        self.length, self.left, self.halvings = length, float(np.max(np.abs(off))), 0
+        slopes = (effects[1:] - effects[0]).T / (STEP * self.scale)
+        if not np.all(np.isfinite(slopes)):
+            self.is_active = False
+            return
+        size = np.linalg.norm(slopes, axis=0)
+        if not np.all(size > 0):
+            self.is_active = False
+            return
+        inverse = np.linalg.pinv(slopes / size, RANK_TOLERANCE) / size[:, None]
+        self.resolution = np.linalg.norm(inverse, axis=1)
+        self.step = inverse @ off
+        if np.all(np.abs(self.step) < 0.1 * self.resolution):
+            self.is_active = False
+            return
+        self.x = self.x + self.step
+
+    def result(self, accepted: float) -> Explanation | None:
+        """What was found, if it explains the difference by amounts that differ from the right ones."""
+        if not self.left <= accepted:
+            return None
+        uncertainty = self.resolution * max(1.0, self.left)
+        if len(self.x) and np.any(self._significance(uncertainty) < MIN_SIGNIFICANT):
+            return None
+        if any(not one.can_vanish and x * nominal <= 0 for one, x, nominal in self._singles()):
+            return None  # no mass or length
+        return Explanation(self.combination, self.x, uncertainty, self.left)
+
+    def _singles(self) -> Iterator[tuple[Candidate, float, float]]:
+        """The candidates of one amount, with it and the nominal one."""
+        first = 0
+        for one in self.combination:
+            if len(one.cause.nominal) == 1:
+                yield one, float(self.x[first]), float(self.nominal[first])
+            first += len(one.cause.nominal)
+
+    def _significance(self, uncertainty: Array) -> Array:
+        """Of each candidate with amounts, how many times its uncertainty they differ from the right ones."""
+        ratios, first = list[float](), 0
+        for one in self.combination:
+            own = slice(first, first + len(one.cause.nominal))
+            first = own.stop
+            if len(one.cause.nominal):
+                ratios.append(float(np.max(np.abs(self.x - self.nominal)[own] / uncertainty[own])))
+        return np.array(ratios)

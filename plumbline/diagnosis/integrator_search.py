@@ -16,13 +16,8 @@ from typing import Literal
 
 import numpy as np
 
-from plumbline.diagnosis.digit_loss import (
-    MIN_SCATTER,
-    describe_scatter,
-    measure_step_scatter,
-)
-from plumbline.diagnosis.hypotheses import format_significant
-from plumbline.diagnosis.result import Diagnosis
+from plumbline.diagnosis.cause import Cause, Diagnosis, significant
+from plumbline.diagnosis.digit_loss import MIN_SCATTER, measure_step_scatter, scatter_cause
 from plumbline.engines.engine_calls import StepEvaluation
 from plumbline.engines.registry import load_adapter
 from plumbline.model.datatypes import Array, Model, State, StepRun
@@ -47,7 +42,8 @@ SCREENING_RATIO = 4.0  # of first steps, in bounds of the declared formula
 FIT_ITERATIONS = 15
 FIT_STEP = 1e-6
 SIMPLE_VALUES = (0.0, 0.25, 0.5, 1.0, 2.0, -1.0, 1 / 3, 1 / 6)
-UNEXPLAINED = "no other integrator, and no other parameter of this one, explains the steps"
+UNEXPLAINED = Cause("unexplained", "steps", "", "no other integrator, and no other parameter of this one")
+CLOSE = Cause("unexplained", "steps", "", "close")
 
 Residuals = Callable[[StepMethod], Array]
 
@@ -80,9 +76,9 @@ def explain_disagreeing_steps(
     adapter = load_adapter(engine)
     method = adapter.integrator(integrator).method
     assert method is not None
-    text = "" if is_known else explain_steps(model, states, method, answer)
-    if isinstance(method, ConstrainedMethod) or text not in ("", UNEXPLAINED):
-        return Diagnosis(text)
+    causes = () if is_known else explain_steps(model, states, method, answer)
+    if isinstance(method, ConstrainedMethod) or causes not in ((), (UNEXPLAINED,)):
+        return Diagnosis(causes)
     runs = [(a.state, a.step, a.run) for a in answer.attempts if a.run is not None]
     ratios = []
     for index, h, run in runs:
@@ -94,12 +90,14 @@ def explain_disagreeing_steps(
         return adapter.step(model, state, integrator, h, RESIDUAL_STEPS)
 
     scatter = measure_step_scatter(model, states[index], h, method, step)
-    if scatter is None or (text and scatter < MIN_SCATTER):
-        return Diagnosis(text)
-    return Diagnosis(describe_scatter(scatter), scatter)
+    if scatter is None or (causes and scatter < MIN_SCATTER):
+        return Diagnosis(causes)
+    return Diagnosis((scatter_cause(["steps"], scatter),), scatter=scatter)
 
 
-def explain_steps(model: Model, states: Sequence[State], method: StepMethod, answer: StepEvaluation) -> str:
+def explain_steps(
+    model: Model, states: Sequence[State], method: StepMethod, answer: StepEvaluation
+) -> tuple[Cause, ...]:
     """Name the integrator that explains an engine's steps.
 
     Args:
@@ -107,7 +105,7 @@ def explain_steps(model: Model, states: Sequence[State], method: StepMethod, ans
         method: the declared formula, from which the steps differ.
 
     Returns:
-        A sentence: "behaves as if …" or that no other formula explains the steps.
+        The causes: another formula or parameter, or that none explains the steps.
 
     """
     found = [(a.state, a.step, a.run) for a in answer.attempts if a.run is not None]
@@ -117,7 +115,7 @@ def explain_steps(model: Model, states: Sequence[State], method: StepMethod, ans
     steps = FormulaSteps(method, model, states, starts)
     worst = max((max(c.ratios, default=0.0) for c in steps.compare(runs).values()), default=0.0)
     if worst <= MIN_DIAGNOSABLE_RATIO:
-        return "the difference is too close to the rounding bound to name an integrator"
+        return (CLOSE,)
 
     def residuals(other: StepMethod) -> Array:
         assert isinstance(other, JointSpaceMethod)
@@ -132,22 +130,22 @@ def explain_steps(model: Model, states: Sequence[State], method: StepMethod, ans
 
     comparisons = sum(len(c.ratios) for c in steps.compare(runs).values())
     read = [
-        words
-        for words, correct in sample_readings(model)
+        cause
+        for cause, correct in sample_readings(model)
         if all(max(c.ratios, default=0.0) <= 1.0 for c in steps.compare([correct(x) for x in runs]).values())
     ]
     if read:
-        return f"behaves as if {read[0]}" + "".join(f"; or as if {words}" for words in read[1:])
+        return (replace(read[0], equal=tuple(read[1:])),)
     if method.implicit_forces == "joint dampers" and not np.any(model.damping):
         method = replace(method, implicit_forces="none")  # the same step
-    return _describe(list(_joint_space_alternatives(method, model)), residuals, remaining)
+    return (_best(list(_joint_space_alternatives(method, model)), residuals, remaining),)
 
 
-def sample_readings(model: Model) -> Iterator[tuple[str, Callable[[StepRun], StepRun]]]:
+def sample_readings(model: Model) -> Iterator[tuple[Cause, Callable[[StepRun], StepRun]]]:
     """List in which other frames, or at which other points, an engine's samples may hold the velocities.
 
     Yields:
-        Words that complete "behaves as if", and what turns such samples into right ones.
+        The cause, and what turns such samples into right ones.
 
     """
     frames = rotation_matrix(model.turn[: model.n, 1])
@@ -162,26 +160,29 @@ def sample_readings(model: Model) -> Iterator[tuple[str, Callable[[StepRun], Ste
 
         return correct
 
-    for words, change in {
-        "the velocities of samples were in the body frame": lambda a, v, w: (np.matvec(a, v), w),
-        "the velocities of samples were those of the joints' points": lambda a, v, w: (
+    for (term, words), change in {
+        ("velocities of samples", "in the body frame"): lambda a, v, w: (np.matvec(a, v), w),
+        ("velocities of samples", "those of the joints' points"): lambda a, v, w: (
             v - np.matvec(a, np.cross(w, model.proximal[: model.n])),
             w,
         ),
-        "the angular velocities of samples were in the world frame": lambda a, v, w: (v, np.matvec(a.mT, w)),
-        "the angular velocities of samples were in the joints' axes": lambda a, v, w: (
+        ("angular velocities of samples", "in the world frame"): lambda a, v, w: (v, np.matvec(a.mT, w)),
+        ("angular velocities of samples", "in the joints' axes"): lambda a, v, w: (
             v,
             np.matvec(frames, w),
         ),
     }.items():
-        yield words, corrected(change)
+        yield Cause("frame", term, "", words), corrected(change)
 
 
-def _describe(
-    alternatives: Sequence[Alternative], residuals: Residuals, remaining: Callable[[StepMethod], float]
-) -> str:
-    """Sentence that names every alternative which explains all steps; formulas come before families."""
-    found: list[tuple[str, float]] = []
+def _best(
+    alternatives: Sequence[Alternative],
+    residuals: Residuals,
+    remaining: Callable[[StepMethod], float],
+    term: str = "steps",
+) -> Cause:
+    """The alternatives that explain all steps, as one cause; formulas come before families."""
+    found: list[Cause] = []
     for alternative in alternatives:
         if found and alternative.declared is not None:
             continue
@@ -192,14 +193,10 @@ def _describe(
                 continue
             left = remaining(method)
         if left <= 1.0:
-            found.append((alternative.describe(x, resolution), left))
-    if not found:
-        return UNEXPLAINED
-    (first, _), *others = found
-    text = f"behaves as if {first}"
-    if others:
-        text += f"; the data cannot distinguish this from: {'; '.join(words for words, _ in others)}"
-    return text + f"; this explains the steps to {max(left for _, left in found):.2g} of the rounding bound"
+            words, declared = alternative.describe(x, resolution), alternative.declared
+            amount, nominal = ((), ()) if declared is None else ((x,), (declared,))
+            found.append(Cause("method", term, "", words, amount, nominal, "", resolution, left))
+    return replace(found[0], equal=tuple(found[1:])) if found else replace(UNEXPLAINED, term=term)
 
 
 def _fit(alternative: Alternative, residuals: Residuals) -> tuple[float, float]:
@@ -347,7 +344,7 @@ def _parameter(
     """The declared formula with another value of one field."""
     return Alternative(
         lambda x, resolution: (
-            words.format(format_significant(x, value, resolution)) + f" (declared: {value:.6g})"
+            words.format(f"{significant(x, value, resolution):.15g}") + f" (declared: {value:.6g})"
         ),
         lambda x: replace(declared, **{name: x}),  # type: ignore[arg-type]
         value,
@@ -365,7 +362,7 @@ def _exchanged_weights(declared: JointSpaceMethod, i: int, j: int) -> Alternativ
         return replace(declared, weights=tuple(weights))
 
     def describe(x: float, resolution: float) -> str:
-        size = format_significant(abs(x), 0.0, resolution)
+        size = f"{significant(abs(x), 0.0, resolution):.15g}"
         more, less = (i, j) if x > 0 else (j, i)
         return f"the weight of stage {more + 1} were larger by {size} and that of stage {less + 1} smaller"
 
@@ -377,16 +374,16 @@ def _exchanged_weights(declared: JointSpaceMethod, i: int, j: int) -> Alternativ
 
 def _explain_constrained_steps(
     model: Model, states: Sequence[State], declared: ConstrainedMethod, runs: Runs
-) -> str:
+) -> tuple[Cause, ...]:
     ratios = {name: max(c.ratios) for name, c in compare_parts(declared, model, states, runs).items()}
     parts = []
     first = ratios.pop("step_first_acceleration", 0.0)
     if first > MIN_DIAGNOSABLE_RATIO:
         accelerations = [run.coordinate_acceleration for *_, run in runs]
         if all(a is not None and not np.any(a[0]) for a in accelerations):
-            parts.append("behaves as if the first accelerations were 0")
+            parts.append(Cause("method", "first accelerations", "", "the first accelerations were 0"))
         else:
-            parts.append("the first accelerations are not those of the equations of motion")
+            parts.append(Cause("unexplained", "first accelerations", "", "no other integrator"))
     if max(ratios.values()) > MIN_DIAGNOSABLE_RATIO:
 
         def residuals(other: StepMethod) -> Array:
@@ -398,13 +395,14 @@ def _explain_constrained_steps(
             found = compare_parts(other, model, states, runs)
             return max(max(found[name].ratios) for name in names)
 
-        text = _describe(list(_constrained_alternatives(declared)), residuals, partial(remaining, ratios))
-        if text == UNEXPLAINED and ratios["step_quadrature"] > MIN_DIAGNOSABLE_RATIO:
+        cause = _best(list(_constrained_alternatives(declared)), residuals, partial(remaining, ratios))
+        if not cause.is_explained and ratios["step_quadrature"] > MIN_DIAGNOSABLE_RATIO:
             same_level = list(_constrained_alternatives(declared, is_level_fixed=True))
-            text = _describe(same_level, residuals, partial(remaining, ["step_quadrature"]))
-            text = f"in the quadrature alone it {text}" if text != UNEXPLAINED else text
-        parts.append(text)
-    return "; ".join(parts) or "the difference is too close to the rounding bound to name an integrator"
+            of_quadrature = partial(remaining, ["step_quadrature"])
+            alone = _best(same_level, residuals, of_quadrature, "quadrature alone")
+            cause = alone if alone.is_explained else cause
+        parts.append(cause)
+    return tuple(parts) or (CLOSE,)
 
 
 def _constrained_alternatives(
@@ -441,7 +439,7 @@ def _generalized_alpha_family(base: ConstrainedMethod, at_level: str) -> Alterna
     declared = base.alpha_f / (1 - base.alpha_f)
 
     def describe(x: float, resolution: float) -> str:
-        radius = format_significant(x, declared, resolution)
+        radius = f"{significant(x, declared, resolution):.15g}"
         return f"it took the generalised-α step with spectral radius {radius}{at_level}"
 
     def method(x: float) -> ConstrainedMethod:

@@ -22,7 +22,13 @@ import numpy as np
 from plumbline.equations.arithmetic import floats
 from plumbline.equations.tree import Tree
 from plumbline.model.datatypes import Array, Model, State
-from plumbline.model.kinematics import cross, cross_matrix, rotate_vectors, rotation_matrix
+from plumbline.model.kinematics import (
+    cross,
+    cross_matrix,
+    rotate_vectors,
+    rotation_matrix,
+    stack_states,
+)
 
 DEPENDENT = 3e-7  # singular values of scaled rows, relative: below it a row depends on the others
 EndRows = Literal["accelerations", "twists", "without velocity terms"]
@@ -46,7 +52,7 @@ class Responses:
     def __init__(
         self,
         model: Model,
-        states: Sequence[State],
+        states: Sequence[State] | State,
         ends: Sequence[tuple[int, int]] = (),
         row_scale: Array | None = None,
         end_rows: EndRows = "accelerations",
@@ -54,18 +60,18 @@ class Responses:
         """Solve for the motions.
 
         Args:
-            model: a tree, or a mechanism cut open.
-            states: S states of it.
+            model: a tree, or a mechanism cut open; its numbers may be others at each state.
+            states: S states of it, or one of arrays (S, ...).
             ends: L pairs of bodies that are joined besides, parts of one body.
             row_scale: (6 L,) factors that make their rows comparable.
             end_rows: what these rows make equal: accelerations of the bodies, or rates of their twists, which
                 is another law where the ends are apart; or accelerations, without what velocities cause.
 
         """
-        state = State(**{name: np.stack([vars(one)[name] for one in states]) for name in vars(states[0])})
-        tree = Tree(floats(), model, state)
-        self.state, self.n, self.far, self._count = state, model.n, tree.far, len(states)
-        self._mass = model.mass[:, None, None]
+        state = states if isinstance(states, State) else stack_states(states)
+        self.tree = tree = Tree(floats(), model, state)
+        self.state, self.n, self.far, self._count = state, model.n, tree.far, len(state.p)
+        self._mass = model.mass[..., None, None]
         A = rotation_matrix(state.p)
         self._inertia = A @ model.inertia @ A.mT
         self.omega, self.arm = self._vectors(tree.w), self._vectors(tree.near)
@@ -78,7 +84,7 @@ class Responses:
         self.ends, self._end_rows = ends, end_rows
         self._join(np.ones(6 * len(ends)) if row_scale is None else row_scale)
 
-        forces = self.load + model.mass[:, None] * model.gravity
+        forces = self.load + model.mass[..., None] * model.gravity[..., None, :]
         moments = self.torque - cross(self.omega, rotate_vectors(self._inertia, self.omega))
         pushed = np.concatenate([forces, moments], -1)[..., None]
         self._coasting = np.concatenate([self._vectors(some) for some in tree.coasting()], -1)[..., None]
@@ -143,14 +149,14 @@ class Responses:
             self.held.append(_both(_across(slides), _across(turns)))
             for size, effort, rotor in elements:
                 efforts.append(np.broadcast_to(0.0 if effort is None else effort[..., 0], (S, size)))
-                armature.append(np.full(size, 0.0 if rotor is None else np.ravel(rotor)[0]))
-        self._armature, self._effort = np.concatenate(armature), np.concatenate(efforts, -1)
+                armature.append(np.broadcast_to(0.0 if rotor is None else rotor[..., 0], (S, size)))
+        self._armature, self._effort = np.concatenate(armature, -1), np.concatenate(efforts, -1)
 
     def _find_motions(self) -> None:
         """A and H = AᵀM A + a, with rates in units in which H has a unit diagonal."""
         x = self._beyond(self._blocks(self._free))
         A = x.reshape(self._count, 6 * self.n, -1)
-        H = A.mT @ self._weigh(x).reshape(A.shape) + np.diag(self._armature)
+        H = A.mT @ self._weigh(x).reshape(A.shape) + self._armature[:, None] * np.eye(A.shape[-1])
         size = np.einsum("sii->si", H)
         # a motion without inertia has no unit of its own, and is held by rows of loops
         unit = 1 / np.sqrt(np.where(size > 0, size, np.max(size, axis=1, keepdims=True, initial=0.0)))
@@ -185,7 +191,7 @@ class Responses:
             for body, arm in ((k, self._near[:, k]), (far, self._far[:, k])):
                 if body >= 0:
                     turning = arm @ inverse[:, body] @ arm.mT
-                    found[:, k, :3] += 1 / self._mass[body] + np.einsum("sii->si", turning)
+                    found[:, k, :3] += 1 / self._mass[..., body, :, 0] + np.einsum("sii->si", turning)
                     found[:, k, 3:] += np.einsum("sii->si", inverse[:, body])
         return np.sqrt(found).reshape(self._count, -1, 1)
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
 
-from plumbline.diagnosis.result import Diagnosis
+from plumbline.diagnosis.cause import Cause, Diagnosis
 from plumbline.engines import engine_calls, environments
 from plumbline.engines.adapter import EngineInfo
 from plumbline.engines.specifications import task_engine
@@ -471,12 +471,15 @@ class ScenarioRun:
         return [Task(subject, call, arguments, self._plan.limits, version, python, key.engine)]
 
     def _add_diagnosis(self, outcome: Outcome) -> None:
-        diagnosis: Diagnosis = outcome.value or Diagnosis(f"no diagnosis: {outcome.failure}")
+        diagnosis: Diagnosis = outcome.value or Diagnosis(
+            (Cause("refusal", "diagnosis", "", outcome.failure or ""),)
+        )
         kind = TaskKind.STEP if outcome.key.integrator else TaskKind.STATE
         cell = self._findings[replace(outcome.key, kind=kind)]
         extra = {} if diagnosis.scatter is None else {"scatter": diagnosis.scatter}
+        causes = tuple(asdict(cause) for cause in diagnosis.causes)
         cell.rows = [
-            replace(row, diagnosis=diagnosis.text or None, extra=row.extra | extra)
+            replace(row, diagnosis=diagnosis.text or None, causes=causes, extra=row.extra | extra)
             if row.verdict == Verdict.DISAGREES
             else row
             for row in cell.rows

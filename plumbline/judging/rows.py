@@ -183,6 +183,7 @@ class Row:
     # engine's column declares
     known_issue: str | None = None
     diagnosis: str | None = None  # the wrong term, in a sentence
+    causes: tuple[dict[str, Any], ...] = ()  # the same as data: of each cause its fields
     user_rtol: float | None = None  # the user's own tolerance, shown beside the verdict
     cpu_time: float = 0.0  # s, of the work behind this row
     extra: dict[str, float] = field(default_factory=dict)

@@ -209,6 +209,16 @@ def state_from_minimal(
     return complete_state(model, start)
 
 
+def stack_states(states: Sequence[State]) -> State:
+    """Put states into one, of arrays with a leading axis.
+
+    Returns:
+        The states, (S, ...) arrays.
+
+    """
+    return State(**{name: np.array([getattr(s, name) for s in states]) for name in vars(states[0])})
+
+
 def complete_state(model: Model, state: State) -> State:
     """Compute all that follows from the minimal coordinates of a state, from the world outwards.
 
@@ -266,13 +276,15 @@ def forward_kinematics(
         if kind.holds_nothing:
             continue
         above = A[..., far, :, :] if far >= 0 else np.eye(3)
-        tip, tip_v, spin = model.point[k, 0], np.zeros(3), np.zeros(3)
+        hang, own_point = model.point[..., k, 0, :], model.point[..., k, 1, :]
+        tip, tip_v, spin = hang, np.zeros(3), np.zeros(3)
         if far >= 0:
-            tip = r[..., far, :] + above @ model.point[k, 0]
-            swing = cross(omega[..., far, :], model.point[k, 0])
+            tip = r[..., far, :] + rotate_vectors(above, hang)
+            swing = cross(omega[..., far, :], hang)
             tip_v = v[..., far, :] + rotate_vectors(above, swing)
             spin = rotate_vectors(above, omega[..., far, :])
-        d, d_rate = model.length[k] * u[..., k, :], model.length[k] * udot[..., k, :]
+        length = model.length[..., k, None]
+        d, d_rate = length * u[..., k, :], length * udot[..., k, :]
         if not kind.has_attitude:
             (d, relative), (d_rate, turning) = JointFrame(model, k, above).motion(
                 x[..., k, :], xdot[..., k, :]
@@ -282,8 +294,8 @@ def forward_kinematics(
             p[..., k, :] = own / np.linalg.norm(own, axis=-1, keepdims=True)
             A[..., k, :, :] = rotation_matrix(p[..., k, :])
             omega[..., k, :] = rotate_vectors(A[..., k, :, :].mT, spin + turning)
-        near = cross(omega[..., k, :], model.proximal[k])
-        r[..., k, :] = tip + d - A[..., k, :, :] @ model.proximal[k]
+        near = cross(omega[..., k, :], own_point)
+        r[..., k, :] = tip + d - rotate_vectors(A[..., k, :, :], own_point)
         v[..., k, :] = tip_v + d_rate - rotate_vectors(A[..., k, :, :], near)
     return p, omega, r, v
 
@@ -296,7 +308,7 @@ class JointFrame:
 
     def __init__(self, model: Model, k: int, above: Array) -> None:
         self.motions = model.kinds[k].motions
-        self.turn_far, self.turn_near = model.turn[k]
+        self.turn_far, self.turn_near = model.turn[..., k, 0, :], model.turn[..., k, 1, :]
         self.above = above
 
     def motion(
@@ -326,7 +338,7 @@ class JointFrame:
                 turn = quaternion_product(turn, half)
         return (shift, quaternion_product(turn, quaternion_conjugate(self.turn_near))), (shift_rate, spin)
 
-    def axes(self, x: Float[Array, "coordinates"]) -> list[tuple[str, Float[Array, "3"]]]:
+    def axes(self, x: Float[Array, "... coordinates"]) -> list[tuple[str, Float[Array, "... 3"]]]:
         """Return what moves, and along or about which world axis.
 
         Returns:
@@ -353,9 +365,9 @@ def joint_vectors(
 
     """
     a, (far, body) = rotation_matrix(p), model.body.T
-    near = r[..., body, :] + np.einsum("...kij,kj->...ki", a[..., body, :, :], model.proximal)
-    hang = r[..., far, :] + np.einsum("...kij,kj->...ki", a[..., far, :, :], model.point[:, 0])
-    hang[..., far < 0, :] = model.point[far < 0, 0]
+    near = r[..., body, :] + rotate_vectors(a[..., body, :, :], model.point[..., 1, :])
+    hang = r[..., far, :] + rotate_vectors(a[..., far, :, :], model.point[..., 0, :])
+    hang[..., far < 0, :] = model.point[..., far < 0, 0, :]
     return np.asarray(near - hang)
 
 
@@ -571,6 +583,7 @@ def coordinates_of_joints(
     """Compute coordinates of joints from the motion of the bodies; angles in (−π, π].
 
     Args:
+        model: its numbers and the state may have the same leading axes.
         state: of which p, omega, r and v count.
 
     Returns:
@@ -578,47 +591,60 @@ def coordinates_of_joints(
 
     """
     a = rotation_matrix(state.p)
-    u, udot, x, xdot = (np.zeros((len(joints), size)) for size in (3, 3, model.columns, model.columns))
+    shape = (*state.r.shape[:-2], len(joints))
+    u, udot, x, xdot = (np.zeros((*shape, size)) for size in (3, 3, model.columns, model.columns))
     omega, d = rotate_vectors(a, state.omega), joint_vectors(model, state.r, state.p)
     for at, k in enumerate(joints):
         far, near = model.body[k]
-        above, spin = (a[far], omega[far]) if far >= 0 else (np.eye(3), np.zeros(3))
+        above, spin = (a[..., far, :, :], omega[..., far, :]) if far >= 0 else (np.eye(3), np.zeros(3))
+        own = d[..., k, :]
         ends = [
-            state.v[i] + cross(omega[i], a[i] @ point) if i >= 0 else np.zeros(3)
-            for i, point in zip((far, near), model.point[k], strict=True)
+            state.v[..., i, :]
+            + cross(omega[..., i, :], rotate_vectors(a[..., i, :, :], model.point[..., k, side, :]))
+            if i >= 0
+            else np.zeros(3)
+            for side, i in enumerate((far, near))
         ]
         rate = ends[1] - ends[0]
         if model.kinds[k].holds_distance:
-            u[at] = d[k] / np.linalg.norm(d[k])
-            udot[at] = (rate - u[at] * (u[at] @ rate)) / model.length[k]
+            unit = own / np.linalg.norm(own, axis=-1, keepdims=True)
+            along = np.sum(unit * rate, axis=-1, keepdims=True)
+            u[..., at, :], udot[..., at, :] = unit, (rate - unit * along) / model.length[..., k, None]
             continue
         motions = model.kinds[k].motions
-        frame = rotation_matrix(model.turn[k, 0]).T @ above.T
-        relative = frame @ a[near] @ rotation_matrix(model.turn[k, 1])
-        x[at, : len(motions)] = _coordinates(motions, frame @ d[k], relative)
-        axes = JointFrame(model, k, above).axes(x[at])
-        turns = np.array([axis for what, axis in axes if what == "turn"]).reshape(-1, 3)
-        turning = iter(np.linalg.lstsq(turns.T, omega[near] - spin)[0] if len(turns) else ())
+        frame = rotation_matrix(model.turn[..., k, 0, :]).mT @ above.mT
+        relative = frame @ a[..., near, :, :] @ rotation_matrix(model.turn[..., k, 1, :])
+        for i, value in enumerate(_coordinates(motions, rotate_vectors(frame, own), relative)):
+            x[..., at, i] = value
+        axes = JointFrame(model, k, above).axes(x[..., at, :])
+        turns = [axis for what, axis in axes if what == "turn"]
+        turning = iter(())
+        if turns:
+            columns = np.stack(np.broadcast_arrays(*turns), axis=-1)
+            turning = iter(
+                np.moveaxis(rotate_vectors(np.linalg.pinv(columns), omega[..., near, :] - spin), -1, 0)
+            )
         for i, (what, axis) in enumerate(axes):
-            slide = axis @ (rate - cross(spin, d[k]))
-            xdot[at, i] = slide if what == "slide" else next(turning)
+            slide = np.sum(axis * (rate - cross(spin, own)), axis=-1)
+            xdot[..., at, i] = slide if what == "slide" else next(turning)
     return u, udot, x, xdot
 
 
-def _coordinates(motions: tuple[tuple[str, int], ...], shift: Array, relative: Array) -> list[float]:
+def _coordinates(motions: tuple[tuple[str, int], ...], shift: Array, relative: Array) -> list[Array]:
     """Coordinates of a joint from its shift and its turn, both in the far axes: R or R_x R_y."""
     turns = [axis for what, axis in motions if what == "turn"]
     angles = []
     for i, axis in enumerate(turns):
         j, k = (axis + 1) % 3, (axis + 2) % 3
         if len(turns) == 1:
-            angles.append(float(np.arctan2(relative[k, j], relative[j, j])))
+            row, column, over = k, j, (j, j)
         elif i == 0:  # y and z of the near axes turned about x: y is left by the second turn
-            angles.append(float(np.arctan2(relative[2, 1], relative[1, 1])))
+            row, column, over = 2, 1, (1, 1)
         else:
-            angles.append(float(np.arctan2(relative[0, 2], relative[0, 0])))
+            row, column, over = 0, 2, (0, 0)
+        angles.append(np.arctan2(relative[..., row, column], relative[..., *over]))
     found = iter(angles)
-    return [float(shift[axis]) if what == "slide" else next(found) for what, axis in motions]
+    return [shift[..., axis] if what == "slide" else next(found) for what, axis in motions]
 
 
 def stretched_length(model: Model) -> Array:

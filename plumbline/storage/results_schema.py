@@ -163,6 +163,20 @@ class _Run(_Part):
     seed: int | None = None
 
 
+class _Cause(_Part):
+    kind: Literal["number", "term", "output", "frame", "method", "rounding", "refusal", "unexplained"]
+    term: str
+    place: str
+    change: str
+    amount: list[float | None]
+    nominal: list[float | None]
+    unit: str
+    uncertainty: float | None
+    left: float | None
+    states: _Count
+    equal: list[_Cause]
+
+
 class _Row(_Part):
     key: str
     scenario: str
@@ -186,6 +200,7 @@ class _Row(_Part):
     alias_of: str | None
     known_issue: str | None
     diagnosis: str | None
+    causes: list[_Cause]
     user_rtol: float | None
     cpu_time: _Duration
     extra: dict[str, float | str | None]

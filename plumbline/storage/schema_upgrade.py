@@ -29,15 +29,23 @@ _RANDOM_BATCH_NAMES = {"folded": "counts_by_verdict", "worst": "worst_ratios"}
 
 
 def upgrade_document(document: Record) -> Record:
-    """Bring the document of a results.json of version 1 or 2 to version 2.
+    """Bring the document of a results.json of an earlier version to the present one.
 
     Returns:
-        The document with the names of version 2. In version 1 the ratio of a row was in its ``extra``, or
-        followed from its value and tolerance.
+        The document with the present names.  In version 1 the ratio of a row was in its ``extra``, or
+        followed from its value and tolerance; before version 3 causes were sentences only.
 
     """
-    if document["schema_version"] != 1:
-        return document
+    if document["schema_version"] == 1:
+        document = _upgrade_first(document)
+    if document["schema_version"] == 2:
+        rows = [row | {"causes": []} for row in document["rows"]]
+        document = document | {"schema_version": 3, "rows": rows}
+    return document
+
+
+def _upgrade_first(document: Record) -> Record:
+    """The names of version 2."""
     run = _rename(document["run"], _RUN_NAMES)
     if "random_batch" in run:
         run["random_batch"] = _rename(run["random_batch"], _RANDOM_BATCH_NAMES)
@@ -55,17 +63,24 @@ def upgrade_document(document: Record) -> Record:
 
 
 def upgrade_summary(table: pa.Table) -> pa.Table:
-    """Bring a summary table of version 1 or 2 to version 2.
+    """Bring a summary table of an earlier version to the present one.
 
     Args:
         table: the content of summary.parquet, all columns.
 
     Returns:
-        The table with the names of version 2 and the column ``ratio``.
+        The table with the present names and the columns ``ratio`` and ``causes``.
 
     """
-    if "ratio" in table.column_names:
-        return table
+    if "ratio" not in table.column_names:
+        table = _upgrade_first_summary(table)
+    if "causes" not in table.column_names:
+        table = table.append_column("causes", pa.array(["[]"] * len(table), pa.string()))
+    return table
+
+
+def _upgrade_first_summary(table: pa.Table) -> pa.Table:
+    """The names of version 2."""
     table = table.rename_columns([_ROW_NAMES.get(name, name) for name in table.column_names])
     records = table.select(["value", "tolerance", "extra"]).to_pylist()
     split = [_split_ratio(record | {"extra": json.loads(record["extra"])}) for record in records]

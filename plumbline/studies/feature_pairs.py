@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from plumbline.model.datatypes import FREE, KINDS, Model, State
 from plumbline.model.features import ROLES, Feature, Place, features, without_feature
-from plumbline.model.kinematics import complete_state
+from plumbline.model.kinematics import complete_state, stack_states
 from plumbline.model.random_mechanisms import mechanism_with_places
 from plumbline.model.sampling import compared_states
 from plumbline.processes.cpu_time import CpuTimes
@@ -23,7 +23,7 @@ from plumbline.scenario.line_and_column_errors import ScenarioError
 from plumbline.scenario.loader import Scenario, scenario_from_dict
 from plumbline.scenario.mechanism_document import mechanism_document
 from plumbline.studies.coverage_study import CoverageFailure
-from plumbline.truth.parameter_effects import evaluate_models, evaluate_to_first_order, stack_states
+from plumbline.truth.parameter_effects import evaluate_models, evaluate_to_first_order
 from plumbline.truth.rounding_bound import state_rounding_bound
 
 MIN_RATIO = 100.0  # of an effect over the tolerance: effects in loops are of first order

@@ -16,7 +16,7 @@ from plumbline.equations.arithmetic import floats
 from plumbline.equations.jets import Jet, jets, with_slopes
 from plumbline.equations.tree import Tree
 from plumbline.model.datatypes import Array, Model, State
-from plumbline.model.kinematics import complete_state
+from plumbline.model.kinematics import complete_state, stack_states
 from plumbline.truth.linear_effects import ChangedModels
 from plumbline.truth.parameters import STATE_KINDS, Parameter, derivative, perturb, perturb_model
 
@@ -138,16 +138,6 @@ def _perturbed(
         return model, stack_states([perturb(model, state, parameter, size)[1] for state in states])
     changed, stacked = perturb_model(model, parameter, size), stack_states(states)
     return changed, complete_state(changed, stacked) if model.has_loops else stacked
-
-
-def stack_states(states: Sequence[State]) -> State:
-    """Put states into one, of arrays with a leading axis.
-
-    Returns:
-        The states, (S, ...) arrays.
-
-    """
-    return State(**{name: np.array([getattr(s, name) for s in states]) for name in vars(states[0])})
 
 
 def evaluate_models(cases: Sequence[tuple[Model, State]]) -> dict[str, Array]:

@@ -7,8 +7,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from plumbline.diagnosis.diagnose import diagnose, observe_difference
-from plumbline.diagnosis.digit_loss import MIN_SCATTER, DigitLoss, find_digit_loss
+from plumbline.diagnosis.diagnose import diagnose
+from plumbline.diagnosis.digit_loss import MIN_SCATTER, DigitLoss, Problem, find_digit_loss
 from plumbline.engines.registry import load_adapter
 from plumbline.model.equivalent import WORLD_VECTORS, first_bodies, rotate_world, unrotate
 from plumbline.model.sampling import random_states
@@ -42,8 +42,7 @@ def answering(change):
 def loss_of(change, joints="bb"):
     model, truth = known(joints)
     evaluate = answering(change)
-    difference = observe_difference(model, evaluate(model, truth.states), truth)
-    return find_digit_loss(difference, model, evaluate)
+    return find_digit_loss(Problem.worst(model, evaluate(model, truth.states), truth), evaluate)
 
 
 def noise(state, shape):
@@ -96,21 +95,22 @@ def test_an_engine_that_keeps_the_call_before_loses_no_digits():
         kept[:] = reported[-1:]
         return reported[:-1]
 
-    difference = observe_difference(model, evaluate(model, truth.states), truth)
-    assert difference.error_ratio(difference.expected) > 1e9
-    assert find_digit_loss(difference, model, evaluate) is None
+    problem = Problem.worst(model, evaluate(model, truth.states), truth)
+    assert problem.ratio() > 1e9
+    assert find_digit_loss(problem, evaluate) is None
 
 
 def test_noise_scatters_and_grows_only_where_it_does():
     flat = loss_of(lambda m, s, a: a * (1 + 1e-9 * noise(s, a.shape)), "bbbb")
     assert flat is not None and flat.scatter > MIN_SCATTER and not flat.grows
-    assert flat.describe().endswith("; rounding or noise in the algorithm")
+    assert flat.cause(["acceleration"]).change.endswith("; rounding or noise in the algorithm")
     growing = loss_of(
         lambda m, s, a: a * (1 + 1e-12 * 10.0 ** np.arange(m.n)[:, None] * noise(s, a.shape)), "bbbb"
     )
     assert growing is not None and growing.grows
-    assert growing.describe().startswith("loses digits: the answer scatters by ")
-    assert growing.describe().endswith(" bodies); rounding in the algorithm")
+    cause = growing.cause(["acceleration"])
+    assert cause.kind == "rounding" and cause.change.startswith("lose digits: they scatter by ")
+    assert cause.change.endswith(" bodies); rounding in the algorithm")
     assert list(growing.ratio_by_length) == [4, 2, 1]
 
 
@@ -127,7 +127,7 @@ def test_an_engine_that_fails_on_turned_problems_is_not_accused_of_losing_digits
     def evaluate(requested, states):
         raise RuntimeError("no")
 
-    assert find_digit_loss(observe_difference(model, reported, truth), model, evaluate) is None
+    assert find_digit_loss(Problem.worst(model, reported, truth), evaluate) is None
 
 
 @pytest.mark.parametrize("name", ["chain-30-balls", "chain-50-balls"])
@@ -136,6 +136,5 @@ def test_what_aba_loses_on_long_chains_has_its_name(name):
     model = loader.load_scenario(loader.find_scenario_file(name)).model
     truth = state_truth(model, random_states(model, 2, seed=1))
     evaluate = load_adapter("pinocchio-aba").evaluate
-    text = diagnose(model, evaluate(model, truth.states), truth, evaluate)
-    assert text.startswith("loses digits: the answer scatters by "), text
-    assert "the error grows with the chain" in text and "behaves as if" not in text, text
+    (cause,) = diagnose(model, evaluate(model, truth.states), truth, evaluate).causes
+    assert cause.kind == "rounding" and "the error grows with the chain" in cause.change, cause

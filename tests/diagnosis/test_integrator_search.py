@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from plumbline.diagnosis.cause import describe
 from plumbline.diagnosis.integrator_search import UNEXPLAINED, explain_steps
 from plumbline.engines.registry import load_adapter
 from plumbline.model.kinematics import angular_velocity, quaternion_rate, rotation_matrix
@@ -34,7 +35,7 @@ def explanation(adapter, integrator, joints="balls", loaded=False, change=lambda
     """Diagnosis of an adapter's steps on a model; the engine may see another one."""
     model, states = subject(joints, loaded, loaded)
     answer = stepped(adapter, integrator, change(model), states)
-    return explain_steps(model, states, integrator.method, answer)
+    return describe(explain_steps(model, states, integrator.method, answer))
 
 
 @pytest.mark.parametrize("defect", some_fast(STEP_DEFECTS, 3))
@@ -94,8 +95,8 @@ def test_samples_with_other_velocities_are_named(words):
     adapter = load_adapter("pinocchio")
     integrator = methods("pinocchio")[0]
     answer = _turned_rates(stepped(adapter, integrator, model, states), other)
-    text = explain_steps(model, states, integrator.method, answer)
-    assert text.endswith(words) and "or as if" not in text, text
+    (cause,) = explain_steps(model, states, integrator.method, answer)
+    assert cause.kind == "frame" and cause.change.endswith(words) and not cause.equal, cause
 
 
 def test_noise_is_not_named():
@@ -105,7 +106,7 @@ def test_noise_is_not_named():
     rng = np.random.default_rng(1)
     for attempt in answer.attempts:
         attempt.run.trajectory.v[...] *= 1 + 1e-9 * rng.normal(size=attempt.run.trajectory.v.shape)
-    assert explain_steps(model, states, integrator.method, answer) == UNEXPLAINED
+    assert explain_steps(model, states, integrator.method, answer) == (UNEXPLAINED,)
 
 
 LOOP_STEPS = [
@@ -124,7 +125,7 @@ def test_a_planted_integrator_is_named_on_a_loop(defect):
     integrator = load_adapter(defect.engine).integrator(defect.integrator)
     with planted(defect) as adapter:
         answer = stepped(adapter, integrator, model, states)
-    assert defect.expected[0] in explain_steps(model, states, integrator.method, answer)
+    assert defect.expected[0] in describe(explain_steps(model, states, integrator.method, answer))
 
 
 def test_samples_with_other_velocities_are_named_on_a_loop():
@@ -135,4 +136,5 @@ def test_samples_with_other_velocities_are_named_on_a_loop():
         stepped(load_adapter("pinocchio"), integrator, model, states),
         lambda a, v, w: (v + np.matvec(a, np.cross(w, near)), w),
     )
-    assert "those of the joints' points" in explain_steps(model, states, integrator.method, answer)
+    (cause,) = explain_steps(model, states, integrator.method, answer)
+    assert cause.change == "those of the joints' points"

@@ -10,9 +10,9 @@ from plumbline.equations.balls import balls as ball_arithmetic
 from plumbline.equations.jets import jets, with_slopes
 from plumbline.equations.tree import Tree
 from plumbline.model.datatypes import KINDS
+from plumbline.model.kinematics import stack_states
 from plumbline.model.random_mechanisms import ELEMENTS, random_tree
 from plumbline.model.sampling import random_states
-from plumbline.truth.parameter_effects import stack_states
 from plumbline.truth.parameters import derivative, list_parameters
 from tests.helpers.catalogue import catalogue_scenarios
 

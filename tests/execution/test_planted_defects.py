@@ -32,17 +32,9 @@ from tests.helpers.planting import (
     motion_report,
     subject,
 )
-from tests.helpers.shared_answers import sharing
 
 for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
     pytest.importorskip(engine)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def shared_predictions():
-    """Most hypotheses predict the same for every defect of a pendulum."""
-    with sharing("plumbline.diagnosis.fit", "evaluate_case", "state_rounding_bound"):
-        yield
 
 
 def state_report(defect):
@@ -114,6 +106,9 @@ def test_scaled_mass_and_inertia_are_invisible_to_accelerations_alone():
     assert "joint_reaction" in wrong and not {"acceleration", "angular_acceleration"} & set(wrong)
 
 
+WITHOUT_NAME = "no number, term, frame or output"
+
+
 def noisy(_, state, a):
     rng = np.random.default_rng(zlib.crc32(state.p.tobytes()))
     return a * (1 + 1e-9 * rng.normal(size=a.shape))
@@ -123,9 +118,10 @@ UNNAMEABLE = (
     Defect("noise", "r̈ × (1 + 1e-9 noise)", answers=answer_change("acceleration", noisy)),
     Defect("cubed", "ω̇′ + 1e-6 ω̇′³", engine="pinocchio",
            answers=answer_change("angular_acceleration", lambda _, __, a: a + 1e-6 * a**3)),
-    Defect("two-at-once", "mass of body 1 and inertia xx of body 2 × (1 + 1e-4)",
+    Defect("three-at-once", "mass of body 1, inertia of body 2 and damping of body 1",
            inputs=model_change(lambda m, _: {
-               "mass": m.mass * [1 + 1e-4, 1], "inertia": m.inertia * [[[1]], [[1 + 1e-4]]]})),
+               "mass": m.mass * [1 + 1e-4, 1], "inertia": m.inertia * [[[1]], [[1 + 1e-4]]],
+               "drag_moment": np.add(m.drag_moment, [1e-4, 0])})),
     Defect("friction", "Coulomb friction of 1e-3 N m on every body", engine="exudyn",
            inputs=model_change(lambda m, s: {"moment": m.moment - 1e-3 * np.sign(s.omega)})),
 )  # fmt: skip
@@ -134,7 +130,7 @@ UNNAMEABLE = (
 @pytest.mark.parametrize("defect", **ids(UNNAMEABLE))
 def test_a_difference_without_single_cause_is_not_named(defect):
     wrong, text = state_report(defect)
-    assert wrong and text.startswith("no single change"), text
+    assert wrong and text and "behaves as if" not in text, text
 
 
 def test_a_difference_next_to_the_bound_is_not_named():
@@ -142,18 +138,18 @@ def test_a_difference_next_to_the_bound_is_not_named():
     reported = list(truth.quantities)
     shift = 1.8 * truth.bounds[3].acceleration[:, None] * np.array([[0.6, -0.48, 0.64]])
     reported[3] = replace(reported[3], acceleration=reported[3].acceleration + shift)
-    assert diagnose(model, reported, truth).startswith("the difference is too close to the rounding bound")
+    (cause,) = diagnose(model, reported, truth).causes
+    assert (cause.kind, cause.change) == ("unexplained", "close")
 
 
 def test_the_diagnosis_states_where_the_difference_persists():
     names = ("gyroscopic-dropped", "gravity-1e-5", "loads-ignored")
     at = {d.name: diagnosis(d) for d in STATE_DEFECTS if d.name in names}
-    assert "vanishes at rest, persists without gravity" in at["gyroscopic-dropped"]
-    assert "persists at rest, vanishes without gravity" in at["gravity-1e-5"]
+    assert "vanishes at rest; persists without gravity" in at["gyroscopic-dropped"]
+    assert "persists at rest; vanishes without gravity" in at["gravity-1e-5"]
     assert "vanishes without loads and drag" in at["loads-ignored"]
 
 
-WITHOUT_NAME = "no single change of a parameter, term or convention explains the "
 BRANCHES = [
     d for d in STATE_DEFECTS if d.name.startswith(("identity-", "fast-", "rod-upward", "stale-rates"))
 ]
@@ -172,7 +168,6 @@ def test_rates(record_property, capsys):
     nameable = [d for d in DEFECTS if d.expected]
     named = [d for d in nameable if is_named(d)]
     reported = [d for d in (*STATE_DEFECTS, *UNNAMEABLE) if "behaves as if" in diagnosis(d)]
-    reported += [d for d in UNNAMEABLE if not diagnosis(d).startswith("no single change")]
     false = [d.name for d in reported if (d.expected and d not in named) or d in UNNAMEABLE]
     false += [d.name for d in BRANCHES if WITHOUT_NAME not in diagnosis(d)]
     figures = {

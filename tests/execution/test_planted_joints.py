@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from plumbline.diagnosis.joint_diagnosis import diagnose_joints
+from plumbline.diagnosis.diagnose import diagnose
 from plumbline.engines.registry import load_adapter
 from plumbline.model.kinematics import rotation_matrix
 from plumbline.model.sampling import random_states
@@ -23,17 +23,9 @@ from tests.helpers.planting import (
     evaluated,
     subject,
 )
-from tests.helpers.shared_answers import sharing
 
 for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
     pytest.importorskip(engine)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def shared_predictions():
-    """The effects of most causes are the same for every defect."""
-    with sharing("plumbline.diagnosis.joint_diagnosis", "_predict"):
-        yield
 
 
 @pytest.mark.parametrize(
@@ -79,7 +71,7 @@ def test_a_misread_velocity_that_only_energies_show_is_named_without_gravity():
     assert not np.any(model.gravity) and truth.bounds[0].tolerance("potential_energy") == 0
     turned = [replace(s, v=np.matvec(rotation_matrix(s.p), s.v)) for s in truth.states]
     found = load_adapter("pinocchio").evaluate(model, turned)
-    assert "the velocity of body 1 were given in the body frame" in diagnose_joints(model, found, truth)
+    assert "the velocity of body 1 were given in the body frame" in diagnose(model, found, truth).text
 
 
 def is_applicable(defect, mechanism):

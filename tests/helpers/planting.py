@@ -19,7 +19,6 @@ import numpy as np
 
 import reference_impl.direct as direct
 from plumbline.diagnosis.diagnose import diagnose
-from plumbline.diagnosis.joint_diagnosis import diagnose_joints
 from plumbline.engines.adapter import Adapter
 from plumbline.engines.engine_calls import Evaluation
 from plumbline.engines.registry import load_adapter
@@ -178,10 +177,8 @@ def diagnosis(defect: Defect) -> str:
     reported, wrong = evaluated(defect)
     if not wrong:
         return ""
-    if not model.is_chain:
-        return diagnose_joints(model, reported, truth)
-    with planted(defect) as engine:
-        return diagnose(model, reported, truth, engine.evaluate)
+    with planted(defect) as engine:  # of chains with the engine, asked again for digits and where it persists
+        return diagnose(model, reported, truth, engine.evaluate if model.is_chain else None).text
 
 
 def assert_named(defect: Defect) -> None:

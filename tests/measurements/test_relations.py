@@ -8,7 +8,7 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from plumbline.diagnosis.defect_model import evaluate_case, make_defect_case
+from plumbline.diagnosis.prediction import Predictor, View
 from plumbline.engines.registry import ENGINES, load_adapter
 from plumbline.judging.relation_rows import judge_relations
 from plumbline.judging.rows import RowContext
@@ -55,11 +55,9 @@ def test_the_ways_back_are_those_of_the_equations(joints):
             else pendulums.make_model(JOINT_PATTERNS[joints], loads=True)
         )
         for state in random_states_of(here):
-            right = evaluate_case(make_defect_case(here, [state]))
+            right = Predictor(here, [state], View()).right
             other_model, other_state = relation.transform(here, state)
-            reported = {
-                q: x[0] for q, x in evaluate_case(make_defect_case(other_model, [other_state])).items()
-            }
+            reported = {q: x[0] for q, x in Predictor(other_model, [other_state], View()).right.items()}
             back = relation.transform_back(_as_state_quantities(reported))
             for q, x in back.items():
                 np.testing.assert_allclose(x, right[q][0], rtol=1e-11, atol=1e-11 * np.max(np.abs(right[q])))

@@ -41,7 +41,7 @@ def test_rows_get_the_present_names_and_keep_their_values():
 def test_the_summary_has_the_same_rows_as_the_document():
     table = {row["key"]: row for row in read_table(STORED, "summary").to_pylist()}
     for row in read_results(STORED)["rows"]:
-        assert table[row["key"]] | {"extra": row["extra"]} == row
+        assert table[row["key"]] | {"extra": row["extra"], "causes": row["causes"]} == row
         assert json.loads(table[row["key"]]["extra"]) == row["extra"]
 
 

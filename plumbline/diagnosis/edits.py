@@ -1,0 +1,412 @@
+"""Table of the numbers that an engine may have wrong: of bodies, joints, elements, springs and the state.
+
+An edit replaces one number or three, or multiplies fields by a factor: of one place, of all, or from one on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from plumbline.diagnosis.cause import Cause, CauseKind
+from plumbline.diagnosis.prediction import TRAILING, Case
+from plumbline.model.datatypes import JOINT_ELEMENTS, SPRING_FIELDS, Array, Model
+from plumbline.model.kinematics import quaternion_exponential, quaternion_product, rotation_matrix
+
+ASKEW = 1e-6  # of a direction: it lies along an axis but for rounding
+LENGTHS = (" m", " rad")  # units of a mechanism's geometry, by which loops may open
+WORDS = {"rest": "rest position", "force": "applied force", "moment": "applied moment",
+         "drag_force": "drag force", "drag_moment": "drag moment", "omega": "angular velocity ω′",
+         "udot": "rod rate u̇", "xdot": "rates", "spring_length": "length", "spring_stiffness": "stiffness",
+         "spring_damping": "damping"}  # fmt: skip
+UNITS = {"mass": " kg", "inertia": " kg m²", "force": " N", "moment": " N m", "drag_force": " N s/m",
+         "drag_moment": " N m s", "gravity": " m/s²", "length": " m", "point": " m"}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Edit:
+    """A change of what an engine evaluates, by the numbers x, of which ``nominal`` are right; or by none."""
+
+    cause: Cause
+    change: Callable[[Case, Array], Case]
+    scale: float = 0.0  # natural size of a change of x
+    can_vanish: bool = True  # whether factors 0, 2 and −1 are possible
+    fields: tuple[str, ...] = ()  # of the model, of which numbers are changed
+
+    @property
+    def nominal(self) -> Array:
+        """The right numbers."""
+        return np.array(self.cause.nominal)
+
+
+# -- changes of fields ---------------------------------------------------------------------------------
+
+
+def with_fields(case: Case, **fields: Any) -> Case:
+    """Replace fields of the model or of the state."""
+    of_state = {name: fields.pop(name) for name in list(fields) if hasattr(case.state, name)}
+    model = replace(case.model, **fields) if fields else case.model
+    return Case(model, replace(case.state, **of_state) if of_state else case.state)
+
+
+def field(case: Case, name: str) -> Array:
+    """Return a field of the model or of the state."""
+    return np.asarray(getattr(case.state if hasattr(case.state, name) else case.model, name))
+
+
+def at_place(name: str, at: tuple[Any, ...]) -> Callable[[Case, Array], Case]:
+    """Replace one number of a field, or one vector."""
+
+    def change(case: Case, x: Array) -> Case:
+        values = field(case, name).copy()
+        values[(..., *at)] = x[0] if len(x) == 1 else x
+        if name == "inertia":
+            values[(..., at[0], at[2], at[1])] = x[0]
+        return with_fields(case, **{name: values})
+
+    return change
+
+
+def scaled(names: Sequence[str], where: Array, part: Any = 1.0) -> Callable[[Case, Array], Case]:
+    """Multiply fields by a factor: at places of a mask, and there only parts of them."""
+
+    def change(case: Case, x: Array) -> Case:
+        changes = {}
+        for name in names:
+            values = field(case, name)
+            mask = np.reshape(np.asarray(where, float), (-1, *(1,) * TRAILING[name]))
+            changes[name] = values * (1 + (x[0] - 1) * mask * part)
+        return with_fields(case, **changes)
+
+    return change
+
+
+def added(name: str, where: Array) -> Callable[[Case, Array], Case]:
+    """Add an amount to a field at places of a mask."""
+    return lambda case, x: with_fields(case, **{name: field(case, name) + x[0] * where})
+
+
+def turned(k: int, side: int, axes: Array) -> Callable[[Case, Array], Case]:
+    """Turn the axes of a joint in one body by a rotation vector in themselves, of components along axes."""
+
+    def change(case: Case, x: Array) -> Case:
+        values = case.model.turn.copy()
+        by = quaternion_exponential(np.asarray(x) @ axes / 2)
+        values[..., k, side, :] = quaternion_product(values[..., k, side, :], by)
+        return with_fields(case, turn=values)
+
+    return change
+
+
+def _turned_attitude(k: int, axis: int) -> Callable[[Case, Array], Case]:
+    def change(case: Case, x: Array) -> Case:
+        values = case.state.p.copy()
+        values[:, k] = quaternion_product(values[:, k], quaternion_exponential(x[0] * np.eye(3)[axis] / 2))
+        return with_fields(case, p=values)
+
+    return change
+
+
+def _shifted_centre(k: int, axis: int) -> Callable[[Case, Array], Case]:
+    """Displace a centre of mass: what is attached to the body moves the other way."""
+
+    def change(case: Case, x: Array) -> Case:
+        point, springs = case.model.point.copy(), case.model.spring_point.copy()
+        point[..., axis] -= x[0] * (case.model.body == k)
+        springs[..., axis] -= x[0] * (case.model.spring_body == k)
+        return with_fields(case, point=point, spring_point=springs)
+
+    return change
+
+
+def _shifted_slide(k: int) -> Callable[[Case, Array], Case]:
+    """Count a slide's coordinate, spring included, from a point further along its axis."""
+
+    def change(case: Case, x: Array) -> Case:
+        model = case.model
+        along = rotation_matrix(model.turn[k, 0])[:, model.kinds[k].motions[0][1]]
+        point, rest = model.point.copy(), model.rest.copy()
+        point[..., k, 0, :] += x[0] * along
+        rest[..., k, 0] -= x[0]
+        return with_fields(case, point=point, rest=rest)
+
+    return change
+
+
+def gyroscopic_moment(case: Case) -> Array:
+    """Return ω′ × J ω′ (S, N, 3)."""
+    omega = case.state.omega
+    return np.cross(omega, np.matvec(case.model.inertia, omega))
+
+
+def _gyroscopic(where: Array) -> Callable[[Case, Array], Case]:
+    def change(case: Case, x: Array) -> Case:
+        less = (x[0] - 1) * where[:, None] * gyroscopic_moment(case)
+        return with_fields(case, moment=case.model.moment - less)
+
+    return change
+
+
+# -- tables --------------------------------------------------------------------------------------------
+
+
+def number_edits(case: Case) -> Iterator[Edit]:
+    """List the edits of one number."""
+    yield from _gravity(case.model)
+    yield from _bodies(case.model)
+    yield from _joints(case.model)
+    yield from _factors(case)
+    yield from _absent(case.model)
+
+
+def _number(
+    term: str, place: str, name: str, at: tuple[Any, ...], value: float, scale: float, unit: str = "",
+    can_vanish: bool = True,
+) -> Edit:  # fmt: skip
+    cause = Cause("number", term, place, nominal=(value,), unit=unit)
+    return Edit(cause, at_place(name, at), scale, can_vanish, (name,))
+
+
+def _factor(
+    term: str, place: str, change: Callable[[Case, Array], Case], can_vanish: bool = True,
+    fields: tuple[str, ...] = (), kind: CauseKind = "number",
+) -> Edit:  # fmt: skip
+    return Edit(Cause(kind, term, place, nominal=(1.0,), unit="×"), change, 1.0, can_vanish, fields)
+
+
+def _gravity(model: Model) -> Iterator[Edit]:
+    size = float(np.linalg.norm(model.gravity)) or 1.0
+    if np.count_nonzero(model.gravity) > 1:  # else it is a component
+        yield _factor(
+            "size of gravity", "", lambda case, x: with_fields(case, gravity=x[0] * case.model.gravity)
+        )
+    for i, axis in enumerate("xyz"):
+        value = float(model.gravity[i])
+        yield _number(f"{axis} component of gravity", "", "gravity", (i,), value, size, UNITS["gravity"])
+
+
+def _bodies(model: Model) -> Iterator[Edit]:
+    size = float(np.linalg.norm(model.gravity)) or 1.0
+    length = float(np.max(np.abs(model.point))) or 1.0
+    for k in range(model.n):
+        place, mass = f"body {k + 1}", float(model.mass[k])
+        yield _number("mass", place, "mass", (k,), mass, mass, UNITS["mass"], can_vanish=False)
+        trace = float(np.trace(model.inertia[k]))
+        for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)):
+            term, value = f"inertia {'xyz'[i]}{'xyz'[j]}", float(model.inertia[k, i, j])
+            yield _number(term, place, "inertia", (k, i, j), value, trace, UNITS["inertia"], i != j)
+        for i, axis in enumerate("xyz"):
+            for name, weight in (("force", mass * size), ("moment", mass * size * length)):
+                value = float(getattr(model, name)[k, i])
+                yield _number(f"{WORDS[name]} {axis}", place, name, (k, i), value, weight, UNITS[name])
+            if not model.kinds[k].holds_nothing:
+                cause = Cause(
+                    "number",
+                    f"centre of mass {axis}",
+                    place,
+                    nominal=(0.0,),
+                    unit=" m",
+                )
+                yield Edit(cause, _shifted_centre(k, i), length)
+            if model.kinds[k].has_attitude:
+                cause = Cause(
+                    "number",
+                    f"attitude about {axis}",
+                    place,
+                    nominal=(0.0,),
+                    unit=" rad",
+                )
+                yield Edit(cause, _turned_attitude(k, i), 1.0)
+        for name, weight in (("drag_force", mass), ("drag_moment", trace)):
+            if not getattr(model, name)[k]:
+                yield _number(WORDS[name], place, name, (k,), 0.0, weight, UNITS[name])
+
+
+def coordinates(model: Model) -> list[tuple[int, int]]:
+    """Joint and column of all coordinates that can have elements."""
+    return [(k, i) for k, kind in enumerate(model.kinds) for i in range(kind.element_count)]
+
+
+def coordinate_place(model: Model, k: int, i: int) -> str:
+    """Name a coordinate of a joint."""
+    names = model.kinds[k].motion_names
+    return f"joint {k + 1}" + (f" {names[i]}" if len(names) > 1 else "")
+
+
+def _joints(model: Model) -> Iterator[Edit]:
+    for k, i in coordinates(model):
+        for name in JOINT_ELEMENTS:
+            if name not in ("rest", "effort") or not model.kinds[k].is_spherical:
+                value = float(getattr(model, name)[k, i])
+                place = coordinate_place(model, k, i)
+                yield _number(WORDS.get(name, name), place, name, (k, i), value, abs(value) or 1.0)
+    for i in range(len(model.spring_body)):
+        for name in SPRING_FIELDS[2:]:
+            value = float(getattr(model, name)[i])
+            yield _number(WORDS[name], f"spring {i + 1}", name, (i,), value, abs(value) or 1.0)
+    for k, kind in enumerate(model.kinds):
+        if kind.holds_nothing:
+            continue
+        place = f"joint {k + 1}"
+        if kind.holds_distance:
+            length = float(model.length[k])
+            yield _number("length", place, "length", (k,), length, length, " m", can_vanish=False)
+        if kind.motions and kind.motions[0][0] == "slide" and _shift_is_askew(model, k):
+            cause = Cause("number", "origin of the slide", place, nominal=(0.0,), unit=" m")
+            yield Edit(cause, _shifted_slide(k), 0.1)
+        for side, where in enumerate(("far", "near")):
+            for axis in range(3):
+                value = float(model.point[k, side, axis])
+                term = f"{where} point {'xyz'[axis]}"
+                yield _number(term, place, "point", (k, side, axis), value, 0.1, " m")
+                if not kind.has_attitude and (side == 0 or not kind.is_rigid):  # equal to a far turn
+                    term, side_place = f"turn about {'xyz'[axis]} of the axes", f"{place} in the {where} body"
+                    cause = Cause("number", term, side_place, nominal=(0.0,), unit=" rad")
+                    yield Edit(cause, turned(k, side, np.eye(3)[[axis]]), 0.1)
+
+
+def _shift_is_askew(model: Model, k: int) -> bool:
+    """Whether another origin of a slide is more than a coordinate of its far point."""
+    along = rotation_matrix(model.turn[k, 0])[:, model.kinds[k].motions[0][1]]
+    return bool(model.stiffness[k, 0] or np.count_nonzero(np.abs(along) > ASKEW) > 1)
+
+
+@dataclass(frozen=True)
+class _Factor:
+    """Fields that are multiplied by one factor: of all bodies, joints or springs, of each, or from one on."""
+
+    term: str
+    names: tuple[str, ...]
+    things: str
+    part: Any = 1.0  # of a field's entries, 1 where they are multiplied
+    is_of_each: bool = False
+    is_from_one_on: bool = True
+    can_vanish: bool = True
+
+
+FACTORS = (
+    _Factor("mass and inertia", ("mass", "inertia"), "bodies", is_of_each=True, can_vanish=False),
+    _Factor("mass", ("mass",), "bodies", can_vanish=False),
+    _Factor("inertia", ("inertia",), "bodies", is_of_each=True, can_vanish=False),
+    _Factor("products of inertia", ("inertia",), "bodies", 1 - np.eye(3), is_of_each=True),
+    _Factor("applied force", ("force",), "bodies", is_of_each=True),
+    _Factor("applied moment", ("moment",), "bodies", is_of_each=True),
+    _Factor("applied loads", ("force", "moment"), "bodies", is_of_each=True),
+    _Factor("drag force", ("drag_force",), "bodies", is_of_each=True),
+    _Factor("drag moment", ("drag_moment",), "bodies", is_of_each=True),
+    _Factor("drag", ("drag_force", "drag_moment"), "bodies", is_of_each=True),
+    _Factor("angular velocity ω′", ("omega",), "bodies", is_of_each=True),
+    _Factor("rod rate u̇", ("udot",), "joints", is_of_each=True, is_from_one_on=False),
+    _Factor("rates", ("xdot",), "joints", is_of_each=True, is_from_one_on=False),
+    *(_Factor(WORDS.get(name, name), (name,), "joints") for name in JOINT_ELEMENTS),
+    _Factor("far point", ("point",), "joints", np.eye(2)[0][:, None]),
+    _Factor("near point", ("point",), "joints", np.eye(2)[1][:, None]),
+    *(_Factor(WORDS[name], (name,), "springs") for name in SPRING_FIELDS[2:]),
+)
+SINGULAR = {"bodies": "body", "joints": "joint", "springs": "spring"}
+
+
+def _factors(case: Case) -> Iterator[Edit]:
+    """One factor on fields."""
+    model = case.model
+    of_attitude = np.array([kind.has_attitude for kind in model.kinds[: model.n]])
+    for one in FACTORS:
+        counts = [_entries(case, name, one.part) for name in one.names]
+        has = np.all([count > 0 for count in counts], axis=0)
+        has = has & of_attitude if one.names == ("omega",) else has
+        places = np.flatnonzero(has).tolist()
+        # of a vector or products with one entry it is a number's
+        is_several = np.sum(counts, axis=0) > (2 if np.ndim(one.part) == 2 else 1)
+        is_number = one.things == "bodies" and TRAILING[one.names[0]] and one.names[0] != "omega"
+        for k in places if one.is_of_each else []:
+            if is_several[k] or not is_number:
+                change = scaled(one.names, np.arange(len(has)) == k, one.part)
+                yield _factor(one.term, f"{SINGULAR[one.things]} {k + 1}", change, one.can_vanish, one.names)
+        for first in places[: len(places) - 1 if one.is_from_one_on else min(len(places) - 1, 1)]:
+            where = has & (np.arange(len(has)) >= first)
+            which = f"all {one.things}" if first == places[0] else f"{one.things} {first + 1} to {len(has)}"
+            change = scaled(one.names, where, one.part)
+            yield _factor(one.term, which, change, one.can_vanish, one.names)
+    for name in JOINT_ELEMENTS:
+        values = getattr(model, name)
+        for what in ("slide", "turn"):
+            chosen = [at for at in coordinates(model) if values[at] and _what(model, at) == what]
+            if 1 < len(chosen) < np.count_nonzero(values):
+                mask = np.zeros(values.shape)
+                mask[tuple(np.transpose(chosen))] = 1.0
+                change = scaled((name,), np.ones(len(mask)), mask)
+                yield _factor(WORDS.get(name, name), f"all {what}s", change, fields=(name,))
+    rates = [name for name in ("omega", "udot", "xdot") if np.any(_entries(case, name, 1.0))]
+    if len(rates) > 1:
+        yield _factor("rates of every kind", "", scaled(rates, np.ones(model.n)))
+    sized = ("point", "length", *(("spring_point", "spring_length") if len(model.spring_body) else ()))
+    if not any(kind.slide_axes for kind in model.kinds):
+        yield _factor("lengths", "the mechanism", _all(sized), can_vanish=False)
+    spins = np.any(gyroscopic_moment(case), axis=(0, 2))
+    for k in np.flatnonzero(spins).tolist():
+        yield _factor("gyroscopic term", f"body {k + 1}", _gyroscopic(np.arange(model.n) == k), kind="term")
+    if np.sum(spins) > 1:
+        yield _factor("gyroscopic term", "all bodies", _gyroscopic(spins), kind="term")
+
+
+def _entries(case: Case, name: str, part: Any) -> Array:
+    """(places,) how many entries of a field are not zero at each place."""
+    values = field(case, name)
+    if hasattr(case.state, name):
+        values = np.any(values, axis=0)
+    return np.asarray(np.count_nonzero(values * part, axis=tuple(range(1, values.ndim))))
+
+
+def _all(names: Sequence[str]) -> Callable[[Case, Array], Case]:
+    return lambda case, x: with_fields(case, **{name: x[0] * field(case, name) for name in names})
+
+
+def _what(model: Model, at: tuple[int, int]) -> str:
+    """Whether a coordinate is a slide or a turn."""
+    motions = model.kinds[at[0]].motions
+    return motions[at[1]][0] if motions else "turn"
+
+
+def _absent(model: Model) -> Iterator[Edit]:
+    """One amount in all places of what the mechanism has nowhere."""
+    for name, scale in (
+        ("drag_force", float(np.max(model.mass))),
+        ("drag_moment", float(np.max(model.inertia))),
+    ):
+        if model.n > 1 and not np.any(getattr(model, name)):
+            cause = Cause("number", WORDS[name], "all bodies", nominal=(0.0,), unit=UNITS[name])
+            yield Edit(cause, added(name, np.ones(model.n)), scale)
+    where = np.zeros(model.armature.shape)
+    for at in coordinates(model):
+        where[at] = 1.0
+    for name in ("armature", "damping"):
+        if np.sum(where) > 1 and not np.any(getattr(model, name)):
+            cause = Cause("number", name, "all joints", nominal=(0.0,))
+            yield Edit(cause, added(name, where), float(np.max(model.inertia)))
+
+
+def vector_edits(model: Model) -> Iterator[Edit]:
+    """List the edits of three numbers: points and turns of axes of joints, loads of bodies, gravity."""
+
+    def vector(term: str, place: str, name: str, at: tuple[Any, ...], scale: float) -> Edit:
+        x = tuple(float(value) for value in getattr(model, name)[at])
+        return Edit(Cause("number", term, place, nominal=x, unit=UNITS[name]), at_place(name, at), scale)
+
+    for k, kind in enumerate(model.kinds):
+        if kind.holds_nothing:
+            continue
+        for side, where in enumerate(("far", "near")):
+            if not kind.has_attitude and (side == 0 or not kind.is_rigid):
+                zeros = (0.0, 0.0, 0.0)
+                place = f"joint {k + 1} in the {where} body"
+                cause = Cause("number", "turn of the axes", place, nominal=zeros, unit=" rad")
+                yield Edit(cause, turned(k, side, np.eye(3)), 0.1)
+            yield vector(f"{where} point", f"joint {k + 1}", "point", (k, side, slice(None)), 0.1)
+    size = float(np.linalg.norm(model.gravity)) or 1.0
+    for k in range(model.n):
+        for name in ("force", "moment"):
+            yield vector(WORDS[name], f"body {k + 1}", name, (k, slice(None)), float(model.mass[k]) * size)
+    yield vector("vector of gravity", "", "gravity", (slice(None),), size)

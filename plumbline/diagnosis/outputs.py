@@ -1,0 +1,539 @@
+"""Table of what an engine or its adapter may return in place of a quantity, with right equations behind it.
+
+A quantity may be of another frame, point, time, body or precision, or a multiple; or it lacks, doubles or
+reverses the part that a load, an element, a closing joint or a body has in it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from plumbline.diagnosis.cause import Cause, significant
+from plumbline.diagnosis.prediction import WRENCHES, Answers, Case
+from plumbline.equations.arithmetic import floats
+from plumbline.equations.tree import Tree
+from plumbline.model.datatypes import Array, State
+from plumbline.model.kinematics import JointFrame, cross, rotate_vectors, rotation_matrix
+from plumbline.model.loops import determinate_projectors, wrench_length
+
+Choose = Callable[[Array], Array]  # of the rows of some bodies or joints
+MakeCause = Callable[..., Cause]  # of words and amounts
+TINY = float(np.finfo(float).tiny)
+SINGLE_ROUNDING = 1e-5  # of the largest value: what computing in single precision may cost
+MAX_RATIO = 2.0  # in bounds: of what is returned and of the right quantity
+FACTOR_ROUNDING = 1e-6  # of a fitted share of a part: a word for 0, 1, 2 or −1 times
+SHARES = {-1.0: "without {}", 1.0: "with twice {}", -2.0: "with {} of the opposite sign"}
+
+
+def error_ratio(difference: Array, bound: Array) -> float:
+    """Return the largest ‖difference‖/bound, of (S,) scalars or (S, ..., 3) vectors; NaN where any is."""
+    size = np.abs(difference) if difference.ndim == 1 else np.linalg.norm(difference, axis=-1)
+    with np.errstate(over="ignore", invalid="ignore"):
+        return float(np.max(size / np.maximum(bound, TINY), initial=0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """What has a part in a quantity, and how large it is."""
+
+    what: str
+    value: Array
+    about: str = ""  # of the moment that a joint's force has about another point: the point
+
+
+@dataclass(frozen=True, eq=False)
+class Outputs:
+    """The right quantities of S states, and what an engine might return instead."""
+
+    case: Case  # states with attitudes, velocities and positions of all bodies
+    right: Answers
+    previous: Answers  # those of the state before each
+    bounds: Answers  # (S,) or (S, N)
+
+    def name(self, quantity: str, reported: Array) -> Cause | None:
+        """Find what was returned in place of one quantity; None where nothing known explains it."""
+        bound = self.bounds[quantity]
+        return self._of_places(quantity, reported, None) or (
+            self._of_wrong_places(quantity, reported) if bound.ndim > 1 and bound.shape[1] > 1 else None
+        )
+
+    def _of_wrong_places(self, quantity: str, reported: Array) -> Cause | None:
+        bound, right = self.bounds[quantity], self.right[quantity]
+        wrong = [
+            k
+            for k in range(bound.shape[1])
+            if not error_ratio(reported[:, k] - right[:, k], bound[:, k]) <= 1
+        ]
+        if not wrong or len(wrong) == bound.shape[1]:
+            return self._exchanged(quantity, reported, wrong) if wrong else None
+        return self._of_places(quantity, reported, wrong) or self._exchanged(quantity, reported, wrong)
+
+    def _exchanged(self, quantity: str, reported: Array, wrong: list[int]) -> Cause | None:
+        """Rows that are those of other bodies."""
+        bound, right = self.bounds[quantity], self.right[quantity]
+        source = {}
+        for k in wrong:
+            for j in range(bound.shape[1]):
+                if (
+                    j != k
+                    and error_ratio(reported[:, k] - right[:, j], MAX_RATIO * (bound[:, k] + bound[:, j]))
+                    <= 1
+                ):
+                    source[k] = j
+                    break
+            else:
+                return None
+        thing = _thing(quantity)
+        of = " and ".join(f"{thing} {k + 1}" for k in wrong)
+        as_that = " and ".join(f"{thing} {source[k] + 1}" for k in wrong)
+        is_swap = len(wrong) == 2 and source == {wrong[0]: wrong[1], wrong[1]: wrong[0]}
+        change = "exchanged" if is_swap else f"as that of {of}"
+        return Cause("output", _words(quantity), of if is_swap else as_that, change)
+
+    def _of_places(self, quantity: str, reported: Array, places: list[int] | None) -> Cause | None:
+        """What was returned in place of a quantity of all bodies or joints, or of some."""
+
+        def chosen(x: Array) -> Array:
+            return x if places is None else x[:, places]
+
+        bound, right, given = chosen(self.bounds[quantity]), chosen(self.right[quantity]), chosen(reported)
+        thing = _thing(quantity)
+        place = "" if places is None else " and ".join(f"{thing} {k + 1}" for k in places)
+
+        def cause(change: str, *amount: float) -> Cause:
+            return Cause("output", _words(quantity), place, change, amount, states=len(given))
+
+        def matches(x: Array, rows: slice = slice(None)) -> bool:
+            """Whether x is what was reported, and differs from what is right by more than both bounds."""
+            if not error_ratio((given - x)[rows], (MAX_RATIO * bound)[rows]) <= 1:
+                return False
+            return error_ratio((x - right)[rows], (MAX_RATIO * bound)[rows]) > MAX_RATIO
+
+        if len(given) > 2 and matches(chosen(self.previous[quantity]), slice(1, None)):
+            return cause("of the previous state (a stale field)")
+        for change, value in self._whole(quantity):
+            if matches(chosen(value)):
+                return cause(change)
+        weight = 1 / _per_entry(bound, given)
+        square = max(float(np.sum((right * weight) ** 2)), TINY)
+        factor = float(np.sum(given * right * weight**2) / square)
+        uncertainty = 1 / np.sqrt(square)
+        if matches(factor * right):
+            if abs(factor + 1) <= max(1e-9, 10 * uncertainty):
+                return cause("with the opposite sign")
+            return replace(
+                cause("multiplied by"), nominal=(1.0,), amount=(significant(factor, 1.0, uncertainty),)
+            )
+        found = self._lacking(quantity, given, chosen, cause)
+        if found:
+            return found
+        is_near = np.max(np.abs(given - right)) <= SINGLE_ROUNDING * np.max(np.abs(right))
+        if is_near and np.any(given) and np.all(given == np.asarray(given, np.float32)):
+            return cause("rounded to single precision")
+        offset = np.mean(given - right, axis=0)
+        if len(given) > 2 and matches(right + offset):
+            if quantity == "potential_energy":
+                return cause("with another origin, at every state larger by", float(f"{offset:.6g}"))
+            return cause("with a constant added at every state")
+        return None
+
+    # -- whole quantities --------------------------------------------------------------------------
+
+    def _whole(self, quantity: str) -> Iterator[tuple[str, Array]]:
+        """What a quantity may be as a whole, in words, with its value."""
+        model, state = self.case
+        right = self.right[quantity]
+        turns = self._turns
+        if quantity == "acceleration":
+            omega = np.matvec(turns, state.omega)
+            g = model.gravity[..., None, :]
+            swing = np.cross(state.omega, np.cross(state.omega, model.proximal[: model.n]))
+            arm = np.matvec(
+                turns, np.cross(self.right["angular_acceleration"], model.proximal[: model.n]) + swing
+            )
+            yield (
+                "as the spatial acceleration (r̈ − ω × ṙ) instead of the classical one",
+                right - cross(omega, state.v),
+            )
+            yield "minus gravity", right - g
+            yield "plus gravity", right + g
+            yield "of the joint's point", right + arm
+        if quantity in ("acceleration", *WRENCHES):
+            near = model.body[:, 1][: right.shape[1]]
+            far = model.body[:, 0][: right.shape[1]]
+            yield "in the body frame", np.matvec(turns[:, near].mT, right)
+            if np.any(far >= 0):
+                above = np.where((far >= 0)[:, None, None], turns[:, far].mT, np.eye(3))
+                yield "in the frame of the body before", np.matvec(above, right)
+        if quantity == "angular_acceleration":
+            yield "in the world frame", np.matvec(turns, right)
+            axes = rotation_matrix(model.turn[: model.n, 1]).mT
+            yield "in the axes of its joint", np.matvec(axes, right)
+        if right.ndim == 3 and right.shape[1] > 1:
+            thing, hangs = (
+                _thing(quantity),
+                np.where(model.body[:, 0] < 0, 0, model.body[:, 0])[: right.shape[1]],
+            )
+            yield f"of another {thing}, the next one", np.roll(right, -1, 1)
+            yield f"of another {thing}, the previous one", np.roll(right, 1, 1)
+            yield f"of another {thing}, the one counted from the other end", right[:, ::-1]
+            yield f"of another {thing}, the one on which it hangs", right[:, hangs]
+        if quantity == "kinetic_energy":
+            moving = [part.value for part in self._kinetic if part.what == "the translation of all bodies"]
+            yield "of rotation alone", right - moving[0]
+        if quantity == "angular_momentum":
+            momentum = np.sum(model.mass[..., None] * state.v, axis=1)
+            centre = np.sum(model.mass[..., None] * state.r, axis=1) / np.sum(model.mass, axis=-1)[..., None]
+            spin = rotate_vectors(model.inertia, state.omega)
+            yield "about the centre of mass", right - cross(centre, momentum)
+            yield (
+                "with the spin in body axes of all bodies",
+                right - np.sum(np.matvec(turns, spin) - spin, axis=1),
+            )
+
+    @cached_property
+    def _turns(self) -> Array:
+        return rotation_matrix(self.case.state.p)
+
+    # -- parts -------------------------------------------------------------------------------------
+
+    def _lacking(self, quantity: str, given: Array, chosen: Choose, cause: MakeCause) -> Cause | None:
+        """One part that has another share in a quantity, or two."""
+        bound, right = chosen(self.bounds[quantity]), chosen(self.right[quantity])
+        weight = 1 / _per_entry(bound, given)
+        off = ((given - right) * weight).ravel()
+        if not np.all(np.isfinite(off)):
+            return None
+        parts = self._parts(quantity)
+        columns = [(chosen(part.value) * weight).ravel() for part in parts]
+        visible = [i for i, x in enumerate(columns) if np.max(np.abs(x), initial=0.0) > MAX_RATIO]
+        if not visible:
+            return None
+        A = np.array([columns[i] for i in visible])
+        square = np.sum(A * A, axis=1)
+        shares = A @ off / square
+        limit = 2 * MAX_RATIO
+        left = np.max(np.abs(off - shares[:, None] * A), axis=1)
+        named: list[Cause] = []
+        for i in np.flatnonzero(left <= limit):
+            words, amount = _share_words(float(shares[i]), parts[visible[i]])
+            if abs(shares[i]) * np.max(np.abs(A[i])) > limit:
+                named.append(cause(words, *amount))
+        if named:
+            exact = [one for one in named if not one.amount] or named
+            return replace(exact[0], equal=tuple(exact[1:]))
+        return self._two_parts(off, A, [parts[i].what for i in visible], cause, limit)
+
+    @staticmethod
+    def _two_parts(off: Array, A: Array, what: list[str], cause: MakeCause, limit: float) -> Cause | None:
+        """Two parts of shares in words: each lacks, counts twice or has the opposite sign."""
+        if len(A) > 200:
+            return None
+        gram, along, square = A @ A.T, A @ off, float(off @ off)
+        size = np.diag(gram)
+        found = []
+        for a in SHARES:
+            for b in SHARES:
+                norm = (
+                    square
+                    - 2 * (a * along[:, None] + b * along)
+                    + a * a * size[:, None]
+                    + b * b * size
+                    + 2 * a * b * gram
+                )
+                for i, j in zip(*np.nonzero(norm <= len(off) * limit**2 + 1e-9 * square), strict=True):
+                    if i < j and np.max(np.abs(off - a * A[i] - b * A[j])) <= limit:
+                        found.append(cause(f"{SHARES[a].format(what[i])} and {SHARES[b].format(what[j])}"))
+        return replace(found[0], equal=tuple(found[1:3])) if found else None
+
+    def _parts(self, quantity: str) -> list[Part]:
+        if quantity in WRENCHES:
+            own = [replace(part, value=part.value[WRENCHES.index(quantity)]) for part in self._wrench_parts]
+            return own + (self._levers if quantity == "joint_moment" else [])
+        names = {
+            "kinetic_energy": "_kinetic",
+            "potential_energy": "_potential",
+            "angular_momentum": "_momentum",
+        }
+        return getattr(self, names[quantity]) if quantity in names else []
+
+    @cached_property
+    def _kinetic(self) -> list[Part]:
+        model, state = self.case
+        moving = 0.5 * model.mass * np.sum(state.v**2, -1)
+        turning = 0.5 * np.sum(state.omega * rotate_vectors(model.inertia, state.omega), -1)
+        parts = _of_bodies(
+            {"{}": moving + turning, "the rotation of {}": turning, "the translation of {}": moving}
+        )
+        return parts + self._element_energies("armature", "rotor", 0)
+
+    @cached_property
+    def _potential(self) -> list[Part]:
+        model, state = self.case
+        weight = -model.mass * np.sum(state.r * model.gravity[..., None, :], -1)
+        springs = [
+            Part(f"spring {i + 1}", self._energy_without("spring_stiffness", (i,))[1])
+            for i in range(len(model.spring_body))
+        ]
+        parts = _of_bodies({"the weight of {}": weight}) + self._element_energies("stiffness", "spring", 1)
+        if springs:
+            parts += [
+                *springs,
+                Part("the springs between points", np.sum([s.value for s in springs], axis=0)),
+            ]
+            parts.append(
+                Part(
+                    "all springs",
+                    self._energy_without("spring_stiffness", ())[1]
+                    + self._energy_without("stiffness", ())[1],
+                )
+            )
+        return parts
+
+    def _energy_without(self, name: str, at: tuple[int, ...]) -> tuple[Array, Array]:
+        """How much kinetic and potential energy a number, or a whole field, adds."""
+        model, state = self.case.model.tree, self.case.state
+        values = getattr(model, name).copy()
+        values[(..., *at)] = 0.0
+        count = len(state.p)
+        full, less = (
+            Tree(floats(), one, state).totals()[:2] for one in (model, replace(model, **{name: values}))
+        )
+        kinetic, potential = (
+            np.broadcast_to(x - y, (count, 1, 1))[:, 0, 0] for x, y in zip(full, less, strict=True)
+        )
+        return kinetic, potential
+
+    def _element_energies(self, name: str, word: str, which: int) -> list[Part]:
+        values = getattr(self.case.model, name)[: self.case.model.n]
+        places = [tuple(map(int, at)) for at in np.argwhere(values)] if values.ndim == 2 else []
+        parts = [
+            Part(f"the {word} of joint {k + 1}" + (f" {i + 1}" if np.count_nonzero(values[k]) > 1 else ""),
+                 self._energy_without(name, (k, i))[which])
+            for k, i in places
+        ]  # fmt: skip
+        every = f"that of the {word}s"
+        return [*parts, Part(every, self._energy_without(name, ())[which])] if places else []
+
+    @cached_property
+    def _momentum(self) -> list[Part]:
+        model, state = self.case
+        orbital = cross(state.r, model.mass[..., None] * state.v)
+        spin = np.matvec(self._turns, rotate_vectors(model.inertia, state.omega))
+        return _of_bodies({"{}": orbital + spin, "the spin of {}": spin, "the translation of {}": orbital})
+
+    # -- wrenches of joints ------------------------------------------------------------------------
+
+    @cached_property
+    def _near(self) -> Array:
+        """(S, J, 3) near points, world frame."""
+        body = self.case.model.body[:, 1]
+        arm = np.matvec(self._turns[:, body], self.case.model.proximal)
+        return np.asarray(self.case.state.r[:, body] + arm)
+
+    @cached_property
+    def _projectors(self) -> list[Array | None]:
+        model, state = self.case
+        if not model.has_loops:
+            return [None] * len(state.p)
+        return [
+            determinate_projectors(model, State(**{name: x[s] for name, x in vars(state).items()}))
+            for s in range(len(state.p))
+        ]
+
+    def _wrench(self, what: str, force: Array, moment: Array) -> Part:
+        """A part in the wrenches of joints; in loops what is determinate of it."""
+        length = wrench_length(self.case.model) if self.case.model.has_loops else 1.0
+        for s, projector in enumerate(self._projectors):
+            if projector is not None:
+                both = rotate_vectors(projector, np.concatenate([force[s], moment[s] / length], axis=-1))
+                force[s], moment[s] = both[:, :3], both[:, 3:] * length
+        return Part(what, np.array([force, moment]))
+
+    def _carried(self, what: str, force: Array, moment: Array) -> Part:
+        """What joints carry of forces and moments (S, N, 3) at the centres of mass."""
+        model, state = self.case
+        f, m = (np.zeros(self._near.shape) for _ in range(2))
+        for body in range(model.n):
+            k = body
+            while k >= 0:
+                f[:, k] -= force[:, body]
+                m[:, k] -= moment[:, body] + cross(state.r[:, body] - self._near[:, k], force[:, body])
+                k = int(model.body[k, 0])
+        return self._wrench(what, f, m)
+
+    @cached_property
+    def _wrench_parts(self) -> list[Part]:
+        model, state = self.case
+        shape, none = state.v.shape, np.zeros(state.v.shape)
+        loads = {
+            "weight": (np.broadcast_to(model.mass[..., None] * model.gravity[..., None, :], shape), none),
+            "applied force": (np.broadcast_to(model.force, shape), none),
+            "applied moment": (none, np.matvec(self._turns, np.broadcast_to(model.moment, shape))),
+            "drag force": (-model.drag_force[..., None] * state.v, none),
+            "drag moment": (none, -model.drag_moment[..., None] * np.matvec(self._turns, state.omega)),
+        }
+        parts = list[Part]()
+        for what, (force, moment) in loads.items():
+            bodies = [k for k in range(model.n) if np.any(force[:, k]) or np.any(moment[:, k])]
+            if len(bodies) > 1:
+                parts.append(self._carried(f"the {what}s", force, moment))
+            for k in bodies:
+                only = (np.arange(model.n) == k)[:, None]
+                parts.append(self._carried(f"the {what} of body {k + 1}", force * only, moment * only))
+        parts += self._spring_parts() + self._element_parts() + self._joint_parts()
+        return parts
+
+    def _spring_parts(self) -> list[Part]:
+        model, state = self.case.model.tree, self.case.state
+        parts = list[Part]()
+        count = len(model.spring_body)
+
+        def loads(damping: Array, stiffness: Array) -> tuple[Array, Array]:
+            tree = Tree(floats(), replace(model, spring_damping=damping, spring_stiffness=stiffness), state)
+            return tuple(  # type: ignore[return-value]
+                np.stack([np.broadcast_to(v, (len(state.p), 3, 1))[..., 0] for v in some], 1)
+                for some in zip(*tree.loads(), strict=True)
+            )
+
+        if not count:
+            return parts
+        c, k = model.spring_damping, model.spring_stiffness
+        none = loads(0 * c, 0 * k)
+        chosen = {f"spring {i + 1}": np.arange(count) == i for i in range(count)}
+        if count > 1:
+            chosen["the springs between points"] = np.ones(count, bool)
+        for what, where in chosen.items():
+            force, moment = (x - y for x, y in zip(loads(c * where, k * where), none, strict=True))
+            parts.append(self._carried(what, force, moment))
+            if np.any(c * where) and np.any(k * where):
+                force, moment = (x - y for x, y in zip(loads(c * where, 0 * k), none, strict=True))
+                parts.append(self._carried(f"the damping of {what}", force, moment))
+        return parts
+
+    def _element_parts(self) -> list[Part]:
+        """Parts along the joints' own motions, which their elements have."""
+        model, state = self.case
+        efforts = {"springs": -model.stiffness[: model.n] * (state.x - model.rest[: model.n]),
+                   "dampers": -model.damping[: model.n] * state.xdot,
+                   "efforts": np.broadcast_to(model.effort[: model.n], state.x.shape)}  # fmt: skip
+        values = {name: np.zeros((2, *self._near.shape)) for name in (*efforts, "rotors")}
+        for k, s in np.ndindex(model.n, len(state.p)):
+            far = int(model.body[k, 0])
+            above = self._turns[s, far] if far >= 0 else np.eye(3)
+            for i, (what, axis) in enumerate(JointFrame(model, k, above).axes(state.x[s, k])):
+                row, total = int(what == "turn"), 0.0
+                for name, amounts in efforts.items():
+                    values[name][row, s, k] += amounts[s, k, i] * axis
+                    total += amounts[s, k, i]
+                if np.any(model.armature[k]):
+                    held = self.right[WRENCHES[row]][s, k]
+                    values["rotors"][row, s, k] += (axis @ held - total) * axis
+        parts = list[Part]()
+        everything = np.zeros((2, *self._near.shape))
+        for name, value in values.items():
+            if np.any(value):
+                parts.append(self._wrench(f"those of the {name} of joints", *value))
+                joints = np.flatnonzero(np.any(value, axis=(0, 1, 3)))
+                for k in joints if len(joints) > 1 else []:
+                    only = np.zeros_like(value)
+                    only[:, :, k] = value[:, :, k]
+                    parts.append(self._wrench(f"that of the {name} of joint {k + 1}", *only))
+                if name != "rotors":
+                    everything += value
+        if np.any(everything):
+            parts.append(self._wrench("those of their springs, dampers and efforts", *everything))
+        return parts
+
+    def _joint_parts(self) -> list[Part]:
+        """What closing joints and children have in the wrenches of the joints before."""
+        model, state = self.case
+        right = [self.right.get(name, np.zeros(self._near.shape)) for name in WRENCHES]
+        parts = list[Part]()
+        every = np.zeros((2, *state.v.shape))
+        for k in range(model.n, len(model.kind)):
+            applied = np.zeros((2, *state.v.shape))
+            for body, sign in zip(model.body[k], (-1.0, 1.0), strict=True):
+                if body >= 0:
+                    applied[0, :, body] += sign * right[0][:, k]
+                    lever = self._near[:, k] - state.r[:, body]
+                    applied[1, :, body] += sign * (right[1][:, k] + cross(lever, right[0][:, k]))
+            every += applied
+            parts.append(self._carried(f"that of the closing joint {k + 1}", *applied))
+        if len(parts) > 1:
+            parts.append(self._carried("those of the closing joints", *every))
+        carried = np.zeros((2, *self._near.shape))
+        for k in range(model.n):
+            far = int(model.body[k, 0])
+            if far >= 0:
+                lever = self._near[:, k] - self._near[:, far]
+                carried[0, :, far] += right[0][:, k]
+                carried[1, :, far] += right[1][:, k] + cross(lever, right[0][:, k])
+        if np.any(carried):
+            parts.append(self._wrench("what the bodies beyond apply", *carried))
+        return parts
+
+    @cached_property
+    def _levers(self) -> list[Part]:
+        """Moments that joints' forces have about other points, of all joints or of those of one kind."""
+        model, state = self.case
+        far = model.body[:, 0]
+        hung = np.where((far < 0)[:, None], model.point[:, 0],
+                        state.r[:, far] + np.matvec(self._turns[:, far], model.point[:, 0]))  # fmt: skip
+        carrying = self._near.copy()
+        for k in range(model.n):
+            if model.kinds[k].is_rigid and far[k] >= 0:
+                carrying[:, k] = carrying[:, far[k]]
+        centre = np.sum(model.mass[..., None] * state.r, axis=1) / np.sum(model.mass, axis=-1)[..., None]
+        points = {"the centres of mass": state.r[:, model.body[:, 1]], "the world's origin": 0 * self._near,
+                  "the centre of mass of the whole": np.broadcast_to(centre[:, None], self._near.shape),
+                  "the far points": hung, "the points of the joints that carry welds": carrying}  # fmt: skip
+        parts = list[Part]()
+        for what, point in points.items():
+            lever = cross(self._near - point, self.right["joint_reaction"])
+            for kind in ("joint", *dict.fromkeys(model.kind)):
+                where = np.array([kind in ("joint", own) for own in model.kind])[:, None]
+                moment = self._wrench("", 0 * lever, lever * where).value[1]
+                parts.append(Part(f"the arm of {kind}s to {what}", moment, f"of {kind}s about {what}"))
+        return parts
+
+
+def _share_words(share: float, part: Part) -> tuple[str, tuple[float, ...]]:
+    """Words where a part is counted 1 + share times, and the number; of arms 1 − share."""
+    if part.about:
+        if abs(share - 1) < FACTOR_ROUNDING:
+            return part.about, ()
+        return f"with {part.what} multiplied by", (float(f"{1 - share:.6g}"),)
+    for value, words in SHARES.items():
+        if abs(share - value) < FACTOR_ROUNDING:
+            return words.format(part.what), ()
+    return f"with {part.what} multiplied by", (float(f"{1 + share:.6g}"),)
+
+
+def _of_bodies(values: dict[str, Array]) -> list[Part]:
+    """Parts (S, N[, 3]) of each body, and of all."""
+    parts = list[Part]()
+    for words, x in values.items():
+        if words != "{}":
+            parts.append(Part(words.format("all bodies"), np.sum(x, axis=1)))
+        if x.shape[1] > 1:
+            parts += [Part(words.format(f"body {k + 1}"), x[:, k]) for k in range(x.shape[1])]
+    return parts
+
+
+def _thing(quantity: str) -> str:
+    return "joint" if quantity in WRENCHES else "body"
+
+
+def _words(quantity: str) -> str:
+    return quantity.replace("_", " ")
+
+
+def _per_entry(bound: Array, values: Array) -> Array:
+    """Positive bounds (S,) or (S, N) that broadcast against values; of a bound of 0 nothing counts."""
+    bound = np.where(bound > 0, bound, np.inf)
+    return bound[..., None] if values.ndim > bound.ndim else bound

@@ -1,0 +1,269 @@
+"""What an engine with a mistake would return: many mistakes and states in one batch, in doubles.
+
+In joint coordinates a mechanism with loops is a tree whose ends are held together, at the coordinates of the
+state; an engine in maximal coordinates evaluates the bodies where they are, loops closed or not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from plumbline.equations.arithmetic import floats
+from plumbline.equations.responses import EndRows, Responses
+from plumbline.equations.tree import Tree
+from plumbline.model.datatypes import (
+    BODY_FIELDS,
+    JOINT_ELEMENTS,
+    JOINT_FIELDS,
+    SPRING_FIELDS,
+    Array,
+    Model,
+    State,
+)
+from plumbline.model.invariants import kinetic_energy, potential_energy
+from plumbline.model.kinematics import (
+    angular_velocity,
+    complete_state,
+    coordinates_of_joints,
+    elastic_energy,
+    joint_coordinates,
+    kinetic_energy_of_rotors,
+    quaternion_rate,
+    rotate_vectors,
+    rotation_matrix,
+    stack_states,
+)
+from plumbline.model.loops import cut_open, determinate_projectors, wrench_length
+from reference_impl.direct import DirectSystem
+from reference_impl.joints import constraint_rows
+from reference_impl.singular_system import SingularSystem
+
+VECTORS = ("acceleration", "angular_acceleration", "joint_reaction", "joint_moment")
+WRENCHES = VECTORS[2:]
+SUMS = ("kinetic_energy", "potential_energy", "angular_momentum")
+QUANTITIES = (*VECTORS, *SUMS)
+# axes of a field behind that of its places
+TRAILING = (
+    dict.fromkeys(("mass", "length", "drag_force", "drag_moment", *SPRING_FIELDS[2:]), 0)
+    | dict.fromkeys(("force", "moment", "p", "omega", "u", "udot", "x", "xdot", "r", "v", *JOINT_ELEMENTS), 1)
+    | dict.fromkeys(("inertia", "point", "turn", "spring_point"), 2)
+)
+CONSTANT_FIELDS = ("kind", "body", "spring_body")
+MAX_BATCH_BODIES = 12_000  # of one batch
+Answers = dict[str, Array]  # by quantity (S, N, 3), (S, 3) or (S,), or with an axis of lanes before
+
+
+class Case(NamedTuple):
+    """What an engine evaluates in place of S states: fields of the model may be others at each state."""
+
+    model: Model
+    state: State  # arrays (S, ...)
+
+
+@dataclass(frozen=True)
+class View:
+    """How an engine takes a state, and which quantities are explained."""
+
+    quantities: tuple[str, ...] = QUANTITIES
+    are_bodies_kept: bool = False  # where the states have them, not where coordinates put them
+    end_rows: EndRows = "accelerations"  # of loops that are not closed there
+
+
+class Predictor:
+    """Predicts quantities at S states of a mechanism."""
+
+    def __init__(self, model: Model, states: Sequence[State], view: View) -> None:
+        """Prepare for the states."""
+        self.case, self.view, self.count = Case(model, stack_states(states)), view, len(states)
+        self.states = states
+        if model.has_loops:
+            self.projectors = [determinate_projectors(model, state) for state in states]
+
+    @cached_property
+    def right(self) -> Answers:
+        """The quantities without a mistake."""
+        return {name: x[0] for name, x in self._evaluate([self.case]).items()}
+
+    def predict(self, cases: Sequence[Case]) -> Answers:
+        """Predict quantities of many cases.
+
+        Returns:
+            By name (lanes, S, ...); not numbers where a case is no mechanism.
+
+        """
+        size = max(1, MAX_BATCH_BODIES // (self.count * self.case.model.n))
+        parts = [self._evaluate(cases[i : i + size]) for i in range(0, len(cases), size)]
+        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+    def _evaluate(self, cases: Sequence[Case]) -> Answers:
+        try:
+            with np.errstate(all="ignore"):
+                if self.view.are_bodies_kept:
+                    found = self.of_bodies([one for case in cases for one in self.each_state(case)])
+                else:
+                    found = self._of_cuts(cases) if self.case.model.has_loops else self._of_trees(cases)
+                return {name: x.reshape(len(cases), self.count, *x.shape[1:]) for name, x in found.items()}
+        except (np.linalg.LinAlgError, SingularSystem, ValueError, ZeroDivisionError):
+            if len(cases) == 1:
+                return {name: np.full((1, *x.shape), np.nan) for name, x in self.right.items()}
+            half = len(cases) // 2  # the others of the batch may be mechanisms
+            first, second = self._evaluate(cases[:half]), self._evaluate(cases[half:])
+            return {name: np.concatenate([x, second[name]]) for name, x in first.items()}
+
+    def _of_trees(self, cases: Sequence[Case]) -> Answers:
+        model, state = self._stacked(cases)
+        tree = Tree(floats(), model, state)
+        found = tree.quantities(tree.solve())
+        lead, answers = (len(state.p),), dict[str, Any]()
+        for name, x in found.items():
+            if isinstance(x, list):
+                x = np.stack([np.broadcast_to(one, (*lead, 3, 1))[..., 0] for one in x], axis=1)
+            else:
+                x = np.broadcast_to(x, (*lead, *x.shape[-2:]))[..., 0]
+                x = x[..., 0] if x.shape[-1] == 1 else x
+            answers[name] = x
+        return answers
+
+    def _stacked(self, cases: Sequence[Case]) -> tuple[Model, State]:
+        """One model and state of arrays (lanes times S, ...); what is the same in all has no such axis."""
+        like, changes = self.case.model, dict[str, Any]()
+        for name, value in vars(like).items():
+            given = [getattr(case.model, name) for case in cases]
+            if name not in CONSTANT_FIELDS and any(one is not value for one in given):
+                changes[name] = np.concatenate(
+                    [np.broadcast_to(x, (self.count, *value.shape)) for x in given]
+                )
+        state = State(
+            **{
+                name: np.concatenate([getattr(case.state, name) for case in cases])
+                for name in vars(self.case.state)
+            }
+        )
+        return replace(like, **changes), state
+
+    def each_state(self, case: Case) -> Iterator[tuple[Model, State]]:
+        """Split a case into the models and states that it is made of."""
+        like = self.case.model
+        for s in range(self.count):
+            changes = {
+                name: getattr(case.model, name)[s]
+                for name, value in vars(like).items()
+                if name not in CONSTANT_FIELDS and getattr(case.model, name).ndim > value.ndim
+            }
+            model = replace(case.model, **changes) if changes else case.model
+            yield model, State(**{name: x[s] for name, x in vars(case.state).items()})
+
+    def cut(self, model: Model, state: State) -> tuple[Model, State]:
+        """Cut loops open: model and state (B, ...), of which fields of the model may lack the axis.
+
+        Args:
+            model: the mechanism, perhaps with other numbers.
+            state: of which the minimal coordinates are used.
+
+        """
+        cut, n = cut_open(self.case.model), model.n
+        near, order = model.body[:, 1], np.argsort(cut.place)
+        is_body = order < n
+        share = cut.model.mass / self.case.model.mass[near[order]]
+        fields = dict[str, Any]()
+        for name, value in vars(model).items():
+            if name in ("mass", "inertia"):
+                x = np.take(value, near[order], value.ndim - 1 - TRAILING[name])
+                fields[name] = x * share.reshape(-1, *(1,) * TRAILING[name])
+            elif name in BODY_FIELDS:
+                x = np.take(value, near[order], value.ndim - 1 - TRAILING[name])
+                fields[name] = x * is_body.reshape(-1, *(1,) * TRAILING[name])
+            elif name in JOINT_FIELDS[2:]:
+                fields[name] = np.take(value, order, value.ndim - 1 - TRAILING[name])
+            elif name not in CONSTANT_FIELDS:
+                fields[name] = value
+        tree: dict[str, Any] = {
+            name: np.take(getattr(model, name), np.arange(n), getattr(model, name).ndim - 1 - TRAILING[name])
+            for name in JOINT_FIELDS[2:]
+        }
+        like = self.case.model.tree
+        there = complete_state(replace(like, **tree), state)
+        closing = coordinates_of_joints(model, there, range(n, len(model.kind)))
+        coordinates = {
+            name: np.concatenate([getattr(there, name), x], axis=-2)[..., order, :]
+            for name, x in zip(("u", "udot", "x", "xdot"), closing, strict=True)
+        }
+        bodies = {name: getattr(there, name)[..., near[order], :] for name in ("p", "omega", "r", "v")}
+        tree_model = replace(cut.model, **fields)
+        return tree_model, complete_state(tree_model, State(**bodies, **coordinates))
+
+    def _of_cuts(self, cases: Sequence[Case]) -> Answers:
+        """Quantities in joint coordinates, of loops cut open."""
+        model, state = self.cut(*self._stacked(cases))
+        cut = cut_open(self.case.model)
+        found = Responses(model, state, cut.ends, cut.row_scale, self.view.end_rows)
+        return self.of_cut(found, [self.projectors[i % self.count] for i in range(len(state.p))])
+
+    def of_cut(self, found: Responses, projectors: Sequence[Array | None]) -> Answers:
+        """Read the mechanism's quantities from the tree that it is cut open to."""
+        cut = cut_open(self.case.model)
+        bodies = cut.place[: self.case.model.n]
+        answers = dict(zip(VECTORS, np.moveaxis(found.solution, 2, 0), strict=True))
+        turns = np.stack([np.broadcast_to(A, (len(projectors), 3, 3)) for A in found.tree.A], 1)
+        answers["angular_acceleration"] = np.matvec(turns.mT, answers["angular_acceleration"])
+        for name in VECTORS:
+            answers[name] = answers[name][:, cut.place if name in WRENCHES else bodies]
+        return self.determinate(answers, projectors) | sums_of(found.tree)
+
+    def determinate(self, answers: Answers, projectors: Sequence[Array | None]) -> Answers:
+        """Keep of the joints' wrenches what rows that depend on others leave determinate."""
+        if all(one is None for one in projectors):
+            return answers
+        length = wrench_length(self.case.model)
+        wrench = np.concatenate([answers["joint_reaction"], answers["joint_moment"] / length], axis=-1)
+        for i, projector in enumerate(projectors):
+            if projector is not None:
+                wrench[i] = rotate_vectors(projector, wrench[i])
+        return answers | {"joint_reaction": wrench[..., :3], "joint_moment": wrench[..., 3:] * length}
+
+    def of_bodies(self, seen: Sequence[tuple[Model, State]], missing_gamma: int | None = None) -> Answers:
+        """Predict quantities of bodies where they are, in maximal coordinates; (lanes times S, ...)."""
+        each = [maximal_quantities(*one, missing_gamma) for one in seen]
+        answers = {name: np.stack([one[name] for one in each]) for name in QUANTITIES}
+        return self.determinate(answers, [self.projectors[i % self.count] for i in range(len(each))])
+
+
+def maximal_quantities(model: Model, state: State, missing_gamma: int | None) -> Answers:
+    """Evaluate quantities in maximal coordinates, by the notes' rows.
+
+    Args:
+        missing_gamma: a joint whose rows have no γ.
+
+    """
+    at = state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
+    system, rows = DirectSystem(model), constraint_rows(model, *at)
+    change = np.zeros(len(system.joint))
+    change[: len(rows.gamma)] = np.where(rows.joint == missing_gamma, -rows.gamma, 0.0)
+    found = system.solve(*at, change, joint_coordinates(model, state)[2])
+    assert found.joint_moment is not None
+    a = rotation_matrix(state.p)
+    spin = rotate_vectors(a, rotate_vectors(model.inertia, state.omega))
+    momentum = np.sum(np.cross(state.r, model.mass[:, None] * state.v) + spin, axis=0)
+    return {
+        "acceleration": found.acceleration,
+        "angular_acceleration": angular_velocity(state.p, found.pddot),
+        "joint_reaction": found.joint_reaction,
+        "joint_moment": found.joint_moment,
+        "kinetic_energy": np.asarray(
+            kinetic_energy(model, state.v, state.omega) + kinetic_energy_of_rotors(model, state)
+        ),
+        "potential_energy": np.asarray(potential_energy(model, state.r) + elastic_energy(model, state)),
+        "angular_momentum": momentum,
+    }
+
+
+def sums_of(tree: Tree) -> Answers:
+    """Return energies (S,) and angular momentum (S, 3) of a tree in doubles."""
+    count = len(tree.state.p)
+    kinetic, potential, momentum = (np.broadcast_to(x, (count, *x.shape[-2:])) for x in tree.totals())
+    return dict(zip(SUMS, (kinetic[:, 0, 0], potential[:, 0, 0], momentum[..., 0]), strict=True))

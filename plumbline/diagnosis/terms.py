@@ -1,0 +1,263 @@
+"""Terms of the equations whose effect is linear: velocity terms, rows of joints, loops, unknown forces.
+
+Their effects follow from the responses of the right mechanism to unit wrenches and unit accelerations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plumbline.diagnosis.cause import Cause
+from plumbline.diagnosis.edits import Edit, at_place, coordinate_place, with_fields
+from plumbline.diagnosis.prediction import VECTORS, WRENCHES, Answers, Case, Predictor
+from plumbline.equations.responses import Responses
+from plumbline.model.datatypes import Array, Model
+from plumbline.model.kinematics import (
+    cross,
+    quaternion_exponential,
+    quaternion_product,
+    rotation_matrix,
+)
+from plumbline.model.loops import cut_open
+
+NOT_HELD = 1e-9  # of a direction: what the joint holds of it
+MAX_CONDITION = 1e14  # of the inertia that released directions have
+RANK_TOLERANCE = 1e-9  # of effects: a force that changes nothing
+Effect = Callable[[Answers], Array]
+
+
+class Terms:
+    """Effects of terms at the states of a predictor."""
+
+    def __init__(self, predictor: Predictor) -> None:
+        """Solve the right mechanism and its responses."""
+        self.predictor, self.model = predictor, predictor.case.model
+        self.joints = np.arange(len(self.model.kind))  # where joint k is in the tree
+        self.tree, self.state = predictor.case
+        self.ends: tuple[tuple[int, int], ...] = ()
+        self.scale: Array | None = None
+        if self.model.has_loops:
+            cut = cut_open(self.model)
+            self.joints, self.ends, self.scale = cut.place, cut.ends, cut.row_scale
+            self.tree, self.state = predictor.cut(*predictor.case)
+        self.found = self._solved(self.ends, "accelerations")
+        self._responses = self.found.to_joints()  # (S, N, 4, 3, c)
+        first = np.cumsum([0, *(held.shape[-1] for held in self.found.held)])
+        self._columns = [slice(first[k], first[k + 1]) for k in range(len(first) - 1)]
+
+    def _solved(self, ends: Sequence[tuple[int, int]], end_rows: str) -> Responses:
+        scale = None if self.scale is None else self.scale[: 6 * len(ends)]
+        return Responses(self.tree, self.state, ends, scale, end_rows)  # type: ignore[arg-type]
+
+    def answers(self, change: Array) -> Answers:
+        """Turn changes (S, N, 4, 3) of the solution into those of the mechanism's vectors."""
+        bodies = self.joints[: self.model.n]
+        found = dict(zip(VECTORS, np.moveaxis(change, 2, 0), strict=True))
+        turns = np.stack([np.broadcast_to(A, (len(change), 3, 3)) for A in self.found.tree.A], 1)
+        found["angular_acceleration"] = np.matvec(turns.mT, found["angular_acceleration"])
+        found = {name: x[:, self.joints if name in WRENCHES else bodies] for name, x in found.items()}
+        if not self.model.has_loops:
+            return found
+        return self.predictor.determinate(found, self.predictor.projectors)
+
+    def linear(self) -> Iterator[tuple[Cause, Answers]]:
+        """List velocity terms, with the effect of one more of each."""
+        own = self.found.velocity_terms()  # (S, N, 6)
+        near, far = np.zeros_like(own), np.zeros_like(own)
+        omega, arm, far_arm = self.found.omega, self.found.arm, self.found.far_arm
+        near[..., :3] = -cross(omega, cross(omega, arm))
+        for k, body in enumerate(self.found.far):
+            if body >= 0:
+                w = omega[:, body]
+                far[:, k, :3] = cross(w, cross(w, far_arm[:, k]))
+        parts = {
+            "velocity term": own,
+            "velocity term of the near body": near,
+            "velocity term of the far body": far,
+            "velocity term of the joint's own motion": own - near - far,
+        }
+        for term, part in parts.items():
+            effects = {}
+            for k in range(len(self.model.kind)):
+                at = self.joints[k]
+                along = np.matvec(self.found.held[at].mT, part[:, at])
+                if np.max(np.abs(along), initial=0.0) > NOT_HELD * max(float(np.max(np.abs(own))), 1e-300):
+                    effects[k] = np.matvec(self._responses[..., self._columns[at]], along[:, None, None])
+            for k, effect in effects.items():
+                yield Cause("term", term, f"joint {k + 1}", nominal=(1.0,), unit="×"), self.answers(effect)
+            if len(effects) > 1:
+                every = np.sum(list(effects.values()), axis=0)
+                yield Cause("term", term, "all joints", nominal=(1.0,), unit="×"), self.answers(every)
+
+    def fixed(self) -> Iterator[tuple[Cause, Answers]]:
+        """List rows, joints and loops that may be left out, with the effect."""
+        for k, kind in enumerate(self.model.kinds):
+            if kind.holds_nothing:
+                continue
+            for term, directions in self._rows(k):
+                change = self._released(int(self.joints[k]), directions)
+                if change is not None:
+                    yield Cause("term", term, f"joint {k + 1}", "left out"), self.answers(change)
+        for loop in range(len(self.ends)):
+            ends = [pair for i, pair in enumerate(self.ends) if i != loop]
+            change = self._solved(ends, "accelerations").solution - self.found.solution
+            place = f"joint {self.model.n + loop + 1}"
+            yield Cause("term", "loop", place, "left open"), self.answers(change)
+        if self.ends:
+            change = self._solved(self.ends, "without velocity terms").solution - self.found.solution
+            yield (
+                Cause("term", "velocity terms", "the rows that close loops", "missing"),
+                self.answers(change),
+            )
+
+    def _rows(self, k: int) -> Iterator[tuple[str, Array]]:
+        """Rows of the table of kinds: of points along axes of several frames, of attitudes about u × w."""
+        model, S = self.model, self.predictor.count
+        far, near = model.body[k]
+        turns = rotation_matrix(self.predictor.case.state.p)
+        above = turns[:, far] if far >= 0 else np.broadcast_to(np.eye(3), (S, 3, 3))
+        joint = rotation_matrix(model.turn[k])
+        frames = {
+            "ijk": np.broadcast_to(np.eye(3), (S, 3, 3)),
+            "xyz": above @ joint[0],
+            "XYZ": turns[:, near] @ joint[1],
+        }
+        axes = {name: frame[..., i] for names, frame in frames.items() for i, name in enumerate(names)}
+        yield "rows", np.broadcast_to(np.eye(6), (S, 6, 6))
+        for u, w in model.kinds[k].rows:
+            if u == "d":
+                continue
+            if w == "d":
+                names = ("xyz"["ijk".index(u)], u, "XYZ"["ijk".index(u)]) if u in "ijk" else (u,)
+                for name in names:
+                    yield f"row along {name}", np.concatenate([axes[name], 0 * axes[name]], -1)[..., None]
+            else:
+                about = np.cross(axes[u], axes[w])
+                yield f"row along {u} × {w}", np.concatenate([0 * about, about], -1)[..., None]
+
+    def _released(self, joint: int, directions: Array) -> Array | None:
+        """Let a joint move in directions (S, 6, m): by as much as makes its wrench there 0."""
+        solution = self.found.solution.copy()
+        for s, own in enumerate(self.found.held[joint]):
+            lost, sizes, _ = np.linalg.svd(own.T @ directions[s])
+            free = lost[:, : int(np.sum(sizes > NOT_HELD))]
+            if not free.shape[1]:
+                return None
+            along = np.zeros((self._responses.shape[-1], free.shape[1]))
+            along[self._columns[joint]] = free
+            wrench = np.zeros((free.shape[1], 6 * self.tree.n))
+            wrench[:, 6 * joint : 6 * joint + 6] = (own @ free).T
+            indeterminate = self.found.indeterminate[s]
+            left = wrench @ indeterminate  # released where others hold as well, a joint does not move
+            _, sizes, rows = np.linalg.svd(left.T)
+            moving = rows[int(np.sum(sizes > NOT_HELD)) :].T
+            responses = self._responses[s]
+            of_joints = responses[:, 2:].reshape(6 * self.tree.n, -1) @ along
+            inertia = moving.T @ wrench @ of_joints @ moving
+            if inertia.size and (not np.all(np.isfinite(inertia)) or np.linalg.cond(inertia) > MAX_CONDITION):
+                return None  # a body can turn without inertia
+            amounts = np.linalg.solve(inertia, -moving.T @ (wrench @ solution[s, :, 2:].ravel()))
+            solution[s] += responses @ (along @ moving @ amounts)
+            balance = np.linalg.lstsq(left, -(wrench @ solution[s, :, 2:].ravel()), NOT_HELD)[0]
+            solution[s, :, 2:] += (indeterminate @ balance).reshape(-1, 2, 3)
+        return np.asarray(solution - self.found.solution)
+
+    def unit_velocity_terms(self, k: int) -> list[Answers]:
+        """Return the effects of unit accelerations that velocities might cause at a joint."""
+        at = self._columns[self.joints[k]]
+        return [self.answers(self._responses[..., i]) for i in range(at.start, at.stop)]
+
+
+# -- unknown forces ------------------------------------------------------------------------------------
+
+
+def force_places(model: Model) -> Iterator[list[tuple[Cause, list[Edit]]]]:
+    """List the places of forces by the number of amounts that are unknown at a state.
+
+    Args:
+        model: a tree.
+
+    Yields:
+        Causes, each with edits by a unit of its forces: of one amount, of all springs together, of two
+        amounts, of three and of six.
+
+    """
+
+    def unit(name: str, at: tuple[int, ...]) -> Edit:
+        value = float(getattr(model, name)[at])
+        return Edit(Cause("number", name), lambda case, _: at_place(name, at)(case, np.array([value + 1.0])))
+
+    def another(term: str, place: str) -> Cause:
+        return Cause("term", term, place, "another at each state")
+
+    single, joints, balls = (
+        list[tuple[Cause, list[Edit]]](),
+        list[tuple[Cause, list[Edit]]](),
+        list[tuple[Cause, list[Edit]]](),
+    )
+    for k, kind in enumerate(model.kinds):
+        for i, (what, _) in enumerate(kind.motions):
+            term = "force" if what == "slide" else "torque"
+            single.append((another(term, coordinate_place(model, k, i)), [unit("effort", (k, i))]))
+        if kind.is_spherical:
+            balls.append((another("moment", f"joint {k + 1}"), _moments_in_ball(model, k)))
+        if len(kind.motions) > 1:
+            efforts = [edit for _, (edit,) in single[-len(kind.motions) :]]
+            joints.append((another("efforts", f"joint {k + 1}"), efforts))
+    springs = [unit("spring_stiffness", (i,)) for i in range(len(model.spring_body))]
+    single += [(another("force", f"spring {i + 1}"), [one]) for i, one in enumerate(springs)]
+    yield single
+    if len(springs) > 1:
+        yield [(another("forces", "the springs between points"), springs)]
+    yield joints
+    loads = {
+        name: [[unit(name, (k, i)) for i in range(3)] for k in range(model.n)] for name in ("force", "moment")
+    }
+    on_bodies = [(another(name, f"body {k + 1}"), loads[name][k]) for name in loads for k in range(model.n)]
+    if model.n == 1:  # a force and a moment on the only body explain any accelerations and wrenches
+        if balls:
+            yield on_bodies[1:] + balls
+        return
+    yield on_bodies + balls
+    if 1 < len(balls) < model.n:  # moments in all joints are moments on all bodies
+        yield [(another("moments", "the ball joints"), [one for _, some in balls for one in some])]
+    both = [loads["force"][k] + loads["moment"][k] for k in range(model.n)]
+    yield [(another("force and moment", f"body {k + 1}"), some) for k, some in enumerate(both)]
+
+
+def _moments_in_ball(model: Model, k: int) -> list[Edit]:
+    """Three other moments between the bodies of a ball joint: of a spring that rests at other attitudes."""
+
+    def turned(axis: Array) -> Callable[[Case, Array], Case]:
+        def change(case: Case, _: Array) -> Case:
+            stiffness, turn = case.model.stiffness.copy(), case.model.turn.copy()
+            stiffness[k, 0] = stiffness[k, 0] or 1.0
+            turn[k, 1] = quaternion_product(turn[k, 1], quaternion_exponential(axis / 2))
+            return with_fields(case, stiffness=stiffness, turn=turn)
+
+        return change
+
+    return [Edit(Cause("number", "moment"), turned(axis)) for axis in np.eye(3)]
+
+
+def is_spanned(basis: Array, wanted: Array, states: NDArray[np.intp], accepted: float) -> bool:
+    """Decide whether some amounts at each state leave nothing of a difference.
+
+    Args:
+        basis: effects (m, amounts), in bounds.
+        wanted: the difference (m,) in bounds.
+        states: (m,) the state of each of its numbers.
+        accepted: what may be left of it, in bounds.
+
+    """
+    for state in np.unique(states):
+        here, there = basis[states == state], wanted[states == state]
+        size = np.max(np.abs(here), axis=0)
+        here = here[:, size > 0] / size[size > 0]
+        amounts = np.linalg.lstsq(here, there, rcond=RANK_TOLERANCE)[0]
+        if np.max(np.abs(there - here @ amounts)) > accepted:
+            return False
+    return True
