@@ -194,7 +194,7 @@ def _bodies(model: Model) -> Iterator[Edit]:
     for k in range(model.n):
         place, mass = f"body {k + 1}", float(model.mass[k])
         yield _number("mass", place, "mass", (k,), mass, mass, UNITS["mass"], can_vanish=False)
-        trace = float(np.trace(model.inertia[k]))
+        trace = float(np.trace(model.inertia[k])) or mass * length**2  # a point mass may be given one
         for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)):
             term, value = f"inertia {'xyz'[i]}{'xyz'[j]}", float(model.inertia[k, i, j])
             yield _number(term, place, "inertia", (k, i, j), value, trace, UNITS["inertia"], i != j)

@@ -647,11 +647,11 @@ def _coordinates(motions: tuple[tuple[str, int], ...], shift: Array, relative: A
     return [shift[..., axis] if what == "slide" else next(found) for what, axis in motions]
 
 
-def stretched_length(model: Model) -> Array:
+def stretched_length(model: Model) -> Float[Array, "bodies"]:
     """Measure how far each body and its rod extend the stretched mechanism.
 
     Returns:
-        (N,) [m] rod length, and the far point's distance from the world's origin where the joint is on the
+        [m] rod length, and the far point's distance from the world's origin where the joint is on the
         world, plus the largest of: distance from the near point to the far points of the joints beyond,
         distance from the near point to the centre of mass, radius of gyration.
 

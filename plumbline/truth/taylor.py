@@ -116,7 +116,10 @@ def _simulate(
     if "time_limit" not in str(outcome):
         raise EngineFailure(f"heyoka stopped: {outcome}")
     y = np.asarray(samples)
-    if y.dtype not in (np.dtype(float), np.dtype(np.longdouble)):
+    is_quad = y.dtype not in (np.dtype(float), np.dtype(np.longdouble))
+    if is_quad and all(kind.has_attitude for kind in model.kinds):
+        y = y.astype(object)  # NumPy multiplies matrices of these numbers as objects only
+    elif is_quad:  # sines of angles are computed in extended precision
         y = np.vectorize(lambda x: np.longdouble(str(x)), otypes=[np.longdouble])(y)
     shape = {"p": 4, "x": model.columns, "xdot": model.columns}
     names = ("p", "omega", "u", "udot", "r", "v", "x", "xdot")
@@ -127,7 +130,10 @@ def _simulate(
             parts[name][:, k, :size] = y[:, at : at + size]
             at += size
     p, omega, r, v = forward_kinematics(model, *parts.values())
-    return MinimalCoordinateRun(times, p, omega, parts["u"], parts["udot"], r, v, int(steps))
+    u, udot = parts["u"], parts["udot"]
+    if y.dtype == object:
+        p, omega, u, udot, r, v = (np.array(a.tolist(), samples.dtype) for a in (p, omega, u, udot, r, v))
+    return MinimalCoordinateRun(times, p, omega, u, udot, r, v, int(steps))
 
 
 def _closures(cut: CutMechanism, state: State) -> tuple[Closure, ...]:

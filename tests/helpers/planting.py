@@ -22,7 +22,7 @@ from plumbline.diagnosis.diagnose import diagnose
 from plumbline.engines.adapter import Adapter
 from plumbline.engines.engine_calls import Evaluation
 from plumbline.engines.registry import load_adapter
-from plumbline.judging.rows import RowContext
+from plumbline.judging.rows import RowContext, Verdict
 from plumbline.judging.state_level import judge_states
 from plumbline.judging.trajectory_level import judge_trajectory
 from plumbline.measurements.order_and_limit import refinement_resolutions
@@ -203,8 +203,8 @@ def motion_subject(mechanism: str, loaded: bool = False) -> tuple[Model, State, 
 
 
 @cache
-def motion_report(defect: Defect) -> list[str]:
-    """Rows about motion that do not agree; an unresolved cell that no file excuses fails a run, too."""
+def motion_report(defect: Defect) -> frozenset[tuple[Verdict, str]]:
+    """Verdicts and quantities about motion that need attention; unresolved cells fail a run, too."""
     model, state, truth = motion_subject(defect.mechanism, defect.loaded)
     with planted(defect) as engine, patch("plumbline.engines.engine_calls.load_adapter", lambda _: engine):
         integrator = engine.integrator(defect.integrator)
@@ -212,7 +212,7 @@ def motion_report(defect: Defect) -> list[str]:
         runs = run_refinement_study(defect.engine, integrator.name, model, state, truth.trajectory.t, steps)
     context = RowContext("planted", "planted", defect.name, defect.name, "0")
     rows = judge_trajectory(context, model, truth, integrator, runs).rows
-    return [f"{row.verdict}: {row.quantity}: {row.reason}" for row in rows if row.verdict.needs_attention]
+    return frozenset((row.verdict, row.quantity) for row in rows if row.verdict.needs_attention)
 
 
 # --- ways to alter what the engine is given -----------------------------------------------------------

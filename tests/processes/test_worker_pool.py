@@ -300,7 +300,7 @@ def test_processes_that_an_engine_starts_end_with_the_pool(tmp_path):
     script.write_text(
         "import sys\n"
         f"sys.path[:0] = {[str(ROOT), str(Path(__file__).parent)]!r}\n"
-        "from test_workers import leave_processes, leave_processes_and_hang, wait_until_ended\n"
+        "from test_worker_pool import leave_processes, leave_processes_and_hang, wait_until_ended\n"
         "from plumbline.processes.worker_pool import Limits, Task, WorkerPool\n"
         "if __name__ == '__main__':\n"
         "    limits, path = Limits(seconds=4), sys.argv[1]\n"
@@ -322,7 +322,7 @@ def test_processes_that_an_engine_starts_end_with_a_killed_run(tmp_path):
     script.write_text(
         "import sys\n"
         f"sys.path[:0] = {[str(ROOT), str(Path(__file__).parent)]!r}\n"
-        "from test_workers import hang, leave_processes\n"
+        "from test_worker_pool import hang, leave_processes\n"
         "from plumbline.processes.worker_pool import Task, WorkerPool\n"
         "if __name__ == '__main__':\n"
         "    with WorkerPool(1) as workers:\n"
@@ -461,7 +461,7 @@ def test_no_orphan_is_left_when_the_parent_is_killed(tmp_path):
     script.write_text(
         "import sys\n"
         f"sys.path[:0] = {[str(Path(__file__).resolve().parents[2]), str(Path(__file__).parent)]!r}\n"
-        "from test_workers import hang, process_id\n"
+        "from test_worker_pool import hang, process_id\n"
         "from plumbline.processes.worker_pool import Task, WorkerPool\n"
         "if __name__ == '__main__':\n"
         "    with WorkerPool(1) as workers:\n"
@@ -486,7 +486,7 @@ def test_a_run_that_is_stopped_and_continued_loses_no_task(tmp_path):
     script.write_text(
         "import sys\n"
         f"sys.path[:0] = {[str(ROOT), str(Path(__file__).parent)]!r}\n"
-        "from test_workers import hang, process_id, sleep_for\n"
+        "from test_worker_pool import hang, process_id, sleep_for\n"
         "from plumbline.processes.worker_pool import Limits, Task, WorkerPool\n"
         "if __name__ == '__main__':\n"
         "    limits = Limits(seconds=5)\n"
