@@ -112,7 +112,7 @@ class Unloadable:
 
 
 def write_into_every_descriptor():
-    for descriptor in range(3, 64):
+    for descriptor in range(3, 4096):  # whichever it is that the answer goes through
         with contextlib.suppress(OSError):
             os.write(descriptor, b"noise")
     time.sleep(600)
