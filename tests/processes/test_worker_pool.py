@@ -178,7 +178,7 @@ FAULTS = [
 
 
 def test_faults_are_reported_at_once_and_change_no_other_task(tmp_path):
-    """In a process of its own: another test may have ended the warm process, which reports exit codes."""
+    """In a process of its own: late in the whole suite a worker did not answer; the reason is not known."""
     script = tmp_path / "parent.py"
     script.write_text(
         "import json, sys\n"
