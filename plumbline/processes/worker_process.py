@@ -326,7 +326,11 @@ def initialize_worker(scratch: str, gigabytes: float, parent: int, environment: 
         sink = os.open(os.devnull, mode)
         os.dup2(sink, descriptor)
         os.close(sink)
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # the warm process handles it
+    for name in ("SIGINT", "SIGQUIT", "SIGHUP", "SIGTERM"):  # Windows has two of them
+        # Background jobs ignore the first two, those of nohup the third; the warm process handles the last.
+        usual = signal.default_int_handler if name == "SIGINT" else signal.SIG_DFL
+        if number := getattr(signal, name, None):
+            signal.signal(number, usual)
     if hasattr(os, "setsid"):
         os.setsid()  # Ctrl-C and what an engine sends to its process group stay apart
     die_with_parent(parent)

@@ -178,15 +178,16 @@ FAULTS = [
 
 
 def test_faults_are_reported_at_once_and_change_no_other_task(tmp_path):
-    """In a process of its own: late in the whole suite a worker did not answer; the reason is not known."""
+    """Also where the command ignores SIGINT, as a job in the background does: no worker inherits that."""
     script = tmp_path / "parent.py"
     script.write_text(
-        "import json, sys\n"
+        "import json, signal, sys\n"
         f"sys.path[:0] = {[str(ROOT), str(Path(__file__).parent)]!r}\n"
         "from test_worker_pool import FAULTS, double\n"
         "from plumbline.processes.worker_pool import Limits, Task, WorkerPool\n"
         "if __name__ == '__main__':\n"
-        "    limits = Limits(seconds=600, gigabytes=4)\n"
+        "    signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
+        "    limits = Limits(seconds=100, gigabytes=4)\n"
         "    tasks = [Task(fault.__name__, fault, (), limits, engine='faulty') for fault, _ in FAULTS]\n"
         "    tasks += [Task(str(i), double, (i,), limits) for i in range(len(FAULTS))]\n"
         "    with WorkerPool(2, limits) as workers:\n"
