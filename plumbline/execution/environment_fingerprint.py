@@ -27,6 +27,7 @@ from plumbline.processes.worker_environment import hashed_environment
 _OWN_FOLDERS = (
     [ROOT] if IS_INSTALLED else [ROOT / name for name in ("plumbline", "adapters", "reference_impl")]
 )
+_HASHED_BY_CONTENT = frozenset(map(str, _OWN_FOLDERS))
 # Tasks call functions of the packages below these; tests/architecture checks that those import none of them.
 _UNHASHED_PACKAGES = ("cli", "execution", "storage", "studies", "judging/known_issues.yaml",
                       "reports", "scenarios", "bench")  # fmt: skip
@@ -102,9 +103,7 @@ def installed_files(folders: Iterable[Path]) -> set[_FileIdentity]:
                 continue
             seen.add((about.st_dev, about.st_ino))
             with os.scandir(folder) as entries:
-                for entry in entries:
-                    if not _may_be_read(folder, entry):
-                        continue
+                for entry in _readable(folder, entries):
                     if entry.is_dir():  # a link comes last, so that files have the same paths each time
                         waiting.insert(0 if entry.is_symlink() else len(waiting), entry.path)
                     else:
@@ -115,15 +114,21 @@ def installed_files(folders: Iterable[Path]) -> set[_FileIdentity]:
     return found
 
 
-def _may_be_read(folder: str, entry: os.DirEntry[str]) -> bool:
-    """Whether tasks may read a file or what is in a folder; this checkout has results besides its modules."""
-    if Path(entry.path) in _OWN_FOLDERS:  # hashed by content
+def _readable(folder: str, entries: Iterable[os.DirEntry[str]]) -> Iterator[os.DirEntry[str]]:
+    """The entries that tasks may read, of thirty thousand; this checkout has results besides its modules."""
+    is_checkout = folder == str(ROOT)
+    for entry in entries:
+        if entry.name in _UNREAD_FOLDERS or entry.name.endswith(_SOURCES_OF_COMPILERS):
+            continue
+        if entry.path in _HASHED_BY_CONTENT or (is_checkout and not _is_imported_from_checkout(entry)):
+            continue
+        yield entry
+
+
+def _is_imported_from_checkout(entry: os.DirEntry[str]) -> bool:
+    if entry.name in _UNIMPORTED_FOLDERS:
         return False
-    if folder == str(ROOT):
-        if entry.name in _UNIMPORTED_FOLDERS:
-            return False
-        return Path(entry, "__init__.py").exists() or entry.name.endswith(tuple(all_suffixes()))
-    return entry.name not in _UNREAD_FOLDERS and not entry.name.endswith(_SOURCES_OF_COMPILERS)
+    return Path(entry, "__init__.py").exists() or entry.name.endswith(tuple(all_suffixes()))
 
 
 def _linked_folders(path: Path) -> list[str]:

@@ -3,6 +3,9 @@
 A record is built of dataclasses, lists, tuples, dictionaries, enumerations, texts, numbers, bytes and arrays.
 Its bytes are the size of a JSON text, the text, and the contents of the arrays that the text refers to.  The
 reader is given the record's type as an annotation and refuses what does not fit.
+
+An answer is a list of records, one for each state, whose arrays are small and alike: a list of equal arrays
+is one array, and a list of records of one class has a list for each field.
 """
 
 from __future__ import annotations
@@ -84,7 +87,7 @@ def decode_record(data: bytes, hint: Any) -> Any:
         TypeError,
         LookupError,
         AttributeError,
-        OverflowError,
+        ArithmeticError,
         RecursionError,
         struct.error,
     ) as error:
@@ -106,11 +109,37 @@ def _plain(value: Any, contents: bytearray) -> Any:
             return _plain(value.item(), contents)
         case Mapping():
             return [[_plain(key, contents), _plain(item, contents)] for key, item in value.items()]
+        case list() if len(value) > 1 and _are_alike_arrays(value):
+            return {"arrays": _plain(np.stack(value), contents)["array"]}
+        case list() if len(value) > 1 and _are_alike_records(value):
+            columns = zip(*map(_values, value), strict=True)
+            return {"records": [type(value[0]).__name__, *(_plain(list(c), contents) for c in columns)]}
         case list() | tuple():
             return [_plain(item, contents) for item in value]
         case _ if is_dataclass(value) and not isinstance(value, type):
-            return [type(value).__name__, *(_plain(getattr(value, f.name), contents) for f in fields(value))]
+            return [type(value).__name__, *(_plain(item, contents) for item in _values(value))]
     raise UnfitRecord(f"a {type(value).__name__} has no encoding")
+
+
+def _are_alike_arrays(values: list[Any]) -> bool:
+    first = values[0]
+    return (
+        isinstance(first, np.ndarray)
+        and first.ndim > 0
+        and all(
+            isinstance(item, np.ndarray) and item.dtype == first.dtype and item.shape == first.shape
+            for item in values
+        )
+    )
+
+
+def _are_alike_records(values: list[Any]) -> bool:
+    first = values[0]
+    return is_dataclass(first) and bool(fields(first)) and len(set(map(type, values))) == 1
+
+
+def _values(record: Any) -> list[Any]:
+    return [getattr(record, field.name) for field in fields(record)]
 
 
 def _append(contents: bytearray, content: bytes) -> tuple[int, int]:
@@ -135,8 +164,7 @@ def _decoder(hint: Any) -> _Decoder:
         (scalar,) = get_args(arguments[1])
         return lambda value, contents: _decode_array(value, contents, np.dtype(scalar))
     if origin in (list, Sequence):
-        item = _decoder(arguments[0])
-        return lambda value, contents: [item(one, contents) for one in _sequence(value)]
+        return _list_decoder(arguments[0])
     if origin is tuple:
         return _tuple_decoder(arguments)
     if origin in (dict, Mapping):
@@ -161,6 +189,13 @@ def _require(is_fit: bool, value: Any, hint: Any) -> Any:
 
 
 def _sequence(value: Any) -> list[Any]:
+    """The encoded items of a list, also of one that was encoded as one array or field by field."""
+    match value:
+        case {"arrays": [kind, [number, *shape], begin, size]}:
+            step = size // number
+            return [{"array": [kind, shape, begin + i * step, step]} for i in range(number)]
+        case {"records": [name, *columns]}:
+            return [[name, *values] for values in zip(*map(_sequence, columns), strict=True)]
     found: list[Any] = _require(isinstance(value, list), value, "a list")
     return found
 
@@ -182,10 +217,37 @@ def _union_decoder(options: tuple[Any, ...]) -> _Decoder:
     return decode
 
 
+@cache
+def _list_decoder(hint: Any) -> _Decoder:
+    """Make the function that decodes lists of a type: of arrays and of records all at once where it can."""
+    item = _decoder(hint)
+    options = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
+    arrays = [option for option in options if get_origin(option) is np.ndarray]
+    records: dict[str, Any] = {option.__name__: option for option in options if is_dataclass(option)}
+
+    def decode(value: Any, contents: memoryview) -> Any:
+        match value:
+            case {"arrays": description} if len(arrays) == 1:
+                return list(_decoder(arrays[0])({"array": description}, contents))
+            case {"records": [name, *columns]} if name in records:
+                decoders = _column_decoders(records[name])
+                values = [decode(column, contents) for decode, column in zip(decoders, columns, strict=True)]
+                return [records[name](*each) for each in zip(*values, strict=True)]
+        return [item(one, contents) for one in _sequence(value)]
+
+    return decode
+
+
+@cache
+def _column_decoders(record: Any) -> list[_Decoder]:
+    hints = get_type_hints(record)
+    return [_list_decoder(hints[field.name]) for field in fields(record)]
+
+
 def _tuple_decoder(arguments: tuple[Any, ...]) -> _Decoder:
     if arguments[1:] == (Ellipsis,):
-        item = _decoder(arguments[0])
-        return lambda value, contents: tuple([item(one, contents) for one in _sequence(value)])
+        items_of = _list_decoder(arguments[0])
+        return lambda value, contents: tuple(items_of(value, contents))
     items = [_decoder(argument) for argument in arguments]
     return lambda value, contents: tuple(
         [item(one, contents) for item, one in zip(items, _sequence(value), strict=True)]
@@ -205,8 +267,10 @@ def _dataclass_decoder(record: Any) -> _Decoder:
 
 
 def _decode_any(value: Any, contents: memoryview) -> Any:
-    if isinstance(value, dict):
+    if isinstance(value, dict) and "array" in value:
         return _decode_array(value, contents)
+    if isinstance(value, dict):
+        value = _sequence(value)
     return [_decode_any(item, contents) for item in value] if isinstance(value, list) else value
 
 
