@@ -53,14 +53,17 @@ class Results:
     rows: list[Record]
 
     @classmethod
-    def load(cls, folder: Path) -> Results:
+    def load(cls, folder: Path, document: Record | None = None) -> Results:
         """Read results.json of any readable schema version.
+
+        Args:
+            document: content of the file, where it has been read already.
 
         Raises:
             DamagedResults: the file is missing or damaged.
 
         """
-        stored = replace_unprintable(read_results(folder))
+        stored = replace_unprintable(document or read_results(folder))
         return cls(folder, stored["run"], stored["scenarios"], stored["engines"], stored["rows"])
 
     def table(self, name: str) -> Columns:

@@ -21,7 +21,7 @@ from plumbline.execution.plan import Plan
 from plumbline.execution.result_cache import DiskResultCache, user_cells_folder
 from plumbline.execution.runner import RunResult, run_plan, save
 from plumbline.processes.worker_pool import Limits, start_warm_process
-from plumbline.storage.results_store import row_record, to_json_value
+from plumbline.storage.results_store import read_results, row_record, to_json_value
 
 MAX_PROOF_CPU_SECONDS = 1e6
 
@@ -92,8 +92,9 @@ def run(
         result = _run_visibly(plan, as_json, fresh)
         save(result, folder, command_line())
         with result.cpu_times.measure("report"):
-            write_scripts(folder, results=cache)
-            report = reports.write(folder)
+            document = read_results(folder)
+            write_scripts(folder, results=cache, document=document)
+            report = reports.write(folder, document=document)
         cache.trim()
     if as_json:
         document = {

@@ -223,7 +223,7 @@ def _list_decoder(hint: Any) -> _Decoder:
     item = _decoder(hint)
     options = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
     arrays = [option for option in options if get_origin(option) is np.ndarray]
-    records: dict[str, Any] = {option.__name__: option for option in options if is_dataclass(option)}
+    records: dict[str, Any] = {getattr(o, "__name__", ""): o for o in options if is_dataclass(o)}
 
     def decode(value: Any, contents: memoryview) -> Any:
         match value:

@@ -73,6 +73,7 @@ def write_scripts(
     limits: Limits | None = None,
     jobs: int | None = None,
     results: ResultCache | None = None,
+    document: dict[str, Any] | None = None,
 ) -> WrittenScripts:
     """Write scripts of rows into the results folder, and list them in scripts/index.json.
 
@@ -83,6 +84,7 @@ def write_scripts(
             earlier run are removed.
         jobs: number of workers; by default as many as the run had.
         results: scripts of earlier runs, used where nothing that they depend on has changed.
+        document: content of the folder's results.json, where it has been read already.
 
     Returns:
         The files, and for rows without one the reason.
@@ -92,7 +94,7 @@ def write_scripts(
         ValueError: results.json or scripts/index.json is missing or damaged; the message names it.
 
     """
-    document = read_results(folder)
+    document = document or read_results(folder)
     scripts, written, tasks = scripts_folder(folder), WrittenScripts(), []
     with _checked(folder):
         disagreeing = _disagreements(document)

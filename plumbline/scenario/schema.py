@@ -140,7 +140,14 @@ def _field(description: str, unit: str = "", default: Any = ..., **limits: Any) 
 class SchemaModel(BaseModel):
     """Base of all parts of a scenario file: strict types, no unknown fields, no NaN or infinity."""
 
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(
+        extra="forbid",
+        strict=True,
+        frozen=True,
+        allow_inf_nan=False,
+        # a run whose scenario files are unchanged validates none of them
+        defer_build=True,
+    )
     alternatives: ClassVar[tuple[str, ...]] = ()  # fields of which exactly one must be given
 
     @model_validator(mode="after")

@@ -45,7 +45,7 @@ class DamagedResults(PlumblineError, ValueError):
 
 
 class _Part(BaseModel):
-    model_config = ConfigDict(extra="ignore", strict=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="ignore", strict=True, allow_inf_nan=False, defer_build=True)
 
 
 class _Scenario(_Part):

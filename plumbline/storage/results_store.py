@@ -33,7 +33,6 @@ TEXT = pa.string()
 REAL = pa.float64()
 INTEGER = pa.int32()
 ROW_GROUP_SIZE = 8_192  # records encoded together: what waits is small
-MAX_WAITING_TABLES = 32  # small tables kept apart: each is tens of kilobytes besides its records
 
 
 def _schema(**columns: pa.DataType) -> pa.Schema:
@@ -154,7 +153,10 @@ def row_record(row: Row) -> dict[str, Any]:
         The fields of `Row` and the row's ``key``.
 
     """
-    return {"key": row.key, **to_json_value(vars(row))}
+    return {
+        "key": row.key,
+        **{name: value if type(value) is str else to_json_value(value) for name, value in vars(row).items()},
+    }
 
 
 class ResultTables:
@@ -165,7 +167,7 @@ class ResultTables:
 
     def __init__(self) -> None:
         """Start with empty tables."""
-        self._waiting: dict[str, list[pa.Table]] = {}
+        self._waiting: dict[str, list[tuple[int, Columns]]] = {}  # number of records, and their columns
         self._files: dict[str, tuple[pa.BufferOutputStream, pq.ParquetWriter]] = {}
 
     def add(self, name: str, columns: Columns) -> None:
@@ -173,18 +175,14 @@ class ResultTables:
 
         Args:
             name: a key of `TABLES`.
-            columns: every column of that table.
+            columns: every column of that table; equal numbers of values, or one value of all records.
 
         """
-        schema = TABLES[name]
         count = next((len(c) for c in columns.values() if isinstance(c, list | np.ndarray)), 1)
-        arrays = [
-            pa.array(columns[field.name], field.type)
-            if isinstance(columns[field.name], list | np.ndarray)
-            else pa.repeat(pa.scalar(columns[field.name], field.type), count)
-            for field in schema
-        ]
-        self._append(name, pa.Table.from_arrays(arrays, schema=schema))
+        waiting = self._waiting.setdefault(name, [])
+        waiting.append((count, columns))
+        if sum(count for count, _ in waiting) >= ROW_GROUP_SIZE:
+            self._encode(name)
 
     def add_rows(self, rows: Iterable[Row]) -> None:
         """Add rows to the summary.
@@ -194,21 +192,16 @@ class ResultTables:
 
         """
         records = [row_record(row) for row in rows]
-        for record in records:
-            record |= {name: json.dumps(record[name]) for name in ("causes", "extra")}
-        self._append("summary", pa.Table.from_pylist(records, schema=TABLES["summary"]))
-
-    def _append(self, name: str, table: pa.Table) -> None:
-        waiting = self._waiting.setdefault(name, [])
-        waiting.append(table)
-        if sum(map(len, waiting)) >= ROW_GROUP_SIZE:
-            self._encode(name)
-        elif len(waiting) >= MAX_WAITING_TABLES:
-            waiting[:] = [pa.concat_tables(waiting).combine_chunks()]
+        columns: Columns = {name: [record[name] for record in records] for name in TABLES["summary"].names}
+        for name in ("causes", "extra"):
+            columns[name] = list(map(json.dumps, columns[name]))
+        self.add("summary", columns)
 
     def _encode(self, name: str) -> None:
+        """Write the waiting records; column by column, since most tables that are added are small."""
+        schema, waiting = TABLES[name], self._waiting.pop(name, [])
         if name not in self._files:
-            schema, sink = TABLES[name], pa.BufferOutputStream()
+            sink = pa.BufferOutputStream()
             writer = pq.ParquetWriter(
                 sink,
                 schema,
@@ -218,7 +211,10 @@ class ResultTables:
                 write_page_checksum=True,
             )
             self._files[name] = sink, writer
-        self._files[name][1].write_table(pa.concat_tables(self._waiting.pop(name, [])), ROW_GROUP_SIZE)
+        arrays = [
+            _joined_column([(count, c[field.name]) for count, c in waiting], field.type) for field in schema
+        ]
+        self._files[name][1].write_table(pa.Table.from_arrays(arrays, schema=schema), ROW_GROUP_SIZE)
 
     def write_parquet(self, folder: Path) -> None:
         """Write every table; nothing can be added afterwards.
@@ -232,11 +228,20 @@ class ResultTables:
         """
         for name in TABLES:
             if name in self._waiting or name not in self._files:
-                self._waiting.setdefault(name, []).append(TABLES[name].empty_table())
                 self._encode(name)
             sink, writer = self._files[name]
             writer.close()
             write_atomically(folder / f"{name}.parquet", sink.getvalue().to_pybytes())
+
+
+def _joined_column(parts: Sequence[tuple[int, Any]], kind: pa.DataType) -> pa.Array:
+    """Join the values of a column, of which a part has one value of all its records, or a list or array."""
+    if parts and all(isinstance(values, np.ndarray) for _, values in parts):
+        return pa.array(np.concatenate([values for _, values in parts]), kind)
+    values: list[Any] = []
+    for count, part in parts:
+        values += part if isinstance(part, list | np.ndarray) else [part] * count
+    return pa.array(values, kind)
 
 
 def read_table(folder: Path, name: str) -> pa.Table:
