@@ -25,7 +25,7 @@ from plumbline.importers.neutral_model import (
     NeutralModel,
 )
 from plumbline.model.datatypes import Array, Float
-from plumbline.model.kinematics import quaternion_product, rotation_matrix
+from plumbline.model.kinematics import quaternion_of, quaternion_product, rotation_matrix
 
 MAX_WARNINGS = 20
 Node = TypeVar("Node")
@@ -155,30 +155,6 @@ def pose_of_coordinates(x: Float[Array, "7"]) -> Float[Array, "4 4"]:
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotation_matrix(x[3:]), x[:3]
     return matrix
-
-
-def quaternion_of(rotation: Float[Array, "3 3"]) -> Float[Array, "4"]:
-    """Return the unit quaternion of a rotation matrix.
-
-    Args:
-        rotation: a proper rotation.
-
-    Returns:
-        The quaternion, scalar first and not negative.
-
-    """
-    R = np.asarray(rotation, float)
-    products = np.array(  # 4 q qᵀ, of whose columns the longest is taken
-        [
-            [1 + R[0, 0] + R[1, 1] + R[2, 2], R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]],
-            [R[2, 1] - R[1, 2], 1 + R[0, 0] - R[1, 1] - R[2, 2], R[1, 0] + R[0, 1], R[0, 2] + R[2, 0]],
-            [R[0, 2] - R[2, 0], R[1, 0] + R[0, 1], 1 - R[0, 0] + R[1, 1] - R[2, 2], R[2, 1] + R[1, 2]],
-            [R[1, 0] - R[0, 1], R[0, 2] + R[2, 0], R[2, 1] + R[1, 2], 1 - R[0, 0] - R[1, 1] + R[2, 2]],
-        ]
-    )
-    column = products[np.argmax(np.diag(products))]
-    q = column / np.linalg.norm(column)
-    return np.asarray(-q if q[0] < 0 else q)
 
 
 def free_joint_name(body: str, file: ModelFile) -> str:

@@ -32,12 +32,11 @@ from adapters.importer_common import (
     make_joint,
     pose,
     pose_of_coordinates,
-    quaternion_of,
 )
 from plumbline.importers.importer import ModelFile
 from plumbline.importers.neutral_model import ElementaryJoint, ModelQuantities, NeutralBody
 from plumbline.model.datatypes import Array
-from plumbline.model.kinematics import rotation_matrix
+from plumbline.model.kinematics import quaternion_of, rotation_matrix
 
 
 class _Layout(LayoutWithOwnVelocities):

@@ -35,12 +35,11 @@ from adapters.importer_common import (
     make_joint,
     merge_made_up_bodies,
     pose_of_coordinates,
-    quaternion_of,
 )
 from plumbline.importers.importer import ModelFile
 from plumbline.importers.neutral_model import ElementaryJoint, ModelQuantities, NeutralBody
 from plumbline.model.datatypes import Array
-from plumbline.model.kinematics import cross_matrix, rotation_matrix
+from plumbline.model.kinematics import cross_matrix, quaternion_of, rotation_matrix
 
 GRAVITY = (0.0, 0.0, -9.81)  # m/s²
 PROBE = 0.5  # rad or m: displacement by which a joint's screw is measured

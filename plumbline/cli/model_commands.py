@@ -26,10 +26,17 @@ from plumbline.importers.neutral_model import MODEL_UNITS, Feature
 from plumbline.judging.rows import Row, Verdict
 from plumbline.layout import IS_INSTALLED
 from plumbline.model_files.importer_cause import Explanation
+from plumbline.model_files.mechanism_of_file import feature_words, load_model_file
 from plumbline.model_files.model_rows import REFUSED, FileResult
 from plumbline.model_files.model_run import ModelPlan, ModelRunResult, run_model_files
 from plumbline.processes.worker_pool import Limits
-from plumbline.scenario.line_and_column_errors import MAX_LISTED_PROBLEMS, did_you_mean, shorten
+from plumbline.scenario.line_and_column_errors import (
+    MAX_LISTED_PROBLEMS,
+    ScenarioError,
+    did_you_mean,
+    shorten,
+)
+from plumbline.scenario.mechanism_document import scenario_text
 from plumbline.storage.results_store import row_record, to_json_value
 
 COLUMN_HEADINGS = {
@@ -80,13 +87,7 @@ def _parse_state(_: click.Context, __: click.Parameter, text: str | None) -> dic
     + EXIT_CODES
 )
 @click.argument("files", nargs=-1, required=True, metavar="FILE...")
-@click.option(
-    "--base",
-    type=click.Choice(["auto", "fixed", "free"]),
-    default="auto",
-    help="Of a URDF: whether its root link is fixed to the world or moves freely. The format does not say; "
-    "auto is fixed. An MJCF file says it itself.",
-)
+@options.base_option(is_passed=True)
 @click.option(
     "--engine",
     "engines",
@@ -128,10 +129,16 @@ def _parse_state(_: click.Context, __: click.Parameter, text: str | None) -> dic
 @options.memory_option
 @options.json_option
 @click.option("--out", type=options.FolderPath(), help="Folder for report, junit.xml, SARIF and results.")
+@click.option(
+    "--to-scenario",
+    "scenario_file",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Compare nothing; write one model file as a scenario file, to be changed and run.",
+)
 def model(
     files: tuple[str, ...], base: Any, engines: tuple[str, ...], state_count: int,
     state: dict[str, float] | None, strip_geometry: bool, root: Path | None, known_files: tuple[Path, ...],
-    jobs: int, timeout: float, memory: float, as_json: bool, out: Path | None,
+    jobs: int, timeout: float, memory: float, as_json: bool, out: Path | None, scenario_file: Path | None,
 ) -> None:  # fmt: skip
     """Compare what engines' importers make of a URDF or MJCF file, and name the parameter that differs.
 
@@ -144,6 +151,8 @@ def model(
     Actuators, tendons, equalities, contacts, limits and mimic joints are not compared, and listed. An
     importer that refuses the file has answered; the exit code is then 1 only if --engine named it.
     """
+    if scenario_file is not None:
+        return _write_scenario(files, base, scenario_file)
     plan = ModelPlan(
         files, engines, options.are_engines_named(), base, root, strip_geometry, state_count,
         state, jobs, Limits(timeout, memory),
@@ -164,6 +173,19 @@ def model(
     if folder is not None:
         _write_reports(document, folder, as_json)
     sys.exit(result.exit_code)
+
+
+def _write_scenario(files: Sequence[str], base: Any, to: Path) -> None:
+    """Write a model file as a scenario file, and what the mechanism leaves out."""
+    if len(files) != 1:
+        raise click.UsageError("--to-scenario takes one model file")
+    try:
+        scenario, document = load_model_file(Path(files[0]), base)
+    except ScenarioError as error:
+        options.exit_on_bad_file(error)
+    with options.exit_on_io_error():
+        to.write_text(scenario_text(document), encoding="utf-8")
+    click.echo(f"{to}: {count_noun(scenario.model.n, 'body', 'bodies')}. {scenario.purpose}")
 
 
 def _write_reports(document: dict[str, Any], folder: Path, as_json: bool) -> None:
@@ -256,7 +278,7 @@ def _print_file(file: FileResult, result: ModelRunResult) -> None:
             out.print(line)
     for title, features in (("not compared", file.model.not_compared), ("left open", file.model.ambiguous)):
         if features:
-            out.print(f"[dim]{title}: {escape(_feature_words(features, file.file))}[/]")
+            out.print(f"[dim]{title}: {escape(feature_words(features, file.file))}[/]")
 
 
 def _print_missing(result: ModelRunResult) -> None:
@@ -309,16 +331,3 @@ def _reasons(name: str, rows: Sequence[Row], file: FileResult) -> list[str]:
         words = ", ".join(f"{field} ({count})" for field, count in fields.items()) or "nothing"
         lines.append(f"  no cause is proved; its description differs from the file in: {escape(words)}")
     return lines
-
-
-def _feature_words(features: Sequence[Feature], shown: str) -> str:
-    counted = Counter(feature.what for feature in features)
-    first = {feature.what: feature for feature in reversed(features)}
-    places = {
-        what: f"line {f.source.line}" if f.source.file == shown else str(f.source)
-        for what, f in first.items()
-    }
-    return ", ".join(
-        f"{count} × {what} ({first[what].name}, {places[what]}{' …' if count > 1 else ''})"
-        for what, count in counted.items()
-    )

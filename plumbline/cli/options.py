@@ -33,7 +33,11 @@ from plumbline.truth.closed_form import ClosedFormMismatch, closed_form_motion
 if TYPE_CHECKING:
     from plumbline.execution.result_cache import DiskResultCache
 
-_ADAPTERS, _TRUST = "plumbline.adapters", "plumbline.trust"  # what the context of a command remembers
+_ADAPTERS, _TRUST, _BASE = (
+    "plumbline.adapters",
+    "plumbline.trust",
+    "plumbline.base",
+)  # what the context of a command remembers
 LOCK_FILE = ".lock"  # of an output folder, held by the command that writes to it
 MIN_TIMEOUT, MAX_TIMEOUT = 1.0, 1e7  # s; starting an engine takes longer than less
 MIN_MEMORY, MAX_MEMORY = 1.0, 1e6  # GB of address space; a worker with an engine does not start with less
@@ -164,6 +168,11 @@ def _note_trust(context: click.Context, _: click.Parameter, is_trusting: bool) -
     context.meta[_TRUST] = is_trusting
 
 
+def _note_base(context: click.Context, _: click.Parameter, base: str) -> str:
+    context.meta[_BASE] = base
+    return base
+
+
 def _add_found_engine(name: str, *, is_trusting: bool) -> None:
     """Add an engine that plumbline.toml or an installed package names; that file needs the user's consent."""
     try:
@@ -225,6 +234,27 @@ def engines_option(command: Callable[..., Any]) -> Callable[..., Any]:
     return _trust_option(_adapter_option(_engine_option(command)))
 
 
+def base_option(*, is_passed: bool) -> _Decorator:
+    """Make the option ``--base``, which model files are read with.
+
+    Args:
+        is_passed: whether the command gets ``base``.
+
+    Returns:
+        The decorator of a command.
+
+    """
+    return click.option(
+        "--base",
+        type=click.Choice(["auto", "fixed", "free"]),
+        default="auto",
+        expose_value=is_passed,
+        callback=_note_base,
+        help="Of a URDF: whether its root link is fixed to the world or moves freely. The format does not "
+        "say; auto is fixed. An MJCF file says it itself.",
+    )
+
+
 jobs_option = click.option(
     "--jobs",
     type=click.IntRange(1, MAX_JOBS),
@@ -278,6 +308,10 @@ def _read_scenarios(
 
 def _load_scenario(path: Path) -> scenarios.Scenario:
     """Load a scenario and check that it is the motion of the closed form named in its file."""
+    if path.suffix in scenarios.MODEL_FILE_SUFFIXES:
+        from plumbline.model_files.mechanism_of_file import load_model_file  # few commands need it
+
+        return load_model_file(path, click.get_current_context().meta.get(_BASE, "auto"))[0]
     scenario = scenarios.load_scenario(path)
     try:
         closed_form_motion(scenario)
@@ -291,8 +325,11 @@ def _load_scenario(path: Path) -> scenarios.Scenario:
 def _recall_scenario(path: Path) -> scenarios.Scenario:
     """Load a scenario; one that was loaded before is neither built nor checked again.
 
-    Its key covers the file, and all that the cells of the result cache depend on.
+    Its key covers the file, and all that the cells of the result cache depend on; a model file may name
+    others.
     """
+    if path.suffix in scenarios.MODEL_FILE_SUFFIXES:
+        return _load_scenario(path)
     code = Path(__file__).read_bytes()
     key = content_key("scenario", environment_fingerprint(""), code, str(path), read_bytes(path))
     known: scenarios.Scenario | None = recall(key, lambda found: isinstance(found, scenarios.Scenario))

@@ -32,10 +32,12 @@ MAX_PROOF_CPU_SECONDS = 1e6
         "run double-tumbling-balls --engine mujoco",
         "run --family chain --level state",
         "run my-pendulum.yaml --out results --json | jq .sentence",
+        "run my-robot.urdf --base free",
     )
     + EXIT_CODES,
 )
 @options.names_argument
+@options.base_option(is_passed=False)
 @click.option("--family", "families", multiple=True, help="Only scenarios of this family (may be repeated).")
 @options.engines_option
 @click.option(
@@ -65,10 +67,16 @@ def run(
     scheduler: str | None, known_files: tuple[Path, ...], out: Path, as_json: bool, user_rtol: float | None,
     fresh: bool, timeout: float, memory: float,
 ) -> None:  # fmt: skip
-    """Compare scenarios (names of the catalogue, or paths of YAML files; default: all) on all engines."""
+    """Compare scenarios (names of the catalogue, or paths of files; default: all) on all engines.
+
+    A file is a scenario in YAML, or a robot in URDF or MJCF; what its mechanism leaves out is listed first.
+    """
     if scheduler is None and options.are_scenarios_found(names):
         start_warm_process([scenario_verdicts.__name__])
     chosen = options.choose_scenarios(names, families)
+    for s in chosen:
+        if s.is_from_model_file:
+            _log(f"{s.path}: {s.purpose}")
     known_issues = options.read_known_issues(known_files, chosen)
     folder = options.claim_folder(out)
     cache = DiskResultCache(user_cells_folder(), _log, is_fresh=fresh)

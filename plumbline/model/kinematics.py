@@ -116,6 +116,30 @@ def turn_of_z(u: Float[Array, "... 3"]) -> Float[Array, "... 4"]:
     return np.where((z >= 0)[..., None], up, down)
 
 
+def quaternion_of(rotation: Float[Array, "3 3"]) -> Float[Array, "4"]:
+    """Return the unit quaternion of a rotation matrix.
+
+    Args:
+        rotation: a proper rotation.
+
+    Returns:
+        The quaternion, scalar first and not negative.
+
+    """
+    R = np.asarray(rotation, float)
+    products = np.array(  # 4 q qᵀ, of whose columns the longest is taken
+        [
+            [1 + R[0, 0] + R[1, 1] + R[2, 2], R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]],
+            [R[2, 1] - R[1, 2], 1 + R[0, 0] - R[1, 1] - R[2, 2], R[1, 0] + R[0, 1], R[0, 2] + R[2, 0]],
+            [R[0, 2] - R[2, 0], R[1, 0] + R[0, 1], 1 - R[0, 0] + R[1, 1] - R[2, 2], R[2, 1] + R[1, 2]],
+            [R[1, 0] - R[0, 1], R[0, 2] + R[2, 0], R[2, 1] + R[1, 2], 1 - R[0, 0] - R[1, 1] + R[2, 2]],
+        ]
+    )
+    column = products[np.argmax(np.diag(products))]
+    q = column / np.linalg.norm(column)
+    return np.asarray(-q if q[0] < 0 else q)
+
+
 def rotation_vector(q: Float[Array, "... 4"]) -> Float[Array, "... 3"]:
     """Return the rotation vector θ u of quaternions, 0 ≤ θ ≤ π.
 

@@ -31,12 +31,11 @@ from plumbline.model_files.model_rows import (
     judge_importer,
     state_seed,
 )
-from plumbline.model_files.prepared_file import BaseChoice, PreparedFile, prepare_file
+from plumbline.model_files.prepared_file import MJCF_READER, BaseChoice, PreparedFile, prepare_file
 from plumbline.processes.isolation import ScratchFolder
 from plumbline.processes.worker_pool import Executor, Limits, Outcome, Packed, Scheduler, Task, WorkerPool
 from plumbline.scenario.line_and_column_errors import Problem, did_you_mean, shorten
 
-MJCF_READER = "mujoco"  # whose compiled model is the neutral reading of MJCF
 ProgressCallback = Callable[[int, int, str], None]
 
 

@@ -20,6 +20,7 @@ from plumbline.scenario.line_and_column_errors import Problem, shorten
 from plumbline.scenario.yaml_reader import is_file
 
 BaseChoice = Literal["fixed", "free", "auto"]
+MJCF_READER = "mujoco"  # whose compiled model is the neutral reading of MJCF
 _LINE = re.compile(r"\bline (\d{1,9})\b")
 _ELEMENT = re.compile(r"\bElement '([^']*)'")  # as MuJoCo names elements; other importers name lines at most
 _ELEMENT_NAME = re.compile(r"\bElement name '([^']*)'")

@@ -70,6 +70,7 @@ __all__ = [
 CATALOGUE_FOLDER = ROOT / "scenarios"
 LOOP_TOLERANCE = 1e-9  # of a loop's gap at t = 0 [m, rad], and of its rate over the largest speed
 MAX_MAGNITUDE = 1e30  # beyond it squares and products leave the range where engines can compute
+MODEL_FILE_SUFFIXES = (".urdf", ".xml", ".mjcf")  # of robots, which other modules read
 FAMILIES = ("single", "double", "chain", "joint", "tree", "loop", "classic")
 
 
@@ -104,6 +105,11 @@ class Scenario:
     def is_in_catalogue(self) -> bool:
         """Whether it comes with the project."""
         return CATALOGUE_FOLDER in self.path.parents
+
+    @property
+    def is_from_model_file(self) -> bool:
+        """Whether it was read from a URDF or MJCF file."""
+        return self.path.suffix in MODEL_FILE_SUFFIXES
 
     @property
     def origin(self) -> str:
@@ -227,9 +233,9 @@ def find_scenario_file(name: str | Path) -> Path:
     if str(name) in known:
         return known[str(name)]
     path = Path(name)
-    if path.suffix in (".yaml", ".yml") or len(path.parts) > 1 or is_file(path):
+    if path.suffix in (".yaml", ".yml", *MODEL_FILE_SUFFIXES) or len(path.parts) > 1 or is_file(path):
         return path
-    valid = "a path of a YAML file, or a name that `plumbline list scenarios` shows"
+    valid = "a path of a YAML, URDF or MJCF file, or a name that `plumbline list scenarios` shows"
     near = closest_match(str(name), [*known, *FAMILIES], cutoff=0.6)
     hint = f". did you mean {f'`--family {near}`' if near in FAMILIES else repr(near)}?" if near else ""
     message = f"unknown scenario{hint}"

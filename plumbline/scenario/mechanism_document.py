@@ -2,11 +2,42 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 from plumbline.model.datatypes import JOINT_ELEMENTS, Model, State
+
+
+def scenario_text(document: dict[str, Any]) -> str:
+    """Write the content of a scenario file.
+
+    Args:
+        document: plain data.
+
+    Returns:
+        YAML: a line for each value, and for each vector.
+
+    """
+    return "\n".join(_lines(document, "")) + "\n"
+
+
+def _lines(value: Any, indent: str) -> Iterator[str]:
+    """The lines of a mapping or of a list of mappings; other values in their JSON form, which is YAML too."""
+    if isinstance(value, list):
+        for item in value:
+            first, *others = _lines(item, indent + "  ")
+            yield f"{indent}- {first.strip()}"
+            yield from others
+        return
+    for key, item in value.items():
+        if isinstance(item, dict) or (isinstance(item, list) and item and isinstance(item[0], dict)):
+            yield f"{indent}{key}:"
+            yield from _lines(item, indent + "  ")
+        elif item is not None:
+            yield f"{indent}{key}: {json.dumps(item, ensure_ascii=False)}"
 
 
 def mechanism_document(model: Model, state: State) -> dict[str, Any]:

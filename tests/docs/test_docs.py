@@ -22,7 +22,7 @@ from plumbline.scenario.field_docs import field_reference
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [
     "first-run.md", "add-a-scenario.md", "add-an-engine.md", "test-your-engine.md", "sweeps.md",
-    "model-files.md", *(["test-your-engine-in-cpp.md"] if shutil.which("g++") else []),
+    "model-files.md", "test-your-robot.md", *(["test-your-engine-in-cpp.md"] if shutil.which("g++") else []),
 ]  # fmt: skip
 BLOCK = re.compile(r"^```([^\n]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 IGNORED = shutil.ignore_patterns(".*", "__pycache__", "node_modules", "out")

@@ -14,7 +14,12 @@ import numpy as np
 import scipy
 
 from plumbline.model.datatypes import FREE, HINGE, ROD, Array, Model, State
-from plumbline.model.kinematics import quaternion_conjugate, quaternion_product, rotation_matrix
+from plumbline.model.kinematics import (
+    quaternion_conjugate,
+    quaternion_of,
+    quaternion_product,
+    rotation_matrix,
+)
 from plumbline.truth.closed_form.motion import (
     CONDITION_RTOL,
     ClosedFormMotion,
@@ -332,7 +337,7 @@ def torque_free_attitude(inertia: Array, p: Array, omega: Array) -> Callable[[Ar
             axis_angle_quaternions(X, theta), axis_angle_quaternions(Z, np.arctan2(I1 * w1, I2 * w2))
         )
 
-    principal = _quaternion_from_matrix(axes)
+    principal = quaternion_of(axes)
     at_start = momentum_to_z(*(np.atleast_1d(x) for x in w))[0]
     base = quaternion_product(quaternion_product(p, principal), quaternion_conjugate(at_start))
 
@@ -348,23 +353,6 @@ def torque_free_attitude(inertia: Array, p: Array, omega: Array) -> Callable[[Ar
         )
 
     return evaluate
-
-
-def _quaternion_from_matrix(A: Array) -> Array:
-    """Unit quaternion (4,) of a rotation matrix: the largest column of 4 p pᵀ."""
-    xx, yy, zz = np.diag(A)
-    a, b, c = A[2, 1] - A[1, 2], A[0, 2] - A[2, 0], A[1, 0] - A[0, 1]
-    xy, xz, yz = A[0, 1] + A[1, 0], A[0, 2] + A[2, 0], A[1, 2] + A[2, 1]
-    K = np.array(
-        [
-            [1 + xx + yy + zz, a, b, c],
-            [a, 1 + xx - yy - zz, xy, xz],
-            [b, xy, 1 - xx + yy - zz, yz],
-            [c, xz, yz, 1 - xx - yy + zz],
-        ]
-    )
-    best = K[np.argmax(np.diag(K))]
-    return np.asarray(best / np.linalg.norm(best))
 
 
 # -- Lagrange's top and the spherical pendulum ---------------------------------------------------------
