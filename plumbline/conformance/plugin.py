@@ -19,6 +19,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group.addoption(
         "--plumbline-engine", metavar="ENGINE", help="cmd:PROGRAM …, FILE.py:Class, package:Class"
     )
+    levels = ("state", "step", "trajectory", "all")
+    group.addoption(
+        "--plumbline-level", choices=levels, default="state", help="what is compared; default state"
+    )
     group.addoption("--plumbline-known", metavar="FILE", help=f"expected failures; default {KNOWN_FILE}")
 
 

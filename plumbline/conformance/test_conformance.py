@@ -1,4 +1,4 @@
-"""One test per scenario and quantity; all scenarios are compared at once, before the first test."""
+"""Tests of an engine; all scenarios are compared at once, before the first test."""
 
 from __future__ import annotations
 
@@ -6,16 +6,25 @@ import os
 
 import pytest
 
+from plumbline.conformance.contract import check_rows
 from plumbline.engines.protocol import QUANTITIES
 from plumbline.execution.comparison import Comparison, compare
-from plumbline.judging.rows import Row, Verdict
+from plumbline.judging.rows import Level
 from plumbline.scenario.loader import catalogue
+
+LEVELS: dict[str, tuple[Level, ...]] = {  # those of the rows, besides "state", at each level of a run
+    "state": (), "step": ("step",), "trajectory": ("trajectory", "invariants"),
+    "all": ("step", "trajectory", "invariants", "relations"),
+}  # fmt: skip
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """Make the tests."""
-    cases = [(name, quantity) for name in catalogue() for quantity in QUANTITIES]
-    metafunc.parametrize(("scenario", "quantity"), cases, ids=[f"state/{s}/{q}" for s, q in cases])
+    """Make the tests: of states one per quantity, of the other levels one for all that they compare."""
+    level = metafunc.config.getoption("--plumbline-level")
+    quantities = QUANTITIES if level in ("state", "all") else ()
+    kinds = [("state", q) for q in quantities] + [(one, "all") for one in LEVELS[level]]
+    cases = [(one, name, quantity) for name in catalogue() for one, quantity in kinds]
+    metafunc.parametrize(("level", "scenario", "quantity"), cases, ids=["/".join(case) for case in cases])
 
 
 @pytest.fixture(scope="session")
@@ -26,18 +35,13 @@ def comparison(request: pytest.FixtureRequest) -> Comparison:
         raise pytest.UsageError("--plumbline-engine names the engine to test")
     calls = (getattr(item, "callspec", None) for item in request.session.items)
     names = dict.fromkeys(c.params["scenario"] for c in calls if c is not None and "scenario" in c.params)
-    return compare(engine, list(names), jobs=os.cpu_count() or 1)
+    level = request.config.getoption("--plumbline-level")
+    return compare(engine, list(names), level, jobs=os.cpu_count() or 1)
 
 
-def test_quantity(comparison: Comparison, scenario: str, quantity: str) -> None:
-    """The quantity agrees with the truth, or the engine declares that it has it not."""
-    rows = [r for r in comparison.rows if r.scenario == scenario and r.quantity in (quantity, "all")]
-    problems = [row for row in rows if row in comparison.problems]
-    if problems:
-        pytest.fail("\n".join(map(_words, problems)), pytrace=False)
-    if not any(row.verdict == Verdict.AGREES for row in rows):
-        pytest.skip(rows[0].reason if rows else "the mechanism has no such quantity")
-
-
-def _words(row: Row) -> str:
-    return f"{row.reason}; {row.diagnosis}" if row.diagnosis else row.reason
+def test_engine(comparison: Comparison, level: str, scenario: str, quantity: str) -> None:
+    """What the engine computes agrees with the truth, or it declares that it has it not."""
+    rows = [row for row in comparison.rows if (row.scenario, row.level) == (scenario, level)]
+    check_rows(
+        comparison, [row for row in rows if "all" in (quantity, row.quantity) or row.quantity == quantity]
+    )

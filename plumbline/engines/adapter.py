@@ -79,6 +79,9 @@ class EngineInfo:
     missing: str | None = None
     python: str = ""
     has_failed: bool = False  # the engine is missing for another reason than that it is not installed
+    is_lifted: bool = (
+        False  # whether accelerations of bodies are computed here from those of joint coordinates
+    )
 
 
 class Adapter(ABC):
@@ -96,6 +99,7 @@ class Adapter(ABC):
     # What some mechanisms have that the engine cannot express, and why: a key of `MODEL_GAPS`, or a quantity
     # that it does not return for them.  Like all declared gaps these are shown and fail no run.
     gaps: ClassVar[Mapping[str, str]] = {}
+    is_lifted: ClassVar[bool] = False  # whether it returns accelerations of joint coordinates, not of bodies
     supported_versions: ClassVar[str] = ""  # PEP 440 range of versions that the adapter works with
     # Requirements of environments with another version: (range of versions, additional requirement).
     extra_requirements: ClassVar[tuple[tuple[str, str], ...]] = ()
@@ -140,7 +144,7 @@ class Adapter(ABC):
         """
         check_declarations(self)
         version, missing = check_version(self, "adapter")
-        return EngineInfo(self.name, self.title, version, self.integrators, missing)
+        return EngineInfo(self.name, self.title, version, self.integrators, missing, is_lifted=self.is_lifted)
 
     def integrator(self, name: str) -> Integrator:
         """Look up one of the engine's integrators.

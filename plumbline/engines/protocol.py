@@ -328,7 +328,7 @@ def served_engine(command: Sequence[str], variables: Mapping[str, str]) -> Serve
     """
     hello = _program(command, variables).hello
     title = hello.title
-    absent = {*QUANTITIES} - {*hello.quantities} - {"acceleration", "angular_acceleration", "joint_moment"}
+    absent = {*QUANTITIES} - {*hello.quantities} - {"acceleration", "angular_acceleration"}
     gaps = {name: f"{title} returns no {name.replace('_', ' ')}" for name in sorted(absent)}
     if "loads" not in hello.has:
         gaps["loads"] = f"{title} applies no loads"
@@ -344,7 +344,10 @@ def served_engine(command: Sequence[str], variables: Mapping[str, str]) -> Serve
         "package": hello.name,
         "integrators": tuple(Integrator(**vars(one)) for one in hello.integrators),
         "unsupported": {name: why for name, why in gaps.items() if name in UNSUPPORTED_KINDS},
-        "gaps": {name: why for name, why in gaps.items() if name in MODEL_GAPS or name == "joints"},
+        "gaps": {
+            name: why for name, why in gaps.items() if name in MODEL_GAPS or name not in UNSUPPORTED_KINDS
+        },
+        "is_lifted": "joint_acceleration" in hello.quantities,
         "builds_trees": "trees" in hello.has,
         "builds_elements": "elements" in hello.has,
         "loops_unsupported_reason": "" if "loops" in hello.has else f"{title} builds no closed loops",

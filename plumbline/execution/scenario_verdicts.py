@@ -54,6 +54,7 @@ _LEVELS: dict[TaskKind, Level] = {
     TaskKind.TRAJECTORY: "trajectory",
     TaskKind.LONG_RUN: "invariants",
 }
+LIFTED = ("acceleration", "angular_acceleration")  # computed here where an engine returns those of its joints
 NO_INDEPENDENT_TRUTH = "no independent truth: python-flint is not installed, and the reference is no judge"
 NO_REGULAR_POSE = (
     "every pose that the loops allow is singular, as of a truss with its bars in one line: forces have no "
@@ -437,6 +438,11 @@ class ScenarioRun:
         if key.kind == TaskKind.STATE and is_singular(self._singular_value) and not is_refused:
             found.rows.append(singular_pose_row(self._context(key.engine), self._singular_value))
         found.rows = mark_aliases(found.rows)
+        if key.kind == TaskKind.STATE and self._engines[key.engine].is_lifted:
+            found.rows = [
+                replace(row, extra=row.extra | {"lifted": 1.0}) if row.quantity in LIFTED else row
+                for row in found.rows
+            ]
         if self._plan.user_rtol is not None:
             found.rows = [replace(row, user_rtol=self._plan.user_rtol) for row in found.rows]
         return found

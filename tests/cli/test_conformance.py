@@ -34,3 +34,47 @@ def test_tests_pass_fail_skip_and_are_expected_to_fail(tmp_path):
     assert found == {"passed": 1, "failed": 1, "skipped": 14} and "XPASS(strict)" in text
     known.write_text('"state/tumbling-bull/*" = "x"\n')
     assert "matches no test" in outcomes(tmp_path, TOY)[0]
+
+
+CONTRACT = """
+from adapters.mujoco_engine import Mujoco
+from plumbline.conformance import contract_tests
+
+
+class Wrong(Mujoco):
+    name = "wrong"
+    title = "Wrong"
+
+    def _evaluate(self, model, states):
+        return super()._evaluate(model.changed(gravity=1.001 * model.gravity), states)
+
+
+RIGHT = "tests.helpers.renamed_engine:Renamed"
+test_right = contract_tests(RIGHT, ["tumbling-ball"], "step")
+test_wrong = contract_tests(Wrong, ["tumbling-ball"], "state")
+"""
+
+
+def test_an_adapter_is_tested_beside_its_own_tests(tmp_path):
+    (tmp_path / "test_mine.py").write_text(CONTRACT)
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        "-c",
+        os.devnull,
+        "--rootdir",
+        tmp_path,
+    ]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=environment)
+    assert "1 failed, 1 passed" in done.stdout, done.stdout + done.stderr
+    assert "test_wrong[tumbling-ball]" in done.stdout and "gravity" in done.stdout
+
+
+def test_levels_beyond_states_are_tests_of_their_own(tmp_path):
+    text, found = outcomes(tmp_path, TOY, "--plumbline-level", "step", "-k", "step/tumbling-ball/")
+    assert found == {"skipped": 1}, text  # it declares that it does not simulate

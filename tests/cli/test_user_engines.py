@@ -44,8 +44,10 @@ def test_a_program_is_a_column_and_its_answers_are_kept_until_it_changes(tmp_pat
     assert first.exit_code == second.exit_code == 0, first.output
     assert "2 agree" in first.stdout and "answers of earlier runs" not in first.stderr
     assert "answers of earlier runs were used" in second.stderr
-    run_data = json.loads((tmp_path / "out/results.json").read_text())["run"]
-    assert run_data["versions"] == {"toy": "0.1"}
+    results = json.loads((tmp_path / "out/results.json").read_text())
+    assert results["run"]["versions"] == {"toy": "0.1"}
+    lifted = {row["quantity"] for row in results["rows"] if row["extra"].get("lifted")}
+    assert lifted == {"acceleration", "angular_acceleration"}
     server.write_text(server.read_text().replace("omega, J @ omega", "omega, 1.001 * J @ omega"))
     third = run(*words)
     assert third.exit_code == 1 and "disagree" in third.stdout, third.output
