@@ -15,7 +15,7 @@ export UV_COMPILE_BYTECODE := 1
 export PYTHONDONTWRITEBYTECODE :=
 MUTANTS ?= --sample 300 --seed 1 --jobs 2
 
-.PHONY: help install run test fast-tests nightly bench benchmarks mutants importers models lint lock release clean
+.PHONY: help install run test fast-tests nightly bench benchmarks mutants importers engines models lint lock release clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' Makefile | sed 's/:.*##/\t/' | expand -t 12
@@ -42,8 +42,8 @@ lint: .venv/test.done  ## style and types only
 	$(PYTHON) -m ruff format --check .
 	$(PYTHON) -m mypy
 
-nightly: .venv/test.done  ## the full matrix with random scenarios, then the long tests
-	$(PYTHON) -m plumbline nightly
+nightly: .venv/test.done  ## the full matrix with random scenarios and the servers that are built, then the long tests
+	$(PYTHON) -m tools.engine_servers --options | xargs $(PYTHON) -m plumbline nightly
 	$(PYTHON) -m pytest -n 2 -m full
 
 bench: .venv/test.done  ## right-hand sides and work-precision beside the engines, as ratios within one run; the daily loop
@@ -102,6 +102,9 @@ importers: .importers/.done .importers-exudyn/.done  ## more importers for `plum
 	-$(UV) pip install --quiet --require-hashes --python .importers-exudyn/bin/python -r locks/exudyn-importer.lock
 	@touch $@
 
+engines: .venv/main.done  ## servers of Drake, DART, Rapier, Simbody: lists sizes and licences, builds what can be built here
+	$(PYTHON) -m tools.engine_servers
+
 # Only the robots' files are wanted: no dependency of these packages is installed, and nothing imports them.
 .corpora/.done: locks/corpora.lock | .venv/pyvenv.cfg
 	$(UV) venv --quiet --allow-existing .corpora
@@ -128,4 +131,4 @@ release: .venv/test.done  ## build and check the wheel, tag the commit, write th
 	UV=$(UV) $(PYTHON) -m tools.release
 
 clean:  ## remove the environment and what runs made
-	rm -rf .venv .uv .importers .importers-exudyn .corpora reports/node_modules reports/out dist
+	rm -rf .venv .uv .engines .importers .importers-exudyn .corpora reports/node_modules reports/out dist

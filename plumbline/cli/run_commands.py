@@ -88,7 +88,7 @@ def run(
         jobs,
         Limits(timeout, memory),
         user_rtol=user_rtol,
-        is_full_catalogue=not names and not families and engines == list(ENGINES) and level == "all",
+        is_full_catalogue=not names and not families and {*ENGINES} <= {*engines} and level == "all",
         result_cache=cache,
         scheduler=scheduler,
         known_issues=known_issues,
@@ -195,7 +195,7 @@ def nightly(
         result, place = run_nightly(
             folder, chosen, engines, random_count=random_count,
             random_trajectory_count=random_trajectories, seed=seed, jobs=jobs,
-            limits=Limits(timeout, memory), is_full_catalogue=not names and engines == list(ENGINES),
+            limits=Limits(timeout, memory), is_full_catalogue=not names and {*ENGINES} <= {*engines},
             extra_refinements=extra_refinements, long_run_seconds=long_run_seconds, scheduler=scheduler,
             self_test=run_self_test if self_test and not layout.IS_INSTALLED else None, progress=progress,
             proof_cpu_seconds=proof_cpu_seconds,

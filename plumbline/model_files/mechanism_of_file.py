@@ -39,7 +39,7 @@ from plumbline.scenario.schema import MIN_INERTIA
 from plumbline.scenario.yaml_source import YamlSource
 
 DURATION, SAMPLE = 0.5, 2.0**-7  # s; the work of dampers is a quadrature over samples
-TURN_RATE, SLIDE_RATE = 2.0, 0.2  # rad/s and m/s at t = 0, standard deviation of each coordinate's
+TURN_RATE, SLIDE_RATE = 5.0, 0.5  # rad/s and m/s at t = 0, standard deviation of each coordinate's
 SHARE = 2.0**-6  # of a body's mass and inertia that each part between its joints carries
 FRAME_ROUNDING = 1e-12  # of axes and anchors of joints that are one joint together
 MAX_RATE = 2e4  # 1/s, of a decay by dampers: no explicit step that a run makes follows a faster one

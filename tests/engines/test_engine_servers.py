@@ -1,0 +1,51 @@
+"""The servers of further engines: their cost is listed first, and those that are built agree with the truth."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from plumbline.execution.comparison import compare
+from plumbline.judging.rows import Verdict
+from tools.engine_servers import ENGINE_SERVERS
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def listed(*words, path=None):
+    environment = os.environ | ({} if path is None else {"PATH": path})
+    command = [sys.executable, "-m", "tools.engine_servers", *words]
+    return subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, env=environment, check=True
+    ).stdout
+
+
+def test_sizes_licences_and_missing_tools_are_listed_before_anything_is_built(tmp_path):
+    lines = dict(
+        zip([s.name for s in ENGINE_SERVERS], listed("--list", path=str(tmp_path)).splitlines(), strict=True)
+    )
+    for server in ENGINE_SERVERS:
+        assert server.licence in lines[server.name] and " MB" in lines[server.name]
+        assert "is built" in lines[server.name] or "is not installed; " in lines[server.name]
+
+
+def test_a_night_gets_the_servers_that_are_built():
+    built = [s for s in ENGINE_SERVERS if s.is_built]
+    options = subprocess.run(
+        ["xargs", "-n1", "echo"], input=listed("--options"), capture_output=True, text=True
+    )
+    words = options.stdout.splitlines()
+    assert [w for w in words if w in {s.adapter for s in built}] == [s.adapter for s in built]
+    assert ("--engine" in words) == bool(built)
+
+
+@pytest.mark.parametrize("server", ENGINE_SERVERS, ids=lambda server: server.name)
+def test_a_server_agrees_with_the_truth(server, tmp_path, monkeypatch):
+    if not server.is_built:
+        pytest.skip(f"{server.name} is not built here: {server.missing() or '`make engines` builds it'}")
+    scenarios = ["double-hinge-skew", "slider-on-arm", "double-tumbling-balls"]
+    found = compare(server.adapter, scenarios, "state")
+    assert not found.problems, [f"{row.key}: {row.reason}" for row in found.problems]
+    assert sum(row.verdict == Verdict.AGREES for row in found.rows) >= 6
