@@ -1,4 +1,4 @@
-"""The servers of further engines: their cost is listed first, and those that are built agree with the truth."""
+"""Servers of further engines: their cost is listed first, and those that are built agree with the truth."""
 
 import os
 import subprocess
