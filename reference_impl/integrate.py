@@ -182,7 +182,10 @@ def integrate_dop853(
 
     def rate(_: float, y: Array) -> Array:
         """(N6) ẏ = (ṙ, ṗ, r̈, p̈)."""
-        state, angles = unpack_state(y[:size], n), y[size:].reshape(-1, 2) if len(y) > size else None
+        state, angles = (
+            unpack_state(y[:size], n),
+            y[size:].reshape(-1, chain.columns) if len(y) > size else None,
+        )
         of_angles = np.zeros(0) if angles is None else elements.coordinates(*state)[1].ravel()
         return np.concatenate([y[7 * n : size], accelerate(*state, angles), of_angles])
 

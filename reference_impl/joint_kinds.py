@@ -1,12 +1,26 @@
-"""The table of joint kinds: what each holds and what it leaves free."""
+"""The table of joint kinds: what each holds and what it leaves free.
+
+A new kind is one entry here and its word in `AxesKind`.  With x, y, z the joint's axes in the far body,
+X, Y, Z in the near one and d from the far to the near point, the rows and coordinates besides those of the
+notes' rod and ball are
+
+    hinge        d; xᵀZ, yᵀZ                   φ = atan2(yᵀX, xᵀX)
+    universal    d; xᵀY                        φ₁ = atan2(zᵀY, yᵀY), φ₂ = atan2(xᵀZ, xᵀX)
+    slide        xᵀd, yᵀd; xᵀY, yᵀZ, zᵀX       zᵀd
+    cylindrical  xᵀd, yᵀd; xᵀZ, yᵀZ            zᵀd, φ as of the hinge
+    weld         d; xᵀY, yᵀZ, zᵀX
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
 
-AxesKind = Literal["hinge", "universal", "slide", "cylindrical", "weld"]  # joints with axes in both bodies
+AxesKind = Literal[
+    "hinge", "universal", "slide", "cylindrical", "planar", "weld"
+]  # joints with axes in both bodies
 Kind = Literal["rod", "ball", "free"] | AxesKind
 
 
@@ -113,6 +127,13 @@ KINDS: dict[Kind, JointKind] = {
     "weld": JointKind((*_POINT, *_ATTITUDE)),
     "free": JointKind((), has_attitude=True),
 }
+
+
+def column_count(kinds: Iterable[Kind]) -> int:
+    """Columns of joint coordinates and elements: 2, or as many as one of the joints has motions."""
+    return max([2, *(len(KINDS[kind].motions) for kind in kinds)])
+
+
 # of joints that the program makes itself
 ROD: Kind = "rod"
 BALL: Kind = "ball"

@@ -16,7 +16,7 @@ from reference_impl.arrays import Float as Float
 from reference_impl.arrays import Indices as Indices
 from reference_impl.arrays import Int as Int
 from reference_impl.arrays import Shaped as Shaped
-from reference_impl.joint_kinds import BALL, KINDS, ROD, JointKind, Kind
+from reference_impl.joint_kinds import BALL, KINDS, ROD, JointKind, Kind, column_count
 
 ZERO_INERTIA = 1e-14  # a principal moment that is this part of the largest is the rounding of 0
 CHAIN_FIELDS = (
@@ -85,7 +85,7 @@ class Mechanism:
     def __post_init__(self) -> None:
         """Give joints without passive elements zeros, and all elements a column per coordinate."""
         given = [getattr(self, name) for name in JOINT_ELEMENTS]
-        columns = max(2, *(len(kind.motions) for kind in self.kinds), *(x.shape[-1] for x in given))
+        columns = max([column_count(self.kind), *(x.shape[-1] for x in given)])
         for name, values in zip(JOINT_ELEMENTS, given, strict=True):
             if values.shape[-2:] != (len(self.kind), columns):
                 # Leading axes are a batch: the steps of implicit methods add to the rotors' inertias.

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from plumbline.judging.rows import RUN_FAMILY, SHOWN_STYLES
-from plumbline.model.datatypes import KINDS, Array, Float, Model, State
+from plumbline.model.datatypes import Array, Float, Model, State
 from plumbline.model.invariants import DEPARTURE, first_departure
 from plumbline.model.kinematics import quaternion_conjugate, quaternion_product, rotation_matrix
 from plumbline.model.loops import cut_open, determinate_projectors, singular_values
@@ -408,11 +408,12 @@ def _body_shapes(scenario: Record) -> list[Record]:
         turned = rotation_matrix(model.turn[k, side])
         return [[_json_number(x, 4) for x in turned[:, i]] for i in numbers]
 
-    for k, kind in enumerate(model.kind):
-        moving = [axis for _, axis in KINDS[kind].motions]  # the first in the far, the last in the near body
+    for k, kind in enumerate(model.kinds):
+        moving = [axis for _, axis in kind.motions]  # the last in the near body, the others in the far one
         shapes.append(
             {
-                "joint": kind,
+                "is_free": kind.holds_nothing,
+                "is_apart": kind.holds_distance or bool(kind.slide_axes),
                 "far": int(model.body[k, 0]),
                 "body": int(model.body[k, 1]),
                 "hang": [_json_number(x) for x in model.point[k, 0]],

@@ -296,7 +296,7 @@ def check_state(model: Model, state: State) -> None:
         BadInput: one of these does not hold; the message names the array.
 
     """
-    widths = {"p": 4, "x": 2, "xdot": 2}
+    widths = {"p": 4, "x": model.columns, "xdot": model.columns}
     for name, array in vars(state).items():
         shape = model.n, widths.get(name, 3)
         if np.shape(array) != shape:

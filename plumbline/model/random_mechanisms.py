@@ -315,7 +315,7 @@ def _number(node: _Node, kinds: list[Kind], far: list[int]) -> None:
 def _moves(model: Model, state: State) -> bool:
     """Whether the loops can move, with no row that depends on others, away from singular poses."""
     cut = cut_open(model)
-    J = cut.jacobian(cut.state(state))
+    J = cut.jacobian(cut.state(complete_state(model, state)))
     size = np.linalg.norm(J, axis=1, keepdims=True)
     if np.min(size) < 1e-9:
         return False

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from plumbline.layout import ROOT
-from plumbline.model.datatypes import FREE, JOINT_ELEMENTS, KINDS, Array, Float, Model, State
+from plumbline.model.datatypes import FREE, JOINT_ELEMENTS, KINDS, Array, Float, Model, State, column_count
 from plumbline.model.kinematics import (
     own_rates,
     quaternion_product,
@@ -578,7 +578,6 @@ def _build_model(
 ) -> Model:
     free = np.array([body.joint.kind == FREE for body in bodies])
     joints = [*(body.joint for body in bodies), *(end.joint for end in document.closes)]
-    motions = [KINDS[joint.kind].motions for joint in joints]
     points = [[_far_point(bodies, k, far[k]), body.proximal] for k, body in enumerate(bodies)]
     return Model(
         kind=tuple(body.joint.kind for body in bodies),
@@ -593,7 +592,7 @@ def _build_model(
         moment=np.array([body.load.moment for body in bodies], dtype=float),
         drag_force=np.array([body.drag.force for body in bodies], dtype=float),
         drag_moment=np.array([body.drag.moment for body in bodies], dtype=float),
-        **_joint_elements([body.joint for body in bodies], max(2, *map(len, motions))),
+        **_joint_elements([body.joint for body in bodies], column_count(joint.kind for joint in joints)),
         spring_body=spring_body,
         spring_point=np.array([spring.points for spring in document.springs], dtype=float).reshape(-1, 2, 3),
         spring_stiffness=np.array([spring.stiffness for spring in document.springs], dtype=float),

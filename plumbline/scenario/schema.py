@@ -301,7 +301,7 @@ class JointElements(SchemaModel):
     kind: str
     armature: PerCoordinate | None = _field(
         "Inertia a of rotors that turn with the rate φ̇ of the joint's coordinate, ½ a φ̇² (kg m², or kg of a "
-        "slide). One number; two for the coordinates of a universal or cylindrical joint. Absent: 0.",
+        "slide). One number, or a list of one per coordinate of the joint. Absent: 0.",
         default=None,
         examples=[0.01],
     )

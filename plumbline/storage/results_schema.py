@@ -13,7 +13,15 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from plumbline.judging.rows import Level
-from plumbline.model.datatypes import CHAIN_FIELDS, JOINT_ELEMENTS, JOINT_FIELDS, KINDS, SPRING_FIELDS, Model
+from plumbline.model.datatypes import (
+    CHAIN_FIELDS,
+    JOINT_ELEMENTS,
+    JOINT_FIELDS,
+    KINDS,
+    SPRING_FIELDS,
+    Model,
+    column_count,
+)
 from plumbline.processes.exceptions import PlumblineError
 from plumbline.scenario.line_and_column_errors import shorten
 from plumbline.scenario.schema import MAX_BODIES, invalid_value_error
@@ -25,12 +33,11 @@ MAX_MAGNITUDE = 1e30  # of the model's numbers, as in scenario files
 
 _MODEL_SHAPES: dict[str, tuple[int, ...]] = {  # of one body; (3,) where none is named
     "inertia": (3, 3), "mass": (), "length": (), "drag_force": (), "drag_moment": (),
-    "body": (2,), "point": (2, 3), "turn": (2, 4), **dict.fromkeys(JOINT_ELEMENTS, (2,)),
+    "body": (2,), "point": (2, 3), "turn": (2, 4),
     "spring_body": (2,), "spring_point": (2, 3), "spring_stiffness": (), "spring_damping": (),
     "spring_length": (),
 }  # fmt: skip
 _STATE_SHAPES: dict[str, tuple[int, ...]] = {"p": (4,), "omega": (3,), "u": (3,), "udot": (3,)}
-_TREE_STATE_SHAPES = _STATE_SHAPES | {"r": (3,), "v": (3,), "x": (2,), "xdot": (2,)}
 _Count = Annotated[int, Field(ge=0, le=2**53)]
 _Duration = Annotated[float, Field(ge=0, le=1e15)]  # s
 _VerdictWord = Literal[
@@ -81,12 +88,16 @@ class _Scenario(_Part):
         )
         joints = self._joint_count(model)
         counts |= dict.fromkeys(JOINT_FIELDS, joints)
-        shapes = {name: (counts.get(name, self.bodies), *_MODEL_SHAPES.get(name, (3,))) for name in names}
-        _check_shapes("model", self.model, shapes | {"gravity": (3,)})
-        state_shapes = _TREE_STATE_SHAPES if is_tree else _STATE_SHAPES
-        _check_shapes("state", self.state, {k: (self.bodies, *shape) for k, shape in state_shapes.items()})
-        if is_tree and self.model is not None and not _are_kinds(self.model["kind"], joints):
+        if is_tree and not _are_kinds(model["kind"], joints):
             raise invalid_value_error("model.kind does not fit the bodies", f"{self.bodies} kinds of joints")
+        columns = (column_count(model.get("kind", ())),)
+        model_shapes = _MODEL_SHAPES | dict.fromkeys(JOINT_ELEMENTS, columns)
+        shapes = {name: (counts.get(name, self.bodies), *model_shapes.get(name, (3,))) for name in names}
+        _check_shapes("model", self.model, shapes | {"gravity": (3,)})
+        state_shapes = _STATE_SHAPES
+        if is_tree:
+            state_shapes = _STATE_SHAPES | {"r": (3,), "v": (3,), "x": columns, "xdot": columns}
+        _check_shapes("state", self.state, {k: (self.bodies, *shape) for k, shape in state_shapes.items()})
         if self.model is not None and min(self.model["mass"], default=1.0) <= 0:
             raise invalid_value_error("has a mass that is not positive", "masses above 0 kg")
         return self

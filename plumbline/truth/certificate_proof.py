@@ -20,6 +20,7 @@ from plumbline.model.datatypes import Array, Model, State
 from plumbline.truth import TruthUnavailable, import_truth_tool
 from plumbline.truth.certificate_file import (
     FORMAT,
+    JOINTS,
     SHAPES,
     VERSION,
     Certificate,
@@ -63,6 +64,10 @@ def reason_not_provable(model: Model) -> str:
     """
     if model.has_loops:
         return "motions of closed loops are not proved: the checker has the equations of trees"
+    if unknown := sorted({*model.kind} - JOINTS.keys()):
+        return (
+            f"motions of {' and '.join(unknown)} joints are not proved: the checker has no equations of them"
+        )
     return ""
 
 

@@ -405,7 +405,9 @@ class StepCharts:
         lead = v.shape[:-1]
         omega = [A.mT @ w for A, w in zip(tree.A, tree.w, strict=True)]
         r, velocity, omega_ = (_stacked(x, lead) for x in (tree.r, tree.v, omega))
-        u, udot, x, xdot = (np.zeros((*lead, n, size), LongDouble) for size in (3, 3, 2, 2))
+        u, udot, x, xdot = (
+            np.zeros((*lead, n, size), LongDouble) for size in (3, 3, *[self.model.columns] * 2)
+        )
         for k, (chart, name) in enumerate(zip(self.of_body, self.model.kind, strict=True)):
             if k in self.of_rod:
                 u[..., k, :], udot[..., k, :] = (part[..., 0] for part in tree.rod_direction(k))

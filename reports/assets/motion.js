@@ -272,9 +272,9 @@ function bounds(m) {
   const low = [0, 0, 0];
   /** @type {Vec} */
   const high = [0, 0, 0];
-  /** @type {(k: number) => string} joint at the world of a body's branch */
-  const root = (k) => (m.shape[k].far < 0 ? m.shape[k].joint : root(m.shape[k].far));
-  const held = m.shape.slice(0, m.bodies).map((_, k) => root(k) !== "free");
+  /** @type {(k: number) => boolean} whether the branch of a body is free */
+  const isFree = (k) => (m.shape[k].far < 0 ? m.shape[k].is_free : isFree(m.shape[k].far));
+  const held = m.shape.slice(0, m.bodies).map((_, k) => !isFree(k));
   for (let i = 0; i < m.r.length; i++) {
     if (held.includes(true) && !held[Math.floor(i / 3) % m.bodies]) continue;
     const v = (m.r[i] * m.span) / 32767;
@@ -371,16 +371,16 @@ function tree(context, see, m, poses, colour, ghost, scene) {
     const closes = k >= m.bodies;
     const parent = shape.far < 0 ? null : poses[shape.far];
     const hang = parent ? add(parent.r, turn(parent.q, shape.hang)) : shape.hang;
-    const near = shape.joint === "free" ? r : add(r, turn(q, shape.near));
+    const near = shape.is_free ? r : add(r, turn(q, shape.near));
     const [a, b, c] = [see(hang), see(near), see(r)];
-    const [free, rod] = [shape.joint === "free", shape.joint === "rod" || shape.joint === "slide" || shape.joint === "cylindrical"];
+    const [free, apart] = [shape.is_free, shape.is_apart];
     const lines = [...shape.far_axes.map((axis) => [hang, parent ? turn(parent.q, axis) : axis]), ...shape.near_axes.map((axis) => [near, turn(q, axis)])]
       .map(([at, axis]) => [add(at, axis, -0.08 * scene.radius), add(at, axis, 0.08 * scene.radius)].map(see));
     parts.push({ depth: Math.max(a[2], b[2]), paint: () => {
       context.strokeStyle = colour;
       context.globalAlpha = ghost ? 0.55 : 1;
       context.setLineDash(ghost ? [3, 3] : []);
-      if (rod) {
+      if (apart) {
         context.lineWidth = ghost ? 1 : 2.2;
         polyline(context, [a, b]);
       }
@@ -393,7 +393,7 @@ function tree(context, see, m, poses, colour, ghost, scene) {
         for (const line of lines) polyline(context, line);
         context.strokeStyle = colour;
         context.fillStyle = paper;
-        for (const [x, y] of rod ? [a, b] : [b]) {
+        for (const [x, y] of apart ? [a, b] : [b]) {
           context.beginPath();
           context.arc(x, y, 2.6, 0, 7);
           context.fill();
@@ -436,7 +436,7 @@ function tree(context, see, m, poses, colour, ghost, scene) {
   parts.sort((a, b) => b.depth - a.depth).forEach((part) => part.paint());
   if (ghost) return;
   context.fillStyle = ink("--ink");
-  for (const shape of m.shape.filter((one) => one.far < 0 && one.joint !== "free")) {
+  for (const shape of m.shape.filter((one) => one.far < 0 && !one.is_free)) {
     const [x, y] = see(shape.hang);
     context.beginPath();
     context.moveTo(x, y);
@@ -456,8 +456,8 @@ function tree(context, see, m, poses, colour, ghost, scene) {
   context.globalAlpha = 0.25;
   context.lineWidth = 2;
   poses.forEach(({ r }, k) => { // shadow
-    const { joint, far, hang } = m.shape[k];
-    const from = joint === "free" ? r : far < 0 ? hang : poses[far].r;
+    const { is_free, far, hang } = m.shape[k];
+    const from = is_free ? r : far < 0 ? hang : poses[far].r;
     polyline(context, [from, r].map((v) => see([v[0], v[1], scene.ground])));
   });
   context.globalAlpha = 1;

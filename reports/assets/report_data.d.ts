@@ -24,8 +24,8 @@ export interface CurveSet {
 }
 
 export type Vec = [number, number, number];
-/** Far body (−1 the world) and point, near body and point, and joint axes in both; joints that close loops have no half. */
-export interface Shape { joint: string; far: number; body: number; hang: Vec; near: Vec; far_axes: Vec[]; near_axes: Vec[]; axes: Vec[]; half: Vec }
+/** Whether the joint leaves its body free, and whether its points part; far body (−1 the world) and point, near body and point, and joint axes in both; joints that close loops have no half. */
+export interface Shape { is_free: boolean; is_apart: boolean; far: number; body: number; hang: Vec; near: Vec; far_axes: Vec[]; near_axes: Vec[]; axes: Vec[]; half: Vec }
 export interface MotionData {
   t: Float32Array; bodies: number; base: [string, string]; span: number; r: Int16Array; p: Int16Array; shape: Shape[];
   runs: { engine: string; integrator: string; scale: Float32Array; d: Int8Array }[];

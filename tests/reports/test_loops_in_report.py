@@ -37,7 +37,10 @@ def test_the_initial_state_is_drawn_with_every_joint(shown):
         assert motion["bodies"] == model.n and motion["base"] == ["", "t = 0"]
         drawn = motion["r"].reshape(-1, 3) * motion["span"] / 32767
         np.testing.assert_allclose(drawn, scenario.state.r, atol=motion["span"] / 32767)
-        assert [shape["joint"] for shape in motion["shape"]] == list(model.kind)
+        assert [shape["is_free"] for shape in motion["shape"]] == model.free.tolist()
+        assert all(
+            shape["is_apart"] for shape, is_rod in zip(motion["shape"], model.rods, strict=True) if is_rod
+        )
         ends = [[shape["far"], shape["body"]] for shape in motion["shape"]]
         assert np.array_equal(ends, model.body)
         assert [bool(shape["half"]) for shape in motion["shape"]] == [k < model.n for k in range(len(ends))]
