@@ -8,6 +8,7 @@ notes' rod and ball are
     universal    d; xᵀY                        φ₁ = atan2(zᵀY, yᵀY), φ₂ = atan2(xᵀZ, xᵀX)
     slide        xᵀd, yᵀd; xᵀY, yᵀZ, zᵀX       zᵀd
     cylindrical  xᵀd, yᵀd; xᵀZ, yᵀZ            zᵀd, φ as of the hinge
+    planar       zᵀd; xᵀZ, yᵀZ                 xᵀd, yᵀd, φ as of the hinge
     weld         d; xᵀY, yᵀZ, zᵀX
 """
 
@@ -124,6 +125,7 @@ KINDS: dict[Kind, JointKind] = {
     "universal": JointKind((*_POINT, ("x", "Y")), (("turn", 0), ("turn", 1))),
     "slide": JointKind((("x", "d"), ("y", "d"), *_ATTITUDE), (("slide", 2),)),
     "cylindrical": JointKind((("x", "d"), ("y", "d"), ("x", "Z"), ("y", "Z")), (("slide", 2), ("turn", 2))),
+    "planar": JointKind((("z", "d"), ("x", "Z"), ("y", "Z")), (("slide", 0), ("slide", 1), ("turn", 2))),
     "weld": JointKind((*_POINT, *_ATTITUDE)),
     "free": JointKind((), has_attitude=True),
 }
