@@ -261,17 +261,15 @@ class ExudynChain:
         """Read the constraints' multipliers.
 
         Returns:
-            Of joint k three (of a rod's distance one, then zeros), then that of the node's |p| = 1;
-            zeros where there are other joints.
+            Of a rod or ball k three (of a rod's distance one, then zeros), then that of the node's |p| = 1.
 
         """
         data, found = self.mbs.systemData, np.zeros((self.model.n, 4))
-        if not self.model.is_chain:
-            return found
         values = np.array(data.GetAECoordinates())
-        for k, (joint, node) in enumerate(zip(self.joints, self.nodes, strict=True)):
-            of_joint = values[data.GetObjectLTGAE(joint)]
-            found[k, : len(of_joint)] = of_joint
+        for k, node in enumerate(self.nodes):
+            if self.model.kinds[k].holds_no_turn:
+                of_joint = values[data.GetObjectLTGAE(self.joints[k])]
+                found[k, : len(of_joint)] = of_joint
             found[k, 3:] = values[data.GetNodeLTGAE(node)]
         return found
 
@@ -472,9 +470,7 @@ def _evaluate_state(chain: ExudynChain) -> StateQuantities:
         acceleration=chain.body_outputs(Output.Acceleration),
         angular_acceleration=chain.body_outputs(Output.AngularAccelerationLocal),
         joint_reaction=np.array(reaction) + elements[:, :3],
-        joint_moment=None
-        if chain.model.is_chain
-        else _joint_moments(chain, reaction, turning) + elements[:, 3:],
+        joint_moment=_joint_moments(chain, reaction, turning) + elements[:, 3:],
         kinetic_energy=kinetic,
         # its own PotentialEnergy is always 0, and springs have none
         potential_energy=elastic_energy(chain.model, chain.state) - float(np.sum(weight * r)),

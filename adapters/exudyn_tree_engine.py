@@ -7,7 +7,7 @@
 
     hinge, universal, slide, cylindrical: revolutes and slides along the joint's own axes, the inner links
            massless; a welded body is merged into its far body's link; a free body is attached to three slides
-           along the world's axes and a ball.  Of such trees the angular momentum is not in the momenta M q̇
+           along the world's axes and a ball
 
     rotors, springs, dampers, efforts: an ObjectGenericODE2 on the coordinates of their joints; a ball joint's
            would be functions of its three angles, and are not built
@@ -67,6 +67,7 @@ from plumbline.model.kinematics import (
     own_rates,
     quaternion_product,
     quaternion_rate,
+    rotate_vectors,
     rotation_matrix,
     velocity_jacobian,
 )
@@ -431,7 +432,6 @@ class ExudynTree(ExudynAdapter):
         "ball elements": "a ball joint of Exudyn's kinematic tree is three revolutes, whose angles are not "
         "the rotation vector that springs, dampers and rotors of ball joints act on",
         "joint_moment": "minimal coordinates have no moments at the joints",
-        "angular_momentum": "a kinematic tree has no output variable for the angular momentum of the whole",
         "angles": "each ball of the tree is three revolute joints, each rod two: singular at a right angle",
     }
     builds_trees = builds_elements = True
@@ -478,39 +478,22 @@ def _rk44_settings() -> Any:
 def _evaluate_state(tree: _KinematicTree) -> StateQuantities:
     """Evaluate all but joint forces, which minimal coordinates do not have, from M, f and outputs.
 
-    M q̈ = f,   T = ½ q̇ᵀ M q̇,   V = -Σ m g·r of its links,   μ = M q̇
+    M q̈ = f,   T = ½ q̇ᵀ M q̇,   V = -Σ m g·r,   angular momentum Σ r × m v + A J ω′
     """
     solver: Any = exudyn.MainSolverExplicit()
     with initialized_solver(solver, tree.mbs, _rk44_settings()):
         M, f = mass_matrix_and_force(solver, tree.mbs)
     tree.mbs.systemData.SetODE2Coordinates_tt(np.linalg.solve(M, f))
-    momentum = M @ tree.initial_angle_rates
-    masses = np.array(tree.mbs.GetObjectParameter(tree.tree, "linkMasses"))[tree.linkage.link_of_body]
-    if any(kind.is_rigid for kind in tree.model.kinds):  # links with several bodies
-        masses = tree.model.mass
     gravity = np.array(tree.mbs.GetObjectParameter(tree.tree, "gravity"))
-    W = tree.linkage.W
+    W, mass = tree.linkage.W, tree.model.mass  # links have the masses of several bodies where one is welded
+    r, v, omega = (tree.read_sensors(output) for output in SENSOR_OUTPUTS[:3])
+    spin = rotate_vectors(tree.linkage.attitude, rotate_vectors(tree.model.inertia, omega))
     return StateQuantities(
         acceleration=tree.read_sensors(Output.Acceleration),
         angular_acceleration=tree.read_sensors(Output.AngularAccelerationLocal),
-        kinetic_energy=float(0.5 * tree.initial_angle_rates @ momentum),
+        kinetic_energy=float(0.5 * tree.initial_angle_rates @ M @ tree.initial_angle_rates),
         potential_energy=elastic_energy(tree.model, tree.state)  # springs have no output of it
-        - float(masses @ (tree.read_sensors(Output.Position) @ gravity)),
-        angular_momentum=_angular_momentum(tree, momentum) if tree.model.is_chain else None,
+        - float(mass @ (r @ gravity)),
+        angular_momentum=np.sum(np.cross(r, mass[:, None] * v) + spin, axis=0),
         mass_matrix=W.T @ M @ W,
     )
-
-
-def _angular_momentum(tree: _KinematicTree, momentum: Array) -> Array:
-    """Return the angular momentum (3,) about the pivot of a chain from the momenta of its angles.
-
-    The momentum of an angle is the angular momentum of all beyond it about that angle's axis.  A ball at the
-    pivot has three axes there; a rod has two, and along u the angular momentum about the pivot is that about
-    the rod's end, where the ball's axes are.
-    """
-    first, *rest = tree.revolute_groups
-    L = first.axes[:, ::-1][:, : first.angle_count] @ momentum[: first.angle_count]
-    if first.angle_count == 2:
-        beyond = rest[0].axes[:, ::-1] @ momentum[2:5]
-        L = L + first.axes[:, 0] * (first.axes[:, 0] @ beyond)
-    return np.asarray(L)

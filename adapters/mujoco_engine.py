@@ -437,7 +437,7 @@ class _MujocoChain:
             acceleration=acceleration[:, 3:] + self.model.gravity,
             angular_acceleration=_to_body_frame(d.xmat[link], acceleration[:, :3]),
             joint_reaction=d.cfrc_int[link, 3:].copy(),
-            joint_moment=None if self.model.is_chain else self._joint_moments(),
+            joint_moment=self._joint_moments(),
             kinetic_energy=float(d.energy[1]),
             potential_energy=float(d.energy[0]),
             angular_momentum=d.subtree_angmom[0] + np.cross(com, momentum),
@@ -511,8 +511,6 @@ class _SoftMechanism:
         answer = self.cut.source_quantities(answer) if self.cut else answer
         if self.rodless:
             answer = self._with_rods(state, answer, self.rodless)
-        if self.source.is_chain:  # balls and rods transmit no moments
-            answer = replace(answer, joint_moment=None)
         if self.source.has_loops:
             return determinate_part(self.source, state, answer)
         return replace(answer, mass_matrix=None)

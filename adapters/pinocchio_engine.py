@@ -402,7 +402,7 @@ class PinocchioChain:
 
         """
         dexp = pin.dIntegrate(self.pin_model, q, theta, pin.ArgumentPosition.ARG1)
-        if self.joint_count <= MAX_DENSE_JOINTS or not self.source_model.is_chain:
+        if self.joint_count <= MAX_DENSE_JOINTS or any(joint.nv != 3 for joint in self.joints):
             return np.asarray(lapack.dgesv(dexp, v)[2])
         each = np.arange(self.joint_count)
         blocks = dexp.reshape(self.joint_count, 3, self.joint_count, 3)[each, :, each, :]  # the rest is zero
@@ -456,7 +456,7 @@ class PinocchioChain:
             acceleration=np.array(acceleration),
             angular_acceleration=np.array(angular),
             joint_reaction=np.array(reaction),
-            joint_moment=None if self.source_model.is_chain else np.array(moment),
+            joint_moment=np.array(moment),
             **energies_and_momentum(engine, data, q, v, elastic_energy(self.source_model, state)),
             mass_matrix=self._mass_matrix(state, q),
         )

@@ -99,7 +99,7 @@ class _FreeFlyerSystem:
             acceleration=np.matvec(turn, a[:, :3] + np.cross(state.omega, local)),
             angular_acceleration=a[:, 3:].copy(),
             joint_reaction=reaction,
-            joint_moment=None if model.is_chain else moment,
+            joint_moment=moment,
             mass_matrix=w.T @ inertia @ w,
             **energies_and_momentum(engine, data, q, v),
         )

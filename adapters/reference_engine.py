@@ -84,7 +84,7 @@ class Reference(MetamorphicHooks):
             x.pddot,
             x.joint_reaction,
             S,
-            None if system.chain.is_chain else x.joint_moment,
+            x.joint_moment,
             system.rotor_count,
             elements.evaluate(*at, joint_x).potential if elements else 0.0,
         )

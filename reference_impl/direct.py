@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,9 +43,7 @@ class Solution:
     tension: Float[Array, "joints"]  # N, 2 ℓ λ of the rods, positive in tension; NaN at ball joints
     # N, force on the near body at the near point, world frame: −C_rᵀ λ, with elements
     joint_reaction: Float[Array, "joints 3"]
-    joint_moment: Float[Array, "joints 3"] | None = (
-        None  # N m, moment on that body about that point, world frame
-    )
+    joint_moment: Float[Array, "joints 3"]  # N m, moment on that body about that point, world frame
     kept: Bool[Flags, "c"] | None = None  # of loops: False where a row depends on others, left out
 
 
@@ -303,13 +302,6 @@ class DirectSystem:
             self._run_rows, self._run_independence = kept, _independence(rows[kept])
         return kept
 
-    def _constraint_forces(self, multiplier: Array, joints: ConstraintRows) -> tuple[Array, Array]:
-        """Forces (J, 3) and generalised forces on p (J, 4) of the joints' rows on the near bodies."""
-        force, of_p = np.zeros((len(self.chain.kind), 3)), np.zeros((len(self.chain.kind), 4))
-        np.add.at(force, self.joint, -multiplier[:, None] * joints.r_near)
-        np.add.at(of_p, self.joint, -multiplier[:, None] * joints.p_near)
-        return force, of_p
-
     def _dense(self, values: Array) -> Array:
         S = np.zeros((self.size, self.size))
         S[self._i, self._j] = values
@@ -322,11 +314,9 @@ class DirectSystem:
         chain, elements, rotors = self.chain, None, np.zeros(0)
         joints = constraint_rows(chain, r, p, v, pdot)
         if self.elements:
-            elements, own = self.elements.evaluate(r, p, v, pdot, x), self.elements.rotors
-            rotors = self.elements.armature[own]
-            rows = elements.r_near[own], elements.p_near[own], elements.p_far[own], -elements.bias[own]
-            of_rotors = self.elements.joint[own]
-            joints = joints.followed_by(of_rotors, *chain.body[of_rotors, ::-1].T, *rows)
+            elements = self.elements.evaluate(r, p, v, pdot, x)
+            rotors = self.elements.armature[self.elements.rotors]
+            joints = self.elements.with_rotors(joints, elements)
         L_, L_rate = L(p), L(pdot)
         JL = chain.inertia @ L_
         blocks = (
@@ -357,56 +347,64 @@ class DirectSystem:
         """The parts of x, and λ as forces."""
         n, c = self.chain.n, len(self.joint)
         multiplier = x[7 * n : 7 * n + c]
-        reaction, of_p = self._constraint_forces(multiplier, joints)
-        if self.elements and elements:
-            np.add.at(reaction, self.elements.joint, elements.torque[:, None] * elements.r_near)
-            np.add.at(of_p, self.elements.joint, elements.torque[:, None] * elements.p_near)
-        tension, rod = np.full(len(self.chain.kind), np.nan), self._rods
-        tension[rod] = 2 * self.chain.length[rod] * multiplier[rod[self.joint]]
+        rows = self.joint, multiplier, joints.r_near, joints.p_near
+        of_elements = (self.elements.joint, elements) if self.elements and elements else None
         return Solution(
             acceleration=x[: 3 * n].reshape(n, 3),
             pddot=x[3 * n : 7 * n].reshape(n, 4),
             multiplier=multiplier,
             norm_multiplier=x[7 * n + c :],
             joint=self.joint,
-            tension=tension,
-            joint_reaction=reaction,
-            joint_moment=joint_moments(self.chain, p, reaction, of_p),
+            **joint_forces(self.chain, p, rows, of_elements),
         )
 
 
-def joint_moments(
-    chain: Mechanism,
+def joint_forces(
+    mechanism: Mechanism,
     p: Float[Array, "bodies 4"],
-    force: Float[Array, "joints 3"],
-    of_p: Float[Array, "joints 4"],
-) -> Float[Array, "joints 3"]:
-    """Compute the moments about the near points of wrenches given by force and generalised force on p.
+    rows: tuple[Int[Indices, "c"], Float[Array, "c"], Float[Array, "c 3"], Float[Array, "c 4"]],
+    of_elements: tuple[Int[Indices, "e"], ElementForces] | None = None,
+) -> dict[str, Any]:
+    """Compute what the rows and the elements of the joints do to the near bodies.
 
     A ½ L Q_p is the moment about the centre of mass; L p = 0 takes the normalisation's share out (E2).
 
     Args:
-        force: [N], on the near bodies, world frame.
-        of_p: Q_p [N m].
+        rows: of each its joint, its multiplier, and ∂/∂r and ∂/∂p of the near body.
+        of_elements: the joints of the elements, and the elements.
 
     Returns:
-        [N m], world frame.
+        The fields ``tension``, ``joint_reaction`` and ``joint_moment`` of `Solution`.
 
     """
-    p = p[chain.body[:, 1]]
+    joint, multiplier, r_near, p_near = rows
+    force, of_p = np.zeros((len(mechanism.kind), 3)), np.zeros((len(mechanism.kind), 4))
+    np.subtract.at(force, joint, multiplier[:, None] * r_near)
+    np.subtract.at(of_p, joint, multiplier[:, None] * p_near)
+    if of_elements:
+        at, found = of_elements
+        np.add.at(force, at, found.torque[:, None] * found.r_near)
+        np.add.at(of_p, at, found.torque[:, None] * found.p_near)
+    tension, rod = np.full(len(mechanism.kind), np.nan), mechanism.rods
+    tension[rod] = 2 * mechanism.length[rod] * multiplier[rod[joint]]
+    p = p[mechanism.body[:, 1]]
     turn = A(p)
-    near = (turn @ chain.point[:, 1, :, None])[..., 0]
+    near = (turn @ mechanism.point[:, 1, :, None])[..., 0]
     about_centre = (turn @ (L(p) @ of_p[..., None]))[..., 0] / 2
-    return np.asarray(about_centre - np.cross(near, force))
+    moment = np.asarray(about_centre - np.cross(near, force))
+    return {"tension": tension, "joint_reaction": force, "joint_moment": moment}
 
 
 def _band_order(chain: Mechanism) -> NDArray[np.intp]:
     """Places (N,) of the bodies and their joints in the band: near each other where joined."""
-    if chain.is_chain:
-        return np.arange(chain.n)
     far, near = chain.body[chain.body[:, 0] >= 0].T
     order = reverse_cuthill_mckee(csr_array((np.ones(len(far)), (far, near)), (chain.n, chain.n)))
-    return np.argsort(order)
+
+    def width(place: NDArray[np.intp]) -> int:  # about; rows stand before their near bodies
+        distance = place[near] - place[far]
+        return int(np.max(np.where(distance > 0, 2 * distance, 1 - 2 * distance), initial=0))
+
+    return min(np.argsort(order), np.arange(chain.n), key=width)
 
 
 def independent_rows(

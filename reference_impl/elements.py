@@ -21,11 +21,12 @@ the far to the near body, along whose axis the torque −k θ u acts: V = ½ k �
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from reference_impl.euler_parameters import A, G, L, cross, dot
+from reference_impl.joints import ConstraintRows
 from reference_impl.mechanism import Array, Float, Mechanism
 
 
@@ -153,6 +154,15 @@ class Elements:
             potential=potential + float(self.stiffness @ stretch**2) / 2,
             dissipation=lost + float(self.damping @ rate**2),
         )
+
+    def with_rotors(self, rows: ConstraintRows, found: ElementForces) -> ConstraintRows:
+        """Append the rows of the rotors to those of the joints: they hold nothing, C counts as 0."""
+        own = self.rotors
+        near, far = self.bodies[:, own]
+        p_far = np.where(far[:, None] < 0, 0.0, found.p_far[own])
+        more = {"joint": self.joint[own], "near": near, "far": far, "C": np.zeros(len(own)), "p_far": p_far}
+        more |= {"r_near": found.r_near[own], "p_near": found.p_near[own], "gamma": -found.bias[own]}
+        return replace(rows, **{name: np.concatenate([getattr(rows, name), x]) for name, x in more.items()})
 
     def _angles(self, f: Array, h: Array, p: Array, x: Array | None) -> Array:
         """Angles (e,) of turns, and of balls the components of the rotation vector."""

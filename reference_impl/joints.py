@@ -22,7 +22,7 @@ dᵀd of (L2, L3).  For one and two bodies on rods these are S1–S4 and D2–D6
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -47,17 +47,6 @@ class ConstraintRows:
     p_far: Shaped[AnyArray, "c 4"]  # ∂C/∂p of the far body; 0 for the world
     gamma: Shaped[AnyArray, "c"]  # C̈ = C_r r̈ + C_p p̈ − γ
     d: Shaped[AnyArray, "joints 3"]  # m, world frame, from the far to the near point of joint k
-
-    def followed_by(self, joint: Int[Indices, "m"], *rows: AnyArray) -> ConstraintRows:
-        """Append rows that hold nothing: those of rotors, whose C counts as 0.
-
-        Args:
-            *rows: their near and far bodies (m,), and ∂/∂r near, ∂/∂p near, ∂/∂p far and γ.
-
-        """
-        names = ("joint", "near", "far", "r_near", "p_near", "p_far", "gamma", "C")
-        more = zip(names, (joint, *rows, np.zeros(len(joint))), strict=True)
-        return replace(self, **{name: np.concatenate([getattr(self, name), x]) for name, x in more})
 
     def constraint_rate(
         self, v: Shaped[AnyArray, "bodies 3"], pdot: Shaped[AnyArray, "bodies 4"]

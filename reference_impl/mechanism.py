@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
@@ -273,6 +274,31 @@ class Mechanism:
     def has_loads(self) -> bool:
         """Whether any constant force or moment is applied."""
         return bool(np.any(self.force) or np.any(self.moment))
+
+
+def side_by_side(mechanisms: Sequence[Mechanism]) -> Mechanism:
+    """Join mechanisms to one.
+
+    Args:
+        mechanisms: of any bodies and joints; of loops the rows are right, but joint k holds another body.
+
+    Returns:
+        All of them, without gravity, which may differ between them.
+
+    """
+    first = np.cumsum([0, *(mechanism.n for mechanism in mechanisms)])
+    fields: dict[str, Any] = {}
+    for name in vars(mechanisms[0]):
+        parts = [getattr(mechanism, name) for mechanism in mechanisms]
+        if name == "kind":
+            fields[name] = sum(parts, ())
+        elif name in ("body", "spring_body"):
+            fields[name] = np.concatenate(
+                [np.where(x < 0, x, x + at) for x, at in zip(parts, first, strict=False)]
+            )
+        else:
+            fields[name] = np.zeros(3) if name == "gravity" else np.concatenate(parts)
+    return Mechanism(**fields)
 
 
 @lru_cache(maxsize=64)  # what is computed of a mechanism is remembered by its identity

@@ -186,6 +186,8 @@ class Adapter(ABC):
         if model.has_loops:
             pairs = zip(states, answers, strict=True)
             answers = [determinate_part(model, state, answer) for state, answer in pairs]
+        if model.is_chain:  # whose moments are 0, and which the causes of chains do not predict yet
+            answers = [replace(answer, joint_moment=None) for answer in answers]
         return answers
 
     def simulate(

@@ -314,8 +314,6 @@ class ScenarioRun:
 
         """
         s, truth = self.scenario, self.truths.get(TaskKind.MOTION_TRUTH)
-        more = () if s.model.is_chain else ("r", "v", "x", "xdot")
-        state_keys = ("p", "omega", "u", "udot", *more)
         about = {
             "family": s.family,
             "title": s.title,
@@ -330,7 +328,7 @@ class ScenarioRun:
             "digest": s.digest,
             "seed": s.seed,
             "model": {key: np.asarray(value).tolist() for key, value in s.model.fields.items()},
-            "state": {key: getattr(s.state, key).tolist() for key in state_keys},
+            "state": {key: value.tolist() for key, value in vars(s.state).items()},
         }
         if isinstance(truth, MotionTruth):
             about |= {

@@ -459,8 +459,6 @@ def _visited_states(motion: AccurateMotion) -> list[State]:
     found = [
         project_to_manifold(model, q[:, :3], q[:, 3:], rate[:, :3], rate[:, 3:]) for q, rate in samples[along]
     ]
-    if model.is_chain:
-        return found
     return [with_joint_coordinates(model, one) for one in found]
 
 

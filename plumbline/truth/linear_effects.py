@@ -29,7 +29,7 @@ from plumbline.model.kinematics import (
 from plumbline.model.loops import determinate_projectors, wrench_length
 from reference_impl.direct import DirectSystem
 from reference_impl.elements import ElementForces
-from reference_impl.fast.tree_elimination import side_by_side
+from reference_impl.mechanism import side_by_side
 
 NO_ROTOR = 1e-200  # kg m² or kg, of a coordinate without a rotor: its row stays
 

@@ -24,10 +24,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import lapack
 
-from reference_impl.direct import EPS, Solution, check_state_solvable
+from reference_impl.direct import EPS, Solution, check_state_solvable, joint_forces
 from reference_impl.euler_parameters import G, L, tilde
-from reference_impl.joints import joint_of_rows
-from reference_impl.mechanism import Array, Float, Mechanism
+from reference_impl.joints import constraint_rows
+from reference_impl.mechanism import Array, Float, Mechanism, side_by_side
 from reference_impl.singular_system import SingularSystem
 
 # Constants that turn flattened outer products of p with another vector into what is needed of them.
@@ -484,21 +484,17 @@ class StructuredSystem:
             hung = np.append(rods[1:], False)
             turn_far = np.where(hung, 2 * self._at_child(mu[0]) * (self._at_child(d) + As[1]), turn_far)
         spin = _dot(omega, _matrix_vector(self.J, omega)) / _dot(q[3:], q[3:])
-        row = np.concatenate(
-            [joint_of_rows(chain) + at for chain, at in zip(self.chains, self.first_body, strict=False)]
-        )
         kept = np.ones((self.body_count, self.rows_per_joint), dtype=bool)
         kept[self.rods, 1:] = False
-        tension = np.full(self.body_count, np.nan)
-        tension[self.rods] = -2 * (self.length * mu[0])[self.rods]
+        forest, multiplier = side_by_side(self.chains), -mu.T[kept]
+        rows = constraint_rows(forest, r, p, v, pdot)
         return Solution(
             acceleration=motion[:3].T,
             pddot=motion[3:].T,
-            multiplier=-mu.T[kept],
+            multiplier=multiplier,
             norm_multiplier=spin + _dot(Rs[0] + self.s[0], turn_near) - _dot(Rs[1] + self.s[1], turn_far),
-            joint=row,
-            tension=tension,
-            joint_reaction=reaction.T,
+            joint=rows.joint,
+            **joint_forces(forest, p, (rows.joint, multiplier, rows.r_near, rows.p_near)),
         )
 
     # -- the manifold -------------------------------------------------------------------------------

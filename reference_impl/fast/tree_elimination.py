@@ -26,7 +26,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -34,15 +33,15 @@ from reference_impl.direct import (
     RUN_RANK_TOLERANCE,
     Solution,
     independent_rows,
-    joint_moments,
+    joint_forces,
     power_of_two_scale,
 )
-from reference_impl.elements import Elements
+from reference_impl.elements import ElementForces, Elements
 from reference_impl.euler_parameters import L, angular_velocity, cross, dot
 from reference_impl.fast.chain_elimination import StructuredSystem, component_first
 from reference_impl.integrate import Acceleration
-from reference_impl.joints import constraint_rows, joint_of_rows
-from reference_impl.mechanism import Array, Float, Indices, Int, Mechanism
+from reference_impl.joints import ConstraintRows, constraint_rows, joint_of_rows
+from reference_impl.mechanism import Array, Float, Indices, Int, Mechanism, side_by_side
 from reference_impl.singular_system import SingularSystem
 
 
@@ -53,20 +52,6 @@ class _Level:
     body: Int[Indices, "g"]  # their near bodies
     far: Int[Indices, "g"]  # their far bodies, −1 the world
     row: Int[Indices, "g c"]
-
-
-@dataclass(frozen=True, eq=False)
-class _Rows:
-    """The rows of all joints, then of all rotors; forces of elements."""
-
-    C: Float[Array, "c"]
-    rate: Float[Array, "c"]  # Ċ
-    r_near: Array  # (rows, 3)
-    p_near: Array  # (rows, 4)
-    p_far: Array  # (rows, 4)
-    gamma: Array  # (rows,)
-    element_force: tuple[Array, Array] | None = None  # (M, 3) and of p (M, 4), of elements but rotors
-    of_joints: tuple[Array, Array] | None = None  # (e, 3), (e, 4): of joint coordinates on near bodies
 
 
 class TreeSystem:
@@ -152,14 +137,14 @@ class TreeSystem:
 
     def _solve_motion(
         self, q: Array, v: Array, a: float, x: Array | None, refine: bool = False
-    ) -> tuple[Array, Array, _Rows]:
-        """(r̈; p̈) (7, M), the multipliers of all rows, and the rows."""
+    ) -> tuple[Array, Array, ConstraintRows, ElementForces | None]:
+        """(r̈; p̈) (7, M), the multipliers of all rows, the rows, and what elements there are."""
         (p, rdot, pdot), forest = (q[3:].T, v[:3].T, v[3:].T), self.forest
         with np.errstate(all="ignore"):  # what is not finite raises SingularSystem
-            rows = self._rows(q, v, x)
+            rows, rate, elements = self._rows(q, v, x)
             gamma, norm, sigma, stretch = rows.gamma, dot(p, p), dot(p, pdot), dot(pdot, pdot)
             if a:
-                gamma[: len(rows.C)] -= 2 * a * rows.rate + a * a * rows.C
+                gamma -= 2 * a * rate + a * a * rows.C
                 stretch = stretch + 2 * a * sigma + 0.5 * a * a * (norm - 1)
             omega = angular_velocity(p, pdot)
             momentum = np.matvec(forest.inertia, omega)
@@ -168,15 +153,15 @@ class TreeSystem:
             moment = moment - (cross(omega, momentum) + 2 * sigma[:, None] * momentum) / norm[:, None]
             along = p * (stretch / norm)[:, None]  # −p̈ along p
             gamma = gamma + dot(rows.p_near, along[self.near]) + dot(rows.p_far, along[self.far])
-            if rows.element_force is not None:
-                force, of_p = force + rows.element_force[0], rows.element_force[1]
-                moment = moment + np.matvec(L(p), of_p) / (2 * norm)[:, None]
+            if elements:
+                force = force + elements.force
+                moment = moment + np.matvec(L(p), elements.p_force) / (2 * norm)[:, None]
             body_terms = np.concatenate([force, moment], 1)
             linear, turn, multiplier = self._eliminate(rows, p, body_terms, gamma, refine)
         found = component_first(linear, turn - along)
         if not np.isfinite(found.sum()):
             raise SingularSystem("the accelerations are not finite: S is singular, or the state is no number")
-        return found, multiplier, rows
+        return found, multiplier, rows, elements
 
     def solve(
         self,
@@ -203,25 +188,16 @@ class TreeSystem:
 
         """
         q, qdot = component_first(r, p), component_first(v, pdot)
-        motion, multiplier, rows = self._solve_motion(q, qdot, 0.0, x, refine=True)
-        forest, c = self.forest, len(rows.C)
-        pull, of_p = np.zeros((self.joint_count, 3)), np.zeros((self.joint_count, 4))
-        np.subtract.at(pull, self.joint, multiplier[:, None] * rows.r_near)
-        np.subtract.at(of_p, self.joint, multiplier[:, None] * rows.p_near)
-        if rows.of_joints is not None and self.elements:
-            np.add.at(pull, self.elements.joint, rows.of_joints[0])
-            np.add.at(of_p, self.elements.joint, rows.of_joints[1])
-        tension, rod = np.full(self.joint_count, np.nan), forest.rods
-        tension[rod] = 2 * forest.length[rod] * multiplier[:c][rod[self.joint[:c]]]
+        motion, multiplier, rows, elements = self._solve_motion(q, qdot, 0.0, x, refine=True)
+        c = len(self.joint) - np.count_nonzero(self.compliance)
+        of_elements = (self.elements.joint, elements) if self.elements and elements else None
         return Solution(
             acceleration=motion[:3].T,
             pddot=motion[3:].T,
             multiplier=multiplier[:c],
             norm_multiplier=np.full(self.body_count, np.nan),
             joint=self.joint[:c],
-            tension=tension,
-            joint_reaction=pull,
-            joint_moment=joint_moments(forest, p, pull, of_p),
+            **joint_forces(self.forest, p, (self.joint, multiplier, rows.r_near, rows.p_near), of_elements),
         )
 
     def project(
@@ -244,40 +220,29 @@ class TreeSystem:
         rest = np.zeros((self.body_count, 6))
         for _ in range(2):  # the second step takes the square of the gap away
             q[3:] /= np.sqrt(dot(q[3:].T, q[3:].T))
-            rows = self._rows(q, v)
-            q += component_first(*self._eliminate(rows, q[3:].T, rest, -self._with_rotors(rows.C))[:2])
+            rows = self._rows(q, v)[0]
+            q += component_first(*self._eliminate(rows, q[3:].T, rest, -rows.C)[:2])
         q[3:] /= np.sqrt(dot(q[3:].T, q[3:].T))
         v[3:] -= q[3:] * dot(q[3:].T, v[3:].T)
-        rows = self._rows(q, v)
-        v += component_first(*self._eliminate(rows, q[3:].T, rest, -self._with_rotors(rows.rate))[:2])
+        rows, rate, _ = self._rows(q, v)
+        v += component_first(*self._eliminate(rows, q[3:].T, rest, -rate)[:2])
         return q, v
 
-    def _with_rotors(self, values: Array) -> Array:
-        """Append zeros for the rows of rotors."""
-        return np.concatenate([values, np.zeros(len(self.joint) - len(values))])
-
-    def _rows(self, q: Array, v: Array, x: Float[Array, "joints coordinates"] | None = None) -> _Rows:
+    def _rows(
+        self, q: Array, v: Array, x: Float[Array, "joints coordinates"] | None = None
+    ) -> tuple[ConstraintRows, Array, ElementForces | None]:
+        """The rows of all joints and then of all rotors, Ċ, and the elements."""
         state = q[:3].T, q[3:].T, v[:3].T, v[3:].T
         rows = constraint_rows(self.forest, *state)
         rate = rows.constraint_rate(*state[2:])
-        parts = rows.r_near, rows.p_near, rows.p_far, rows.gamma
         if self.elements is None:
-            return _Rows(rows.C, rate, *parts)
+            return rows, rate, None
         found = self.elements.evaluate(*state, self.x if x is None else x)
-        rotors = self.elements.rotors
-        p_far = np.where(self.forest.body[self.elements.joint, 0, None] < 0, 0.0, found.p_far)
-        own = found.r_near, found.p_near, p_far, -found.bias
-        r_near, p_near, p_far, gamma = (
-            np.concatenate([part, more[rotors]]) for part, more in zip(parts, own, strict=True)
-        )
-        torque = found.torque[:, None]
-        return _Rows(
-            rows.C, rate, r_near, p_near, p_far, gamma, (found.force, found.p_force),
-            (torque * found.r_near, torque * found.p_near),
-        )  # fmt: skip
+        rotors = np.zeros(len(self.elements.rotors))
+        return self.elements.with_rotors(rows, found), np.concatenate([rate, rotors]), found
 
     def _eliminate(
-        self, rows: _Rows, p: Array, wrench: Array, gamma: Array, refine: bool = False
+        self, rows: ConstraintRows, p: Array, wrench: Array, gamma: Array, refine: bool = False
     ) -> tuple[Array, Array, Array]:
         """Solve for a: r̈ (M, 3) and Lᵀα/2π (M, 4), with b = ``wrench`` (M, 6); and for all multipliers.
 
@@ -412,28 +377,3 @@ def eliminated_acceleration(chain: Mechanism) -> Acceleration:
         return np.concatenate([a[:3].T.ravel(), a[3:].T.ravel()])
 
     return acceleration
-
-
-def side_by_side(mechanisms: Sequence[Mechanism]) -> Mechanism:
-    """Join mechanisms to one.
-
-    Args:
-        mechanisms: of any bodies and joints; of loops the rows are right, but joint k holds another body.
-
-    Returns:
-        All of them, without gravity, which may differ between them.
-
-    """
-    first = np.cumsum([0, *(mechanism.n for mechanism in mechanisms)])
-    fields: dict[str, Any] = {}
-    for name in vars(mechanisms[0]):
-        parts = [getattr(mechanism, name) for mechanism in mechanisms]
-        if name == "kind":
-            fields[name] = sum(parts, ())
-        elif name in ("body", "spring_body"):
-            fields[name] = np.concatenate(
-                [np.where(x < 0, x, x + at) for x, at in zip(parts, first, strict=False)]
-            )
-        else:
-            fields[name] = np.zeros(3) if name == "gravity" else np.concatenate(parts)
-    return Mechanism(**fields)
