@@ -287,9 +287,12 @@ def side_by_side(mechanisms: Sequence[Mechanism]) -> Mechanism:
 
     """
     first = np.cumsum([0, *(mechanism.n for mechanism in mechanisms)])
+    columns = max(mechanism.columns for mechanism in mechanisms)
     fields: dict[str, Any] = {}
     for name in vars(mechanisms[0]):
         parts = [getattr(mechanism, name) for mechanism in mechanisms]
+        if name in JOINT_ELEMENTS:
+            parts = [np.pad(part, ((0, 0), (0, columns - part.shape[1]))) for part in parts]
         if name == "kind":
             fields[name] = sum(parts, ())
         elif name in ("body", "spring_body"):

@@ -20,6 +20,7 @@ ORDER_MARGIN = 0.3  # orders are 1, 2 or 4; the next term of the error moves the
 ENGINES = ["reference", "mujoco", "pinocchio", "exudyn", "exudyn-tree"]
 MIXES = {
     "jointed": ("hinge", "universal", "slide", "cylindrical", "weld"),
+    "planar": ("hinge", "planar"),
     "all": ("rod", "ball", "hinge", "universal", "slide", "cylindrical", "weld", "free"),
 }
 

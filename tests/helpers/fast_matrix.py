@@ -22,6 +22,7 @@ STEPS = MOTIONS | {
     "drag-rod": "loads on a rod",
     "double-rod-then-ball": "a ball on a rod",
     "sprung-cylinder": "a cylindrical joint",
+    "planar-top": "a planar joint",
     "universal-pendulum": "a universal joint",
     "wrecking-ball": "a weld",
 }
