@@ -14,7 +14,7 @@ from scipy.sparse.linalg import splu
 
 from adapters import exudyn_engine, mujoco_engine, pinocchio_engine
 from adapters.exudyn_common import make_settings
-from plumbline.model.datatypes import Array, Model, State
+from plumbline.model.datatypes import HINGE, Array, Model, State
 from plumbline.model.kinematics import quaternion_rate
 from plumbline.model.random_mechanisms import random_tree
 from plumbline.model.sampling import random_states
@@ -60,8 +60,8 @@ def hinge_tree(shape: Literal["chain", "binary tree", "star"], bodies: int) -> t
         far[first], half = above, count // 2
         branches = (first, first + 1, half), (first, first + 1 + half, count - 1 - half)
         waiting += [branch for branch in branches if branch[2] > 0]
-    drawn = random_tree(np.random.default_rng(1), bodies, ("hinge",), loads=False)
-    model = drawn.changed(body=np.stack([far, np.arange(bodies)], axis=1), kind=("hinge",) * bodies)
+    drawn = random_tree(np.random.default_rng(1), bodies, (HINGE,), loads=False)
+    model = drawn.changed(body=np.stack([far, np.arange(bodies)], axis=1), kind=(HINGE,) * bodies)
     (state,) = random_states(model, 1, 1)
     return model, state
 

@@ -143,7 +143,7 @@ def prepare_file(
     folder = (root or package_folder(path)).resolve()
     if mjcf.resolve_inside(path, folder) is None:
         raise ModelFileError([Problem(shown, 0, 0, "", f"is outside the root folder {folder}")])
-    chosen: Base = "free" if base == "free" else "fixed"
+    chosen: Base = "fixed" if base == "auto" else base
     if kind == "mjcf" and base != "auto":
         hint = "leave --base out, or add or remove the <freejoint> in the file"
         raise ModelFileError(

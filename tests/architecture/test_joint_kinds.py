@@ -11,9 +11,8 @@ from tests.architecture.test_layers import MODULES
 OWN_TABLES = r"""
     reference_impl\.joint_kinds      # the table
     | plumbline\.truth\.certificate_(file|checker)  # certificates are checked without the code that made them
-    | plumbline\.(importers|model_files|cli)\..*  # elementary joints of robots' files; --base free
-    | plumbline\.storage\.results_store  # the base of a model file
-    | adapters\..* | bench\..*
+    | plumbline\.(importers|model_files)\..*  # elementary joints of robots' files
+    | adapters\..*
 """
 OTHER_MEANINGS = {"slide": "a motion"}
 FILES = [
@@ -24,11 +23,15 @@ FILES = [
 
 
 def kinds_named(tree):
-    """Words of kinds that stand as text by themselves, but in types."""
+    """Words of kinds that stand as text by themselves, but in types and lists of bases of robots' files."""
     types = [node for node in ast.walk(tree) if isinstance(node, ast.Subscript)]
     literals = [node for node in types if isinstance(node.value, ast.Name) and node.value.id == "Literal"]
     in_types = {id(constant) for node in literals for constant in ast.walk(node)}
-    texts = [node for node in ast.walk(tree) if isinstance(node, ast.Constant) and id(node) not in in_types]
+    lists = [node.elts for node in ast.walk(tree) if isinstance(node, ast.List | ast.Tuple)]
+    words = [[one for one in elements if isinstance(one, ast.Constant)] for elements in lists]
+    of_bases = {id(one) for some in words if "fixed" in [one.value for one in some] for one in some}
+    texts = [node for node in ast.walk(tree) if isinstance(node, ast.Constant)]
+    texts = [node for node in texts if id(node) not in in_types | of_bases]
     return {node.value for node in texts if node.value in KINDS.keys() - OTHER_MEANINGS.keys()}
 
 
