@@ -294,7 +294,6 @@ ANSWERS: dict[str, tuple[Callable[[Answers], Any], str]] = {
     "momentum_list": (with_field(angular_momentum=list), "angular_momentum is a value of type list of 3"),
     "mass_matrix_flat": (with_field(mass_matrix=np.ravel), "mass_matrix has shape (9,), expected (3, 3)"),
     "reaction_dict": (with_field(joint_reaction=lambda f: {"f": f}), "joint_reaction is a value"),
-    "moment_of_a_ball": (with_field(joint_moment=lambda _: np.zeros((1, 3))), "must be None: balls and rods"),
     "limits_list": (with_field(limit_error=lambda _: [1.0]), "limit_error is a value of type list of 1"),
     "limits_of_nothing": (with_field(limit_error=lambda _: {"speed": 1.0}), "limit_error is a value"),
     "records_dict": (lambda right: [vars(one) for one in right], "must be a StateQuantities"),
@@ -389,7 +388,7 @@ for _name, (_, _words) in AT_IMPORT.items():
 
 FAST = (
     "import_exit_0", "evaluation_interrupt", "evaluation_unprintable", "declared_version_none",
-    "answers_list", "answers_moment_of_a_ball", "after_start_daemon",
+    "answers_list", "after_start_daemon",
 )  # fmt: skip
 NOT_AN_ADAPTER = dict
 
