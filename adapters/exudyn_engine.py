@@ -307,6 +307,8 @@ class Exudyn(ExudynAdapter):
     gaps: ClassVar[Mapping[str, str]] = {
         "rotors": "Exudyn has no rotor between two bodies in maximal coordinates",
         "ball springs": "Exudyn has no spring along the rotation vector of a ball joint",
+        "planar elements": "the force of Exudyn's linear spring acts along its axis at both points, which in "
+        "a joint with two slides are not on one line",
         "universal springs": "the angle of Exudyn's torsional spring, atan2(-A01, A00) of the relative turn, "
         "is that of a joint with one turn, not of a universal joint",
     }

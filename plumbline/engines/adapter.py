@@ -50,6 +50,7 @@ UNSUPPORTED_KINDS = {
     "integrators": "the engine evaluates states and does not simulate",
 }
 _BALLS: Callable[[JointKind], bool] = attrgetter("is_spherical")
+_TWO_SLIDES: Callable[[JointKind], bool] = lambda kind: len(kind.slide_axes) > 1  # noqa: E731
 _TWO_TURNS: Callable[[JointKind], bool] = attrgetter("exchanges_axes")
 # Mechanisms that an adapter may declare as gaps: it is not asked about them, and must not refuse others so.
 MODEL_GAPS: Mapping[str, Callable[[Model], bool]] = {
@@ -60,6 +61,7 @@ MODEL_GAPS: Mapping[str, Callable[[Model], bool]] = {
     "rotors": lambda model: bool(np.any(model.armature)),
     "ball elements": lambda model: _has_elements(model, _BALLS, "armature", "damping", "stiffness"),
     "ball springs": lambda model: _has_elements(model, _BALLS, "damping", "stiffness"),
+    "planar elements": lambda model: _has_elements(model, _TWO_SLIDES, "damping", "stiffness", "effort"),
     "universal springs": lambda model: _has_elements(model, _TWO_TURNS, "stiffness"),
     "point masses": lambda model: model.lacks_inertia,
     "bodies": lambda model: model.n > 1,

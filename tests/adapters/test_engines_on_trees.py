@@ -77,7 +77,7 @@ def test_a_turn_without_inertia_is_found():
     assert motion_without_inertia(replace(model, inertia=model.inertia + 1e-3 * np.eye(3)), state) is None
 
 
-MOVING = ("ball", "hinge", "universal", "slide", "cylindrical")
+MOVING = ("ball", "hinge", "universal", "slide", "cylindrical", "planar")
 # what an engine cannot build: element, kind of joint, and words of its reason
 MISSING = {
     "pinocchio-maximal": [(element, None, "no joints with rotors, springs") for element in ELEMENTS],
@@ -85,6 +85,7 @@ MISSING = {
         ("armature", None, "no rotor between two bodies"),
         *((element, "ball", "rotation vector") for element in ("damping", "stiffness")),
         ("stiffness", "universal", "a joint with one turn"),
+        *((element, "planar", "two slides") for element in ("damping", "stiffness", "effort")),
     ],
     "exudyn-tree": [(element, "ball", "three revolutes") for element in ("armature", "damping", "stiffness")],
 }
