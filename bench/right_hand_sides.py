@@ -14,7 +14,7 @@ from scipy.sparse.linalg import splu
 
 from adapters import exudyn_engine, mujoco_engine, pinocchio_engine
 from adapters.exudyn_common import make_settings
-from plumbline.model.datatypes import HINGE, Array, Model, State
+from plumbline.model.datatypes import BALL, HINGE, ROD, Array, Model, State
 from plumbline.model.kinematics import quaternion_rate
 from plumbline.model.random_mechanisms import random_tree
 from plumbline.model.sampling import random_states
@@ -35,7 +35,7 @@ def random_pendulum(bodies: int, rods: bool = False, seed: int = 1) -> tuple[Mod
         The model and a state on its manifold.
 
     """
-    drawn = random_tree(np.random.default_rng(seed), bodies, ("rod" if rods else "ball",), loads=False)
+    drawn = random_tree(np.random.default_rng(seed), bodies, (ROD if rods else BALL,), loads=False)
     body, point = np.arange(bodies)[:, None] + [-1, 0], drawn.point.copy()
     point[0, 0] = 0.0
     model = drawn.changed(body=body, point=point)
