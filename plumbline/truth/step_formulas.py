@@ -24,7 +24,8 @@ from plumbline.truth.step_charts import BodyStates, LongDouble, StepCharts
 
 Array = NDArray[Any]  # in this module of extended precision, where nothing else is stated
 Coordinates = list[Array]
-HAS_EXTENDED_PRECISION = np.finfo(LongDouble).eps < 1e-18  # False on Apple's arm64 and with MSVC
+MAX_EXTENDED_EPSILON = 1e-18  # of the numbers that formulas of steps need
+HAS_EXTENDED_PRECISION = np.finfo(LongDouble).eps < MAX_EXTENDED_EPSILON
 
 
 def joint_space_steps(
