@@ -13,6 +13,7 @@ import pytest
 
 from plumbline.engines.environments import _run_uv
 from plumbline.truth import has_independent_truth
+from tests.helpers.dask_cluster import cluster
 from tools.release import problem, release_notes
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -77,6 +78,25 @@ def test_installed_it_compares_engines_and_writes_one_folder(unpacked, tmp_path)
     assert "14 agree" in done.stdout
     run = json.loads((tmp_path / "plumbline-out/results.json").read_text())["run"]
     assert run["commit"] is None and "certified" in run["truth"]
+
+
+@pytest.mark.timeout(300)
+def test_installed_it_runs_on_a_cluster_without_a_checkout(unpacked, tmp_path):
+    pytest.importorskip("distributed")
+    words = (
+        "run",
+        "tumbling-ball",
+        "--level",
+        "state",
+        "--engine",
+        "reference",
+        "--engine",
+        "mujoco",
+        "--fresh",
+    )
+    with cluster(tmp_path, 1, import_path=unpacked) as (address, _):
+        done = run_installed(unpacked, tmp_path, *words, "--scheduler", address)
+    assert done.returncode == 0 and "14 agree" in done.stdout, done.stdout + done.stderr
 
 
 def test_without_an_independent_truth_no_row_agrees(unpacked, tmp_path):
