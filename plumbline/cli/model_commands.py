@@ -27,7 +27,7 @@ from plumbline.judging.rows import Row, Verdict
 from plumbline.layout import IS_INSTALLED
 from plumbline.model_files.importer_cause import Explanation
 from plumbline.model_files.mechanism_of_file import feature_words, load_model_file
-from plumbline.model_files.model_rows import REFUSED, FileResult
+from plumbline.model_files.model_rows import IS_REFUSED, FileResult
 from plumbline.model_files.model_run import ModelPlan, ModelRunResult, run_model_files
 from plumbline.processes.worker_pool import Limits
 from plumbline.scenario.line_and_column_errors import (
@@ -320,7 +320,7 @@ def _reasons(name: str, rows: Sequence[Row], file: FileResult) -> list[str]:
     silent = (Verdict.AGREES, Verdict.INFORMATION, Verdict.NOT_INSTALLED)
     bad = [row for row in rows if row.verdict not in silent and row.known_issue is None]
     explanation = file.explanations.get(name) or Explanation(is_proved=True)
-    refused = [row for row in rows if row.verdict == Verdict.INFORMATION and row.reason.startswith(REFUSED)]
+    refused = [row for row in rows if row.verdict == Verdict.INFORMATION and row.extra.get(IS_REFUSED)]
     unexplained = [row for row in bad if row.diagnosis is None]
     lines = [f"{coloured_glyph(bad[0])} {escape(cause.sentence)}" for cause in explanation.causes if bad]
     for row in (*unexplained, *refused):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -32,6 +32,9 @@ class Cause:
     uncertainty: float = 0.0  # of the amount, by what the evidence leaves
     left: float | None = None  # evidence: largest difference that is left, in rounding bounds
     states: int = 0  # at so many states
+    quantities: tuple[str, ...] = ()  # that it is about; empty: all that are wrong
+    needs: tuple[str, ...] = ()  # of what is unexplained: without one of them the difference vanishes
+    general: str = ""  # the term, or of an output the change, without a place that is in its words
     equal: tuple[Cause, ...] = ()  # causes from which the data cannot distinguish it
 
     @property
@@ -40,9 +43,11 @@ class Cause:
         return self.kind not in ("unexplained", "rounding", "refusal")
 
     @property
-    def identity(self) -> tuple[str, ...]:
+    def identity(self) -> tuple[str, str, str]:
         """What two rows with the same cause have in common: all but place, digits and evidence."""
-        return self.kind, self.term, self.change
+        if self.kind == "output":
+            return self.kind, self.term, self.general or self.change
+        return self.kind, self.general or self.term, self.change
 
     def with_amount(self, amount: np.ndarray, uncertainty: float) -> Cause:
         """State a fitted amount: as a factor in words where it is one, else with the digits that it has."""
@@ -61,14 +66,12 @@ class Diagnosis:
     """What is known about the cause of a disagreement."""
 
     causes: tuple[Cause, ...] = ()  # together they explain it
-    persistence: dict[str, str] = field(default_factory=dict)  # by condition: persists, vanishes or a failure
     scatter: float | None = None  # of the error over its size, where it was measured
 
     @property
     def text(self) -> str:
         """The sentence."""
-        where = "; ".join(f"{what} {condition}" for condition, what in self.persistence.items())
-        return describe(self.causes) + (f" (the difference {where})" if where else "")
+        return describe(self.causes)
 
 
 def significant(x: float, near: float, uncertainty: float) -> float:
@@ -106,7 +109,13 @@ def _describe_other(cause: Cause) -> str:
     if cause.change == "close":
         return f"the difference of the {cause.term} is too close to the rounding bound to name a cause"
     tried = cause.change or "no number, term, frame or output, and no two of them,"
-    return f"{tried} explains the {cause.term}"
+    needs = f"; its difference vanishes without {join_words(cause.needs, 'or')}" if cause.needs else ""
+    return f"{tried} explains the {cause.term}{needs}"
+
+
+def join_words(words: Sequence[str], last: str = "and") -> str:
+    """Join words to a list in a sentence."""
+    return f" {last} ".join(filter(None, (", ".join(words[:-1]), words[-1])))
 
 
 def describe_cause(cause: Cause) -> str:

@@ -16,18 +16,18 @@ import numpy as np
 from plumbline.diagnosis.cause import Cause, Diagnosis
 from plumbline.diagnosis.digit_loss import Evaluate, Problem, find_digit_loss, measure_scatter, scatter_cause
 from plumbline.diagnosis.fit import ACCEPTED_RATIO, Difference, Explanation, Mask, Search
+from plumbline.diagnosis.needs import find_needs
 from plumbline.diagnosis.outputs import Outputs, error_ratio
-from plumbline.diagnosis.prediction import QUANTITIES, SUMS, VECTORS, WRENCHES, Answers, Case, Predictor, View
+from plumbline.diagnosis.prediction import QUANTITIES, SUMS, VECTORS, WRENCHES, Answers, Case, View
 from plumbline.diagnosis.readings import other_branches
 from plumbline.diagnosis.terms import Terms, force_places, is_spanned
 from plumbline.engines.registry import load_adapter
-from plumbline.model.datatypes import Array, Model, State, StateQuantities
-from plumbline.model.kinematics import complete_state, stack_states, state_from_minimal
+from plumbline.model.datatypes import Array, Model, StateQuantities
+from plumbline.model.kinematics import complete_state, stack_states
 from plumbline.truth.ground_truth import StateTruth
-from plumbline.truth.rounding_bound import rounding_bounds
 
 MIN_DIAGNOSABLE_RATIO = 8.0  # in bounds: of hundreds of fitted causes, some explain less by chance
-MAX_LOCATED = 4  # states at which the difference is looked for at rest, without gravity and without loads
+MAX_LOCATED = 4  # states at which the difference is looked for with one thing taken away
 LOOP_VIEWS = (
     View(are_bodies_kept=True),
     # an engine's forces that close an open loop act on both ends, its own wrenches count them at one
@@ -65,14 +65,13 @@ def diagnose(
 
     Args:
         reported: what the engine returned at the states of ``truth``.
-        evaluate: evaluates the engine again, at turned problems and at rest, without gravity, without loads
-            and drag, to find loss of digits and to localise the difference; None to skip that.
+        evaluate: evaluates the engine again, at turned problems to find loss of digits, and with one thing
+            taken away at a time to find what an unexplained difference needs; None to skip that.
 
     """
     search = _Diagnosing(model, reported, truth, evaluate)
     causes = search.causes()
-    persistence = search.persistence() if evaluate and search.largest > 1 else {}
-    return Diagnosis(causes, persistence)
+    return Diagnosis(tuple(search.with_needs(causes)) if evaluate else causes)
 
 
 def state_count(model: Model) -> int:
@@ -136,7 +135,8 @@ class _Diagnosing:
     def causes(self) -> tuple[Cause, ...]:
         """Find the causes, or say that there are none."""
         if self.largest <= 1:
-            return (Cause("output", "mass matrix", "", "wrong; all other quantities are right"),)
+            words = "wrong; all other quantities are right"
+            return (Cause("output", "mass matrix", "", words, quantities=("mass_matrix",)),)
         if self.largest <= MIN_DIAGNOSABLE_RATIO or not np.isfinite(self.largest):
             return (
                 self._close(self.wrong()) if np.isfinite(self.largest) else self._unexplained(self.wrong()),
@@ -158,10 +158,10 @@ class _Diagnosing:
         )
 
     def _close(self, quantities: Sequence[str]) -> Cause:
-        return Cause("unexplained", _words(quantities), "", "close")
+        return Cause("unexplained", _words(quantities), "", "close", quantities=tuple(quantities))
 
     def _unexplained(self, quantities: Sequence[str]) -> Cause:
-        return Cause("unexplained", _words(quantities))
+        return Cause("unexplained", _words(quantities), quantities=tuple(quantities))
 
     def _digit_loss(self, quantities: Sequence[str]) -> Cause | None:
         if not self.evaluate or self.model.has_loops:
@@ -272,7 +272,7 @@ class _Diagnosing:
         for quantity in quantities:
             found = outputs.name(quantity, self._at(quantity, self.reported))
             if found is not None:
-                named[quantity] = replace(found, states=len(self.places))
+                named[quantity] = replace(found, states=len(self.places), quantities=(quantity,))
         return named
 
     def _outputs_alone(self, wrong: Sequence[str]) -> tuple[Cause, ...]:
@@ -386,52 +386,22 @@ class _Diagnosing:
             *([self._close(close)] if close else []),
         )
 
-    # -- where the difference persists ---------------------------------------------------------------
+    # -- what an unexplained difference needs --------------------------------------------------------
 
-    def persistence(self) -> dict[str, str]:
-        """Evaluate again where the difference is largest: at rest, without gravity, without loads."""
+    def with_needs(self, causes: Sequence[Cause]) -> list[Cause]:
+        """Say of what is unexplained what its difference needs; quantities with other needs apart."""
         assert self.evaluate
-        model = self.model
         worst = np.max([self.ratios[q] for q in QUANTITIES], axis=0)
-        states = [self.truth.states[i] for i in self.order[:MAX_LOCATED] if worst[i] > 1]
-        trials: list[tuple[str, Model, list[State]]] = [("again", model, states)]
-        if not model.has_loops:
-            at_rest = [
-                state_from_minimal(model, s.p, 0 * s.omega, s.u, 0 * s.udot, s.x, 0 * s.xdot, s.r, 0 * s.v)
-                for s in states
-            ]
-            trials.append(("at rest", model, at_rest))
-        trials.append(("without gravity", replace(model, gravity=0 * model.gravity), states))
-        if model.has_loads or model.has_drag:
-            unloaded = {k: 0 * getattr(model, k) for k in ("force", "moment", "drag_force", "drag_moment")}
-            trials.append(("without loads and drag", replace(model, **unloaded), states))
-        found: dict[str, str] = {}
-        for name, changed, at in trials:
-            try:
-                is_there = self._persists(changed, at)
-            except Exception as error:  # an engine may raise anything; a failure here is information too
-                found[name] = f"fails ({' '.join(str(error).split())[:80]})"
+        count = min(MAX_LOCATED, state_count(self.model))
+        states = [self.truth.states[i] for i in self.order[:count] if worst[i] > 1]
+        found = list[Cause]()
+        for cause in causes:
+            if cause.kind != "unexplained" or cause.change:
+                found.append(cause)
                 continue
-            if name != "again":
-                found[name] = "persists" if is_there else "vanishes"
-            elif not is_there:
-                return {"when the states are evaluated alone": "does not show again"}
+            groups: dict[tuple[str, ...], list[str]] = {}
+            needs = find_needs(self.model, states, cause.quantities, self.evaluate)
+            for quantity in cause.quantities:
+                groups.setdefault(needs[quantity], []).append(quantity)
+            found += [replace(self._unexplained(some), needs=needs) for needs, some in groups.items()]
         return found
-
-    def _persists(self, model: Model, states: list[State]) -> bool:
-        assert self.evaluate
-        answers, right = self.evaluate(model, states), Predictor(model, states, View()).right
-        bounds = rounding_bounds(model, states)
-        names = [
-            q
-            for q in QUANTITIES
-            if getattr(self.reported[0], q) is not None and getattr(self.truth.quantities[0], q) is not None
-        ]
-        return any(
-            not error_ratio(
-                np.array([np.asarray(getattr(a, q), float) for a in answers]) - right[q],
-                np.array([np.asarray(b.tolerance(q)) for b in bounds]),
-            )
-            <= 1
-            for q in names
-        )

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from plumbline.diagnosis.cause import Cause
+from plumbline.diagnosis.cause import Cause, CauseKind
 from plumbline.diagnosis.outputs import error_ratio
 from plumbline.diagnosis.prediction import QUANTITIES, Answers, Predictor, View
 from plumbline.model.datatypes import Array, Model, State, StateQuantities, StepRun
@@ -40,9 +40,12 @@ Evaluate = Callable[[Model, list[State]], list[StateQuantities]]
 
 def scatter_cause(quantities: Sequence[str], scatter: float) -> Cause:
     """State how an error scatters."""
-    verb = "lose digits: they scatter" if scatter >= MIN_SCATTER else "have a cause: they scatter"
-    change = f"{verb} by {scatter:.2g} of their error when world and body axes are turned by {TURN:g} rad"
-    return Cause("rounding", " and ".join(q.replace("_", " ") for q in quantities), "", change, (scatter,))
+    is_loss = scatter >= MIN_SCATTER
+    verb = "lose digits: they scatter" if is_loss else "have a cause: they scatter"
+    text = f"{verb} by {scatter:.2g} of their error when world and body axes are turned by {TURN:g} rad"
+    words = " and ".join(q.replace("_", " ") for q in quantities)
+    kind: CauseKind = "rounding" if is_loss else "unexplained"
+    return Cause(kind, words, "", text, (scatter,), quantities=tuple(quantities))
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ WORDS = {"rest": "rest position", "force": "applied force", "moment": "applied m
          "drag_force": "drag force", "drag_moment": "drag moment", "omega": "angular velocity ω′",
          "udot": "rod rate u̇", "xdot": "rates", "spring_length": "length", "spring_stiffness": "stiffness",
          "spring_damping": "damping"}  # fmt: skip
+OF_SPRINGS = {name: f"{WORDS[name]} of springs between points" for name in SPRING_FIELDS[2:]}
 UNITS = {"mass": " kg", "inertia": " kg m²", "force": " N", "moment": " N m", "drag_force": " N s/m",
          "drag_moment": " N m s", "gravity": " m/s²", "length": " m", "point": " m"}  # fmt: skip
 
@@ -164,24 +165,29 @@ def number_edits(case: Case) -> Iterator[Edit]:
 
 def _number(
     term: str, place: str, name: str, at: tuple[Any, ...], value: float, scale: float, unit: str = "",
-    can_vanish: bool = True,
+    can_vanish: bool = True, general: str = "",
 ) -> Edit:  # fmt: skip
-    cause = Cause("number", term, place, nominal=(value,), unit=unit)
+    general = general or WORDS.get(name, name)
+    cause = Cause("number", term, place, nominal=(value,), unit=unit, general=general)
     return Edit(cause, at_place(name, at), scale, can_vanish, (name,))
 
 
 def _factor(
     term: str, place: str, change: Callable[[Case, Array], Case], can_vanish: bool = True,
-    fields: tuple[str, ...] = (), kind: CauseKind = "number",
+    fields: tuple[str, ...] = (), kind: CauseKind = "number", general: str = "",
 ) -> Edit:  # fmt: skip
-    return Edit(Cause(kind, term, place, nominal=(1.0,), unit="×"), change, 1.0, can_vanish, fields)
+    cause = Cause(kind, term, place, nominal=(1.0,), unit="×", general=general)
+    return Edit(cause, change, 1.0, can_vanish, fields)
 
 
 def _gravity(model: Model) -> Iterator[Edit]:
     size = float(np.linalg.norm(model.gravity)) or 1.0
     if np.count_nonzero(model.gravity) > 1:  # else it is a component
         yield _factor(
-            "size of gravity", "", lambda case, x: with_fields(case, gravity=x[0] * case.model.gravity)
+            "size of gravity",
+            "",
+            lambda case, x: with_fields(case, gravity=x[0] * case.model.gravity),
+            general="gravity",
         )
     for i, axis in enumerate("xyz"):
         value = float(model.gravity[i])
@@ -203,22 +209,12 @@ def _bodies(model: Model) -> Iterator[Edit]:
                 value = float(getattr(model, name)[k, i])
                 yield _number(f"{WORDS[name]} {axis}", place, name, (k, i), value, weight, UNITS[name])
             if not model.kinds[k].holds_nothing:
-                cause = Cause(
-                    "number",
-                    f"centre of mass {axis}",
-                    place,
-                    nominal=(0.0,),
-                    unit=" m",
-                )
+                term = "centre of mass"
+                cause = Cause("number", f"{term} {axis}", place, nominal=(0.0,), unit=" m", general=term)
                 yield Edit(cause, _shifted_centre(k, i), length)
             if model.kinds[k].has_attitude:
-                cause = Cause(
-                    "number",
-                    f"attitude about {axis}",
-                    place,
-                    nominal=(0.0,),
-                    unit=" rad",
-                )
+                term = f"attitude about {axis}"
+                cause = Cause("number", term, place, nominal=(0.0,), unit=" rad", general="attitude")
                 yield Edit(cause, _turned_attitude(k, i), 1.0)
         for name, weight in (("drag_force", mass), ("drag_moment", trace)):
             if not getattr(model, name)[k]:
@@ -246,7 +242,9 @@ def _joints(model: Model) -> Iterator[Edit]:
     for i in range(len(model.spring_body)):
         for name in SPRING_FIELDS[2:]:
             value = float(getattr(model, name)[i])
-            yield _number(WORDS[name], f"spring {i + 1}", name, (i,), value, abs(value) or 1.0)
+            yield _number(
+                WORDS[name], f"spring {i + 1}", name, (i,), value, abs(value) or 1.0, general=OF_SPRINGS[name]
+            )
     for k, kind in enumerate(model.kinds):
         if kind.holds_nothing:
             continue
@@ -261,10 +259,12 @@ def _joints(model: Model) -> Iterator[Edit]:
             for axis in range(3):
                 value = float(model.point[k, side, axis])
                 term = f"{where} point {'xyz'[axis]}"
-                yield _number(term, place, "point", (k, side, axis), value, 0.1, " m")
+                general = f"{where} point"
+                yield _number(term, place, "point", (k, side, axis), value, 0.1, " m", general=general)
                 if not kind.has_attitude and (side == 0 or not kind.is_rigid):  # equal to a far turn
                     term, side_place = f"turn about {'xyz'[axis]} of the axes", f"{place} in the {where} body"
-                    cause = Cause("number", term, side_place, nominal=(0.0,), unit=" rad")
+                    general = "turn of the axes"
+                    cause = Cause("number", term, side_place, nominal=(0.0,), unit=" rad", general=general)
                     yield Edit(cause, turned(k, side, np.eye(3)[[axis]]), 0.1)
 
 
@@ -285,6 +285,7 @@ class _Factor:
     is_of_each: bool = False
     is_from_one_on: bool = True
     can_vanish: bool = True
+    general: str = ""
 
 
 FACTORS = (
@@ -304,7 +305,7 @@ FACTORS = (
     *(_Factor(WORDS.get(name, name), (name,), "joints") for name in JOINT_ELEMENTS),
     _Factor("far point", ("point",), "joints", np.eye(2)[0][:, None]),
     _Factor("near point", ("point",), "joints", np.eye(2)[1][:, None]),
-    *(_Factor(WORDS[name], (name,), "springs") for name in SPRING_FIELDS[2:]),
+    *(_Factor(WORDS[name], (name,), "springs", general=OF_SPRINGS[name]) for name in SPRING_FIELDS[2:]),
 )
 SINGULAR = {"bodies": "body", "joints": "joint", "springs": "spring"}
 
@@ -324,12 +325,19 @@ def _factors(case: Case) -> Iterator[Edit]:
         for k in places if one.is_of_each else []:
             if is_several[k] or not is_number:
                 change = scaled(one.names, np.arange(len(has)) == k, one.part)
-                yield _factor(one.term, f"{SINGULAR[one.things]} {k + 1}", change, one.can_vanish, one.names)
+                yield _factor(
+                    one.term,
+                    f"{SINGULAR[one.things]} {k + 1}",
+                    change,
+                    one.can_vanish,
+                    one.names,
+                    general=one.general,
+                )
         for first in places[: len(places) - 1 if one.is_from_one_on else min(len(places) - 1, 1)]:
             where = has & (np.arange(len(has)) >= first)
             which = f"all {one.things}" if first == places[0] else f"{one.things} {first + 1} to {len(has)}"
             change = scaled(one.names, where, one.part)
-            yield _factor(one.term, which, change, one.can_vanish, one.names)
+            yield _factor(one.term, which, change, one.can_vanish, one.names, general=one.general)
     for name in JOINT_ELEMENTS:
         values = getattr(model, name)
         for what in ("slide", "turn"):
@@ -393,7 +401,9 @@ def vector_edits(model: Model) -> Iterator[Edit]:
 
     def vector(term: str, place: str, name: str, at: tuple[Any, ...], scale: float) -> Edit:
         x = tuple(float(value) for value in getattr(model, name)[at])
-        return Edit(Cause("number", term, place, nominal=x, unit=UNITS[name]), at_place(name, at), scale)
+        general = term if name == "point" else WORDS.get(name, name)
+        cause = Cause("number", term, place, nominal=x, unit=UNITS[name], general=general)
+        return Edit(cause, at_place(name, at), scale)
 
     for k, kind in enumerate(model.kinds):
         if kind.holds_nothing:

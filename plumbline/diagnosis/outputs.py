@@ -26,6 +26,7 @@ TINY = float(np.finfo(float).tiny)
 SINGLE_ROUNDING = 1e-5  # of the largest value: what computing in single precision may cost
 MAX_RATIO = 2.0  # in bounds: of what is returned and of the right quantity
 FACTOR_ROUNDING = 1e-6  # of a fitted share of a part: a word for 0, 1, 2 or −1 times
+SPRINGS, CLOSING_JOINTS = "the springs between points", "those of the closing joints"
 SHARES = {-1.0: "without {}", 1.0: "with twice {}", -2.0: "with {} of the opposite sign"}
 
 
@@ -43,6 +44,12 @@ class Part:
     what: str
     value: Array
     about: str = ""  # of the moment that a joint's force has about another point: the point
+    every: str = ""  # the same of all bodies, joints or springs, where it is of one of them
+
+    @property
+    def sort(self) -> str:
+        """What it is called wherever it is."""
+        return self.every or self.what
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +99,9 @@ class Outputs:
         as_that = " and ".join(f"{thing} {source[k] + 1}" for k in wrong)
         is_swap = len(wrong) == 2 and source == {wrong[0]: wrong[1], wrong[1]: wrong[0]}
         change = "exchanged" if is_swap else f"as that of {of}"
-        return Cause("output", _words(quantity), of if is_swap else as_that, change)
+        return Cause(
+            "output", _words(quantity), of if is_swap else as_that, change, general=f"of another {thing}"
+        )
 
     def _of_places(self, quantity: str, reported: Array, places: list[int] | None) -> Cause | None:
         """What was returned in place of a quantity of all bodies or joints, or of some."""
@@ -220,16 +229,18 @@ class Outputs:
         left = np.max(np.abs(off - shares[:, None] * A), axis=1)
         named: list[Cause] = []
         for i in np.flatnonzero(left <= limit):
-            words, amount = _share_words(float(shares[i]), parts[visible[i]])
             if abs(shares[i]) * np.max(np.abs(A[i])) > limit:
-                named.append(cause(words, *amount))
+                part = parts[visible[i]]
+                words, amount = _share_words(float(shares[i]), part)
+                general, _ = _share_words(float(shares[i]), replace(part, what=part.sort))
+                named.append(replace(cause(words, *amount), general=general))
         if named:
             exact = [one for one in named if not one.amount] or named
             return replace(exact[0], equal=tuple(exact[1:]))
-        return self._two_parts(off, A, [parts[i].what for i in visible], cause, limit)
+        return self._two_parts(off, A, [parts[i] for i in visible], cause, limit)
 
     @staticmethod
-    def _two_parts(off: Array, A: Array, what: list[str], cause: MakeCause, limit: float) -> Cause | None:
+    def _two_parts(off: Array, A: Array, parts: list[Part], cause: MakeCause, limit: float) -> Cause | None:
         """Two parts of shares in words: each lacks, counts twice or has the opposite sign."""
         if len(A) > 200:
             return None
@@ -247,7 +258,10 @@ class Outputs:
                 )
                 for i, j in zip(*np.nonzero(norm <= len(off) * limit**2 + 1e-9 * square), strict=True):
                     if i < j and np.max(np.abs(off - a * A[i] - b * A[j])) <= limit:
-                        found.append(cause(f"{SHARES[a].format(what[i])} and {SHARES[b].format(what[j])}"))
+                        both = (SHARES[a], parts[i]), (SHARES[b], parts[j])
+                        words = " and ".join(share.format(part.what) for share, part in both)
+                        general = " and ".join(share.format(part.sort) for share, part in both)
+                        found.append(replace(cause(words), general=general))
         return replace(found[0], equal=tuple(found[1:3])) if found else None
 
     def _parts(self, quantity: str) -> list[Part]:
@@ -276,14 +290,14 @@ class Outputs:
         model, state = self.case
         weight = -model.mass * np.sum(state.r * model.gravity[..., None, :], -1)
         springs = [
-            Part(f"spring {i + 1}", self._energy_without("spring_stiffness", (i,))[1])
+            Part(f"spring {i + 1}", self._energy_without("spring_stiffness", (i,))[1], every=SPRINGS)
             for i in range(len(model.spring_body))
         ]
         parts = _of_bodies({"the weight of {}": weight}) + self._element_energies("stiffness", "spring", 1)
         if springs:
             parts += [
                 *springs,
-                Part("the springs between points", np.sum([s.value for s in springs], axis=0)),
+                Part(SPRINGS, np.sum([s.value for s in springs], axis=0)),
             ]
             parts.append(
                 Part(
@@ -311,12 +325,12 @@ class Outputs:
     def _element_energies(self, name: str, word: str, which: int) -> list[Part]:
         values = getattr(self.case.model, name)[: self.case.model.n]
         places = [tuple(map(int, at)) for at in np.argwhere(values)] if values.ndim == 2 else []
+        every = f"that of the {word}s"
         parts = [
             Part(f"the {word} of joint {k + 1}" + (f" {i + 1}" if np.count_nonzero(values[k]) > 1 else ""),
-                 self._energy_without(name, (k, i))[which])
+                 self._energy_without(name, (k, i))[which], every=every)
             for k, i in places
         ]  # fmt: skip
-        every = f"that of the {word}s"
         return [*parts, Part(every, self._energy_without(name, ())[which])] if places else []
 
     @cached_property
@@ -345,16 +359,16 @@ class Outputs:
             for s in range(len(state.p))
         ]
 
-    def _wrench(self, what: str, force: Array, moment: Array) -> Part:
+    def _wrench(self, what: str, force: Array, moment: Array, every: str = "") -> Part:
         """A part in the wrenches of joints; in loops what is determinate of it."""
         length = wrench_length(self.case.model) if self.case.model.has_loops else 1.0
         for s, projector in enumerate(self._projectors):
             if projector is not None:
                 both = rotate_vectors(projector, np.concatenate([force[s], moment[s] / length], axis=-1))
                 force[s], moment[s] = both[:, :3], both[:, 3:] * length
-        return Part(what, np.array([force, moment]))
+        return Part(what, np.array([force, moment]), every=every)
 
-    def _carried(self, what: str, force: Array, moment: Array) -> Part:
+    def _carried(self, what: str, force: Array, moment: Array, every: str = "") -> Part:
         """What joints carry of forces and moments (S, N, 3) at the centres of mass."""
         model, state = self.case
         f, m = (np.zeros(self._near.shape) for _ in range(2))
@@ -364,7 +378,7 @@ class Outputs:
                 f[:, k] -= force[:, body]
                 m[:, k] -= moment[:, body] + cross(state.r[:, body] - self._near[:, k], force[:, body])
                 k = int(model.body[k, 0])
-        return self._wrench(what, f, m)
+        return self._wrench(what, f, m, every)
 
     @cached_property
     def _wrench_parts(self) -> list[Part]:
@@ -384,7 +398,8 @@ class Outputs:
                 parts.append(self._carried(f"the {what}s", force, moment))
             for k in bodies:
                 only = (np.arange(model.n) == k)[:, None]
-                parts.append(self._carried(f"the {what} of body {k + 1}", force * only, moment * only))
+                place = f"the {what} of body {k + 1}"
+                parts.append(self._carried(place, force * only, moment * only, f"the {what}s"))
         parts += self._spring_parts() + self._element_parts() + self._joint_parts()
         return parts
 
@@ -406,13 +421,14 @@ class Outputs:
         none = loads(0 * c, 0 * k)
         chosen = {f"spring {i + 1}": np.arange(count) == i for i in range(count)}
         if count > 1:
-            chosen["the springs between points"] = np.ones(count, bool)
+            chosen[SPRINGS] = np.ones(count, bool)
         for what, where in chosen.items():
             force, moment = (x - y for x, y in zip(loads(c * where, k * where), none, strict=True))
-            parts.append(self._carried(what, force, moment))
+            parts.append(self._carried(what, force, moment, SPRINGS))
             if np.any(c * where) and np.any(k * where):
                 force, moment = (x - y for x, y in zip(loads(c * where, 0 * k), none, strict=True))
-                parts.append(self._carried(f"the damping of {what}", force, moment))
+                part = self._carried(f"the damping of {what}", force, moment, f"the damping of {SPRINGS}")
+                parts.append(part)
         return parts
 
     def _element_parts(self) -> list[Part]:
@@ -437,12 +453,14 @@ class Outputs:
         everything = np.zeros((2, *self._near.shape))
         for name, value in values.items():
             if np.any(value):
-                parts.append(self._wrench(f"those of the {name} of joints", *value))
+                every = f"those of the {name} of joints"
+                parts.append(self._wrench(every, *value))
                 joints = np.flatnonzero(np.any(value, axis=(0, 1, 3)))
                 for k in joints if len(joints) > 1 else []:
                     only = np.zeros_like(value)
                     only[:, :, k] = value[:, :, k]
-                    parts.append(self._wrench(f"that of the {name} of joint {k + 1}", *only))
+                    part = self._wrench(f"that of the {name} of joint {k + 1}", *only)
+                    parts.append(replace(part, every=every))
                 if name != "rotors":
                     everything += value
         if np.any(everything):
@@ -463,9 +481,10 @@ class Outputs:
                     lever = self._near[:, k] - state.r[:, body]
                     applied[1, :, body] += sign * (right[1][:, k] + cross(lever, right[0][:, k]))
             every += applied
-            parts.append(self._carried(f"that of the closing joint {k + 1}", *applied))
+            part = self._carried(f"that of the closing joint {k + 1}", *applied)
+            parts.append(replace(part, every=CLOSING_JOINTS))
         if len(parts) > 1:
-            parts.append(self._carried("those of the closing joints", *every))
+            parts.append(self._carried(CLOSING_JOINTS, *every))
         carried = np.zeros((2, *self._near.shape))
         for k in range(model.n):
             far = int(model.body[k, 0])
@@ -521,7 +540,8 @@ def _of_bodies(values: dict[str, Array]) -> list[Part]:
         if words != "{}":
             parts.append(Part(words.format("all bodies"), np.sum(x, axis=1)))
         if x.shape[1] > 1:
-            parts += [Part(words.format(f"body {k + 1}"), x[:, k]) for k in range(x.shape[1])]
+            every = words.format("all bodies")
+            parts += [Part(words.format(f"body {k + 1}"), x[:, k], every=every) for k in range(x.shape[1])]
     return parts
 
 

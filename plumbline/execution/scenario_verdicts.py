@@ -223,8 +223,13 @@ class ScenarioRun:
                     reason = f"not compared: {self._left_out[kind]}"
                     row = self._context(name).make_row
                     found.rows.append(row(_LEVELS[kind], "-", "all", Verdict.INFORMATION, reason))
-        found.rows = outlier.annotate_outliers(found.rows)
+        found.rows = outlier.annotate_outliers(found.rows, self._is_certified)
         return found
+
+    @property
+    def _is_certified(self) -> bool:
+        truth = self.truths.get(TaskKind.STATE_TRUTH)
+        return not isinstance(truth, StateTruth) or truth.is_certified
 
     def judged_rows(self, found: JudgingResult, known: KnownIssues) -> list[Row]:
         """Mark what is recorded, where all engines stand against the truth, and what lacks a truth.
@@ -236,10 +241,9 @@ class ScenarioRun:
             The rows in the same order.
 
         """
-        model, truth = self.scenario.model, self.truths.get(TaskKind.STATE_TRUTH)
+        model, is_certified = self.scenario.model, self._is_certified
         rows = known.mark_known(found.rows, model.n, inertia_ratio(model))
         families = {name: _family(name) for name in self._engines}
-        is_certified = not isinstance(truth, StateTruth) or truth.is_certified
         rows = outlier.doubt_truth(
             rows, found.deviations, families, "" if is_certified else _family("reference")
         )

@@ -92,14 +92,17 @@ def _describe_doubt(rows: Sequence[Row], are_alike: bool) -> str:
     )
 
 
-def annotate_outliers(rows: Sequence[Row]) -> list[Row]:
+def annotate_outliers(rows: Sequence[Row], is_certified: bool) -> list[Row]:
     """Append the outliers to the diagnosis of every row that disagrees at state level.
+
+    Args:
+        is_certified: whether the truth at the states is.
 
     Returns:
         The rows, in the same order.
 
     """
-    sentence = describe_outliers(rows)
+    sentence = describe_outliers(rows, is_certified)
     return [
         replace(row, diagnosis="; ".join(filter(None, (row.diagnosis, sentence))))
         if _is_state_disagreement(row)
@@ -108,8 +111,11 @@ def annotate_outliers(rows: Sequence[Row]) -> list[Row]:
     ]
 
 
-def describe_outliers(rows: Sequence[Row]) -> str:
+def describe_outliers(rows: Sequence[Row], is_certified: bool) -> str:
     """Describe the engines that disagree at state level, in which quantities, and those that agree.
+
+    Args:
+        is_certified: whether the truth at the states is.
 
     Returns:
         The end of a sentence; "" where nothing disagrees.
@@ -123,7 +129,6 @@ def describe_outliers(rows: Sequence[Row]) -> str:
     disputed = {row.quantity for row in rows if _is_state_disagreement(row)}
     right = [row for row in rows if row.level == "state" and row.verdict == Verdict.AGREES]
     agree = list(dict.fromkeys(r.engine for r in right if r.quantity in disputed and r.engine not in wrong))
-    is_certified = any("truth: certified" in row.derivation for row in rows)
     truth = "the certified truth" if is_certified else "the reference, which is the truth here"
     outliers = "; ".join(f"{engine} in {_join_words(quantities)}" for engine, quantities in wrong.items())
     if not set(agree) - (set() if is_certified else {"reference"}):

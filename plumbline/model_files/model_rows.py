@@ -47,6 +47,7 @@ from plumbline.scenario.line_and_column_errors import shorten
 
 MODEL_FAMILY = "model file"  # of the rows, in place of a scenario's family
 REFUSED = "refused: "  # before an importer's words
+IS_REFUSED = "refused"  # in ``Row.extra`` of a file that an importer refuses
 SEED = 17
 MASS_ROUNDING = 2.0**-48  # relative, of the sum of the masses
 
@@ -111,7 +112,8 @@ def judge_answer(
 
     """
     if answer.reading is not None and answer.reading.model is None:
-        return [_row(context, "all", Verdict.UNSUPPORTED, f"{REFUSED}{answer.reading.refusal}")]
+        reason = f"{REFUSED}{answer.reading.refusal}"
+        return [replace(_row(context, "all", Verdict.UNSUPPORTED, reason), extra={IS_REFUSED: 1.0})]
     if answer.failure or answer.reading is None or answer.reading.model is None:
         return [_row(context, "all", Verdict.FAILED, answer.failure or "no answer")]
     reading = answer.reading.model

@@ -185,6 +185,9 @@ class _Cause(_Part):
     uncertainty: float | None
     left: float | None
     states: _Count
+    quantities: list[str] = []
+    needs: list[str] = []
+    general: str = ""
     equal: list[_Cause]
 
 

@@ -199,7 +199,7 @@ def _of_loops(model: Model, states: Sequence[State]) -> list[RoundingBound]:
         sizes = list(largest.values())
         total = totals[s] + of_welds[s] + sizes + (terms.of_rows[s] + of_welds[s] + sizes) * (spread - 1)
         scale = {
-            name: np.full(len(model.kind) if name.startswith("joint") else model.n, value)
+            name: np.full(len(model.kind) if name in ("joint_reaction", "joint_moment") else model.n, value)
             for name, value in largest.items()
         }
         spread_sums = {name: size * spread for name, size in _at(sums, s).items()}

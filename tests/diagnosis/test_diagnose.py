@@ -16,7 +16,6 @@ from plumbline.model.kinematics import (
     complete_state,
     rotation_matrix,
     spring_vectors,
-    state_from_minimal,
 )
 from plumbline.model.loops import determinate_part
 from plumbline.model.sampling import compared_states, random_states
@@ -349,7 +348,7 @@ def test_error_ratios_are_in_units_of_the_bounds():
     assert np.isnan(error_ratio(np.array([np.nan]), np.array([1.0])))
 
 
-# -- where the difference persists -------------------------------------------------------------------
+# -- what an unexplained difference needs ------------------------------------------------------------
 
 
 def engine_of(change):
@@ -362,51 +361,56 @@ def engine_of(change):
     return evaluate
 
 
-def test_a_failure_of_the_second_evaluation_is_reported_and_the_next_trial_runs():
-    model, reported, truth = changed("acceleration", lambda i, x, b: 1.5 * x)
+def needs_of(pattern, is_there, **has):
+    """What an acceleration needs that no cause explains, and that is wrong under a condition."""
+    model = pendulums.make_model(pattern, **has)
+    truth = state_truth(model, random_states(model, 9, seed=6))
+
+    def changed(m, s, a):
+        wrong = np.cos(7 * a.acceleration + 3 * np.sum(s.p)) * (1 + np.arange(3)) if is_there(m, s) else 0
+        return replace(a, acceleration=a.acceleration + wrong)
+
+    evaluate = engine_of(changed)
+    (cause,) = diagnose(model, evaluate(model, truth.states), truth, evaluate).causes
+    assert cause.quantities == ("acceleration",) and cause.kind == "unexplained"
+    return cause.needs
+
+
+@pytest.mark.parametrize(
+    ("is_there", "needs"),
+    [
+        (lambda m, s: True, ()),
+        (lambda m, s: np.any(m.force), ("an applied force",)),
+        (lambda m, s: np.any(m.drag_force) and np.any(s.omega), ("motion", "drag")),
+        (lambda m, s: np.any(m.gravity) and np.any(m.moment), ("gravity", "an applied moment")),
+    ],
+    ids=["nothing", "force", "drag in motion", "gravity and moment"],
+)
+def test_a_difference_needs_what_cannot_be_taken_away(is_there, needs):
+    assert needs_of("rb", is_there, loads=True, drag=True) == needs
+
+
+def test_a_trial_that_the_engine_refuses_shows_nothing_and_the_next_one_runs():
+    model, reported, truth = changed("acceleration", lambda i, x, b: np.cos(9 * x) + 5)
 
     def evaluate(requested, states):
         if not any(np.any(s.omega) for s in states):
-            raise RuntimeError("no\n  weight" + "x" * 100)
-        return engine_of(lambda m, s, a: replace(a, acceleration=1.5 * a.acceleration))(requested, states)
+            raise RuntimeError("no weight")
+        if not np.any(requested.gravity):
+            return state_truth(requested, states).quantities
+        return engine_of(lambda m, s, a: replace(a, acceleration=np.cos(9 * a.acceleration) + 5))(
+            requested, states
+        )
 
-    found = diagnose(model, reported, truth, evaluate).persistence
-    assert found["at rest"] == f"fails (no weight{'x' * 71})" and found["without gravity"] == "persists"
-
-
-@pytest.mark.parametrize(("loads", "drag"), [(True, True), (True, False), (False, True)])
-def test_an_error_in_the_loads_vanishes_without_them(loads, drag):
-    model = pendulums.make_model("b", loads=loads, drag=drag)
-    truth = state_truth(model, random_states(model, 4, seed=6))
-    none = {name: 0 * getattr(model, name) for name in ("force", "moment", "drag_force", "drag_moment")}
-
-    def evaluate(requested, states):
-        return state_truth(replace(requested, **none), states).quantities
-
-    assert diagnose(model, evaluate(model, truth.states), truth, evaluate).persistence == {
-        "at rest": "persists" if loads else "vanishes",  # drag does, too
-        "without gravity": "persists",
-        "without loads and drag": "vanishes",
-    }
+    (cause,) = diagnose(model, reported, truth, evaluate).causes
+    assert cause.needs == ("gravity",)
+    assert describe([cause]).endswith("explains the acceleration; its difference vanishes without gravity")
 
 
-def test_an_error_in_velocity_terms_vanishes_at_rest():
-    model = pendulums.make_model("rb")
-    truth = state_truth(model, random_states(model, 4, seed=3))
-
-    def evaluate(requested, states):
-        still = [state_from_minimal(requested, s.p, 0 * s.omega, s.u, 0 * s.udot) for s in states]
-        return state_truth(requested, still).quantities
-
-    diagnosis = diagnose(model, evaluate(model, truth.states), truth, evaluate)
-    assert diagnosis.persistence == {"at rest": "vanishes", "without gravity": "persists"}
-    assert diagnosis.text.endswith("(the difference vanishes at rest; persists without gravity)")
-
-
-def test_nothing_is_concluded_where_the_difference_does_not_show_again():
-    model, reported, truth = changed("acceleration", lambda i, x, b: 1.5 * x if i == 5 else x)
-    found = diagnose(model, reported, truth, engine_of(lambda m, s, a: a)).persistence
-    assert found == {"when the states are evaluated alone": "does not show again"}
+def test_a_difference_that_does_not_show_again_needs_the_other_states():
+    model, reported, truth = changed("acceleration", lambda i, x, b: np.cos(9 * x) + 5)
+    (cause,) = diagnose(model, reported, truth, engine_of(lambda m, s, a: a)).causes
+    assert cause.needs == ("other states in the same call",)
 
 
 # -- sentences ---------------------------------------------------------------------------------------

@@ -150,14 +150,6 @@ def test_a_difference_next_to_the_bound_is_not_named():
     assert (cause.kind, cause.change) == ("unexplained", "close")
 
 
-def test_the_diagnosis_states_where_the_difference_persists():
-    names = ("gyroscopic-dropped", "gravity-1e-5", "loads-ignored")
-    at = {d.name: diagnosis(d) for d in STATE_DEFECTS if d.name in names}
-    assert "vanishes at rest; persists without gravity" in at["gyroscopic-dropped"]
-    assert "persists at rest; vanishes without gravity" in at["gravity-1e-5"]
-    assert "vanishes without loads and drag" in at["loads-ignored"]
-
-
 BRANCHES = [
     d for d in STATE_DEFECTS if d.name.startswith(("identity-", "fast-", "rod-upward", "stale-rates"))
 ]

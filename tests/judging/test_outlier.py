@@ -106,7 +106,7 @@ def rows_of_engines(*defective_engines, defect="mass-1-1e-5", leave_out=()):
 
 @pytest.mark.parametrize("name", ENGINES)
 def test_one_engine_against_the_others_is_the_outlier(name):
-    text = describe_outliers(rows_of_engines(name))
+    text = describe_outliers(rows_of_engines(name), True)
     context, others = text.split("; ")
     assert context.startswith(f"outlier: {name} in acceleration, angular acceleration")
     assert others == (
@@ -117,47 +117,46 @@ def test_one_engine_against_the_others_is_the_outlier(name):
 
 
 def test_two_outliers_are_both_named_and_a_single_quantity_is_reported():
-    text = describe_outliers(rows_of_engines("mujoco", "exudyn"))
+    text = describe_outliers(rows_of_engines("mujoco", "exudyn"), True)
     assert text.startswith("outliers: mujoco in ") and "; exudyn in " in text
     assert text.endswith(
         "; reference, pinocchio and exudyn-tree agree with the certified truth "
         "and, within the sum of their bounds, with each other"
     )
-    text = describe_outliers(rows_of_engines("pinocchio", defect="reaction-sign"))
+    text = describe_outliers(rows_of_engines("pinocchio", defect="reaction-sign"), True)
     assert text.startswith("outlier: pinocchio in joint reaction; reference, mujoco and exudyn agree"), text
 
 
 def test_who_agrees_alone_and_where_none_does():
-    alone = describe_outliers(rows_of_engines("mujoco", leave_out=("exudyn", "exudyn-tree", "pinocchio")))
+    alone = describe_outliers(
+        rows_of_engines("mujoco", leave_out=("exudyn", "exudyn-tree", "pinocchio")), True
+    )
     assert alone.endswith("; reference agrees with the certified truth")
-    assert "no other engine agrees with the certified truth" in describe_outliers(rows_of_engines(*ENGINES))
+    assert "no other engine agrees with the certified truth" in describe_outliers(
+        rows_of_engines(*ENGINES), True
+    )
 
 
 def test_a_truth_of_the_notes_own_may_be_the_one_that_is_wrong():
     """Without the truth tools the reference is the truth, and agrees with itself."""
     others = ENGINES[1:]
-    uncertified = [
-        replace(row, derivation=row.derivation.replace("truth: certified", "truth: the notes' system"))
-        for row in rows_of_engines(*others)
-    ]
-    assert describe_outliers(uncertified).endswith("the truth is not certified: it may itself be wrong")
-    uncertified = [
-        replace(row, derivation=row.derivation.replace("truth: certified", "truth: the notes' system"))
-        for row in rows_of_engines("mujoco")
-    ]
-    assert describe_outliers(uncertified).startswith("outlier: mujoco in ")
+    assert describe_outliers(rows_of_engines(*others), False).endswith(
+        "the truth is not certified: it may itself be wrong"
+    )
+    assert describe_outliers(rows_of_engines("mujoco"), False).startswith("outlier: mujoco in ")
 
 
 def test_it_follows_the_diagnosis_of_rows_that_disagree_and_of_no_other():
     assert (
-        describe_outliers(rows_of_engines()) == "" and annotate_outliers(sound := rows_of_engines()) == sound
+        describe_outliers(rows_of_engines(), True) == ""
+        and annotate_outliers(sound := rows_of_engines(), True) == sound
     )
     before = [replace(row, diagnosis="behaves so") for row in rows_of_engines("mujoco")]
-    for was, now in zip(before, annotate_outliers(before), strict=True):
+    for was, now in zip(before, annotate_outliers(before, True), strict=True):
         if was.verdict == "disagrees":
             assert now.diagnosis.startswith("behaves so; outlier: mujoco in ")
             assert replace(now, diagnosis=was.diagnosis) == was
         else:
             assert now == was
-    bare = annotate_outliers(rows_of_engines("mujoco"))
+    bare = annotate_outliers(rows_of_engines("mujoco"), True)
     assert any(row.diagnosis and row.diagnosis.startswith("outlier: mujoco") for row in bare)
