@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ from plumbline.execution.plan import (
 from plumbline.execution.random_batch import RandomBatch
 from plumbline.execution.scenario_verdicts import ScenarioRun, uncompared_kinds
 from plumbline.judging import known_issues
+from plumbline.judging.findings import Finding, find_findings
 from plumbline.judging.identity import RUN_SCENARIO, IdentityCheck
 from plumbline.judging.rows import RUN_FAMILY, Row, Verdict, is_declared
 from plumbline.layout import IS_INSTALLED
@@ -77,6 +79,11 @@ class RunResult:
     metadata: dict[str, Any]  # the entry ``run`` of results.json
     own_scenarios: frozenset[str] = frozenset()  # names of those of the user's own files
     wide_issues: tuple[str, ...] = ()  # what `KnownIssues.wide_issues` describes
+
+    @cached_property
+    def findings(self) -> list[Finding]:
+        """The rows that do not agree, by cause."""
+        return find_findings(self.rows, {name: about["bodies"] for name, about in self.scenarios.items()})
 
 
 def describe_engines(

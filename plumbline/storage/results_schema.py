@@ -220,10 +220,27 @@ class _Row(_Part):
     extra: dict[str, float | str | None]
 
 
+class _Finding(_Part):
+    name: str
+    engine: str
+    verdict: _VerdictWord
+    title: str
+    sentence: str
+    known_issue: str | None
+    versions: list[str]
+    right_versions: list[str]
+    scenarios: list[str]
+    quantities: list[str]
+    largest_ratio: float | None
+    identity: list[str]
+    rows: list[str]
+
+
 class _Results(_Part):
     run: _Run
     scenarios: dict[str, _Scenario]
     engines: dict[str, _Engine]
+    findings: list[_Finding]
     rows: list[_Row]
 
     @model_validator(mode="after")

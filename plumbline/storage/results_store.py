@@ -21,14 +21,15 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from plumbline.judging.findings import find_findings
 from plumbline.judging.rows import Columns, Row
 from plumbline.scenario.line_and_column_errors import shorten
 from plumbline.storage.results_schema import DamagedResults, check_results
 from plumbline.storage.schema_upgrade import upgrade_document, upgrade_summary
 
 Record = dict[str, Any]
-SCHEMA_VERSION = 3
-READABLE_VERSIONS = (1, 2, 3)
+SCHEMA_VERSION = 4
+READABLE_VERSIONS = (1, 2, 3, 4)
 TEXT = pa.string()
 REAL = pa.float64()
 INTEGER = pa.int32()
@@ -316,7 +317,12 @@ def write_results(
             path.unlink(missing_ok=True)
     tables.write_parquet(folder)
     head = {"schema_version": SCHEMA_VERSION, "run": run, "scenarios": scenarios, "engines": engines}
-    document = {**to_json_value(head), "rows": [row_record(row) for row in rows]}
+    found = find_findings(rows, {name: about["bodies"] for name, about in scenarios.items()})
+    document = {
+        **to_json_value(head),
+        "findings": to_json_value([finding.record() for finding in found]),
+        "rows": [row_record(row) for row in rows],
+    }
     text = json.dumps(document, ensure_ascii=False)  # an indent takes the encoder in Python
     write_atomically(folder / "results.json", text.encode())
 

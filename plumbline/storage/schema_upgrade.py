@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+from dataclasses import fields
 from typing import Any
 
 import pyarrow as pa
 
-from plumbline.judging.rows import error_ratio
+from plumbline.judging.findings import find_findings
+from plumbline.judging.rows import Row, Verdict, error_ratio
 
 Record = dict[str, Any]
 
@@ -33,7 +35,8 @@ def upgrade_document(document: Record) -> Record:
 
     Returns:
         The document with the present names.  In version 1 the ratio of a row was in its ``extra``, or
-        followed from its value and tolerance; before version 3 causes were sentences only.
+        followed from its value and tolerance; before version 3 causes were sentences only, and before 4
+        nothing was grouped by cause.
 
     """
     if document["schema_version"] == 1:
@@ -41,7 +44,17 @@ def upgrade_document(document: Record) -> Record:
     if document["schema_version"] == 2:
         rows = [row | {"causes": []} for row in document["rows"]]
         document = document | {"schema_version": 3, "rows": rows}
+    if document["schema_version"] == 3:
+        bodies = {name: about["bodies"] for name, about in document["scenarios"].items()}
+        found = find_findings(map(row_of_record, document["rows"]), bodies)
+        document = document | {"schema_version": 4, "findings": [finding.record() for finding in found]}
     return document
+
+
+def row_of_record(record: Record) -> Row:
+    """Make a row of its entry in results.json."""
+    own = {one.name: record[one.name] for one in fields(Row)}
+    return Row(**own | {"verdict": Verdict(record["verdict"])})
 
 
 def _upgrade_first(document: Record) -> Record:
