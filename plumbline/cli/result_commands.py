@@ -13,7 +13,8 @@ import reports
 from plumbline import layout
 from plumbline.cli import options
 from plumbline.cli.help_texts import examples
-from plumbline.cli.terminal_output import count_noun, make_console, print_table
+from plumbline.cli.terminal_output import MAX_WIDTH, count_noun, make_console, print_table
+from plumbline.scenario.line_and_column_errors import did_you_mean
 from plumbline.storage.results_store import read_results
 
 MAKES_ONE = "`python -m plumbline nightly` makes one in the folder `nightly`"
@@ -164,3 +165,48 @@ def reproduce(folder: Path, keys: tuple[str, ...], form: str | None) -> None:
         click.echo(str(path))
     for key, reason in written.reasons.items():
         raise click.ClickException(f"{key}: {reason}")
+
+
+@click.command(
+    epilog=examples(
+        "explain", "explain mujoco-by-tendon-equalities", "explain NAME --results nightly/history/ID"
+    ),
+)
+@click.argument("name", required=False, metavar="[FINDING]")
+@click.option(
+    "--results",
+    "folder",
+    default=layout.DEFAULT_OUT,
+    type=options.ResultsPath(),
+    help="Folder of results. Default: that of `run`.",
+)
+def explain(name: str | None, folder: Path) -> None:
+    """Print everything that is known about a finding of a run, or list its findings.
+
+    FINDING is a name that `run` prints, or its beginning.
+    """
+    from plumbline.cli import findings_output as output
+    from plumbline.judging.findings import find_findings
+    from plumbline.judging.known_issues import project_known_issues
+    from plumbline.storage.schema_upgrade import row_of_record
+    from plumbline.storage.script_index import read_script_index, scripts_folder
+
+    with options.exit_on_damaged_results():
+        document = read_results(folder)
+        scripts = {key: str(scripts_folder(folder) / file) for key, file in read_script_index(folder).items()}
+    bodies = {scenario: about["bodies"] for scenario, about in document["scenarios"].items()}
+    found = find_findings(map(row_of_record, document["rows"]), bodies)
+    if name is None:
+        for finding in found:
+            click.echo(f"{finding.name}: {output.coverage(finding)}")
+        click.echo(count_noun(len(found), "finding") if found else "no finding", err=True)
+        return
+    chosen = [f for f in found if f.name == name] or [f for f in found if f.name.startswith(name)]
+    if len(chosen) != 1:
+        hint = did_you_mean(name, [f.name for f in chosen or found])
+        several = f"{len(chosen)} findings begin so" if chosen else "no finding has this name"
+        raise click.UsageError(f"{name!r}: {several}" + (f"; {hint}" if hint else ""))
+    issues = {issue.id: issue for issue in project_known_issues()}
+    width = min(max(make_console(sys.stdout).width, output.WIDTH), MAX_WIDTH)
+    for line in output.explain(chosen[0], issues.get(chosen[0].known_issue or ""), scripts, width):
+        click.echo(line)

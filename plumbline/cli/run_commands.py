@@ -59,13 +59,14 @@ MAX_PROOF_CPU_SECONDS = 1e6
     help="A relative tolerance of your own; results and report show it beside each derived verdict, which it "
     "does not change.",
 )
+@click.option("--matrix", "has_matrix", is_flag=True, help="Print each cell, scenarios × engines, too.")
 @click.option("--fresh", is_flag=True, help="Compute everything again, also what earlier runs computed.")
 @options.timeout_option(300.0)
 @options.memory_option
 def run(
     names: tuple[str, ...], families: tuple[str, ...], engines: list[str], level: Any, jobs: int,
     scheduler: str | None, known_files: tuple[Path, ...], out: Path, as_json: bool, user_rtol: float | None,
-    fresh: bool, timeout: float, memory: float,
+    has_matrix: bool, fresh: bool, timeout: float, memory: float,
 ) -> None:  # fmt: skip
     """Compare scenarios (names of the catalogue, or paths of files; default: all) on all engines.
 
@@ -108,10 +109,11 @@ def run(
         document = {
             "run": result.metadata,
             "sentence": result.metadata["sentence"],
+            "findings": [finding.record() for finding in result.findings],
             "rows": [row_record(r) for r in result.rows],
         }
         click.echo(json.dumps(to_json_value(document), ensure_ascii=False, indent=1))
-    _finish(result, report, as_json)
+    _finish(result, report, as_json, has_matrix)
 
 
 @click.command(
@@ -224,10 +226,10 @@ def _log(sentence: str) -> None:
     click.echo(sentence, err=True)
 
 
-def _finish(result: RunResult, report: Path, as_json: bool) -> None:
+def _finish(result: RunResult, report: Path, as_json: bool, has_matrix: bool = False) -> None:
     """Print the result for people, unless stdout holds JSON, and exit with the run's code."""
     if not as_json:
-        print_result(result)
+        print_result(result, has_matrix=has_matrix)
     click.echo(f"report: {report}", err=as_json)
     if cached := result.cpu_times.cached_count:
         _log(f"{cached} answers of earlier runs were used; --fresh computes them again")

@@ -1,4 +1,4 @@
-"""What a run prints on the terminal: progress, the matrix of verdicts, the reasons of what does not agree."""
+"""What a run prints on the terminal: progress, findings, and where it is wanted the matrix of verdicts."""
 
 from __future__ import annotations
 
@@ -14,10 +14,12 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from plumbline.cli.verdict_matrix import VerdictMatrix, coloured_glyph
+from plumbline.cli.findings_output import WIDTH, describe_run, legend, wrap
+from plumbline.cli.verdict_matrix import VerdictMatrix, matrix_of_rows
 from plumbline.execution.runner import RunResult
-from plumbline.judging.rows import SHOWN_STYLES, Verdict
+from plumbline.judging.rows import SHOWN_STYLES
 
+MAX_WIDTH = 160  # columns of a wide terminal that sentences use
 PIPED_WIDTH = 10_000  # columns: in a pipe or a log nothing is cut or wrapped, unless COLUMNS is set
 
 
@@ -131,34 +133,33 @@ class ProgressDisplay:
 def print_matrix(matrix: VerdictMatrix) -> None:
     """Print the matrix of verdicts and its legend on stdout."""
     out = make_console(sys.stdout)
+    for line in matrix.heads():
+        out.print(escape(line))
     out.print(matrix.table())
     legend = wrap_items((f"{style.glyph} {shown}" for shown, style in SHOWN_STYLES.items()), out.width)
-    out.print(
-        "[dim]each cell: worst verdict, agreeing checks / all checks, error over tolerance of the worst row\n"
-        f"{legend}[/]"
-    )
+    out.print(f"[dim]each cell: worst verdict, its error over tolerance\n{legend}[/]")
 
 
-def print_result(result: RunResult) -> None:
-    """Print the matrix of scenarios × engines, why rows do not agree, and the summary."""
+def print_result(result: RunResult, *, has_matrix: bool = False) -> None:
+    """Print what a run found.
+
+    Args:
+        has_matrix: whether to print the cells, scenarios × engines, too.
+
+    """
     out = make_console(sys.stdout)
-    in_doubt = {row.reason: None for row in result.rows if row.verdict == Verdict.HARNESS_FAILED}
-    for reason in in_doubt:
-        out.print(
-            f"[magenta bold]{Verdict.HARNESS_FAILED.style.glyph} the harness failed:[/] {escape(reason)}"
-        )
-    matrix = VerdictMatrix(result.engines)
-    for scenario in result.scenarios:
-        matrix.replace_rows(scenario, [])
-    for row in result.rows:
-        matrix.add_rows(row.scenario, [row])
-    print_matrix(matrix)
-    for row in result.rows:
-        is_silent = row.verdict in (Verdict.AGREES, Verdict.INFORMATION, Verdict.HARNESS_FAILED)
-        if not is_silent and row.known_issue is None:
-            out.print(f"{coloured_glyph(row)} {escape(row.key)}: {escape(row.reason)}")
+    width = max(WIDTH, min(out.width, MAX_WIDTH)) if out.width != PIPED_WIDTH else WIDTH
+    if has_matrix:
+        print_matrix(matrix_of_rows(result.rows, result.engines))
+    for line in describe_run(result.rows, result.findings, width, result.random_batch.counts_by_verdict):
+        out.print(line)
+    out.print(f"[dim]{escape(wrap_items(legend(result.rows), width))}[/]")
     for sentence in result.wide_issues:
-        out.print(f"[yellow]i[/] {escape(sentence)}")
+        for line in wrap(f"i {sentence}", width, ""):
+            out.print(f"[yellow]{escape(line)}[/]")
     for entry in result.stale_issues:
-        out.print(f"[red]![/] known entry {escape(entry.id)} no longer occurs: remove it from its file")
-    out.print(f"[bold]{escape(result.metadata['sentence'])}[/]")
+        text = f"! known entry {entry.id} no longer occurs: remove it from its file"
+        for line in wrap(text, width, ""):
+            out.print(f"[red]{escape(line)}[/]")
+    for line in wrap(result.metadata["sentence"], width, ""):
+        out.print(f"[bold]{escape(line)}[/]")

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from string import ascii_uppercase
 
 from rich.markup import escape
 from rich.table import Table
 
 from plumbline.engines.adapter import EngineInfo
 from plumbline.engines.environments import split_version
-from plumbline.judging.rows import Row, Verdict
+from plumbline.judging.rows import SHOWN_STYLES, Row, Verdict, shown_verdict
 
 VERDICT_COLOURS = {
     Verdict.AGREES: "green", Verdict.DISAGREES: "red bold", Verdict.UNRESOLVED: "yellow",
@@ -17,7 +19,6 @@ VERDICT_COLOURS = {
     Verdict.HARNESS_FAILED: "magenta bold",
     Verdict.INFORMATION: "dim",
 }  # fmt: skip
-MAX_COMPLETE_TABLE = 60  # scenarios; of more, those where everything agrees are left out of the table
 
 
 class VerdictMatrix:
@@ -56,29 +57,36 @@ class VerdictMatrix:
             One line per scenario, those with the worst verdict first.
 
         """
-        table = Table(box=None, pad_edge=False, header_style="bold")
+        table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
         table.add_column("scenario")
-        for name, info in self._engines.items():
-            table.add_column(escape(engine_heading(name, info.version)))
-        shown = list(self._rows)
-        if len(shown) > MAX_COMPLETE_TABLE:
-            shown = [name for name in shown if self._is_remarkable(name)]
-        for scenario in sorted(shown, key=self._severity, reverse=True)[:max_lines]:
+        for letter, _ in zip(ascii_uppercase, self._engines, strict=False):
+            table.add_column(letter)
+        for scenario in sorted(self._rows, key=self._severity, reverse=True)[:max_lines]:
             of = ([r for r in self._rows[scenario] if r.engine == engine] for engine in self._engines)
             table.add_row(escape(scenario), *map(_format_cell, of))
         return table
 
+    def heads(self) -> list[str]:
+        """List the engines of the columns."""
+        names = [engine_heading(name, info.version) for name, info in self._engines.items()]
+        return [f"{letter} {name}" for letter, name in zip(ascii_uppercase, names, strict=False)]
+
     def line(self, scenario: str) -> str:
-        """Format the cells of a scenario."""
-        of = {engine: [r for r in self._rows[scenario] if r.engine == engine] for engine in self._engines}
-        cells = ", ".join(f"{engine} {_format_cell(rows)}" for engine, rows in of.items() if rows)
-        return f"{escape(scenario)}: {cells}"
+        """Count the verdicts of a scenario."""
+        counts = Counter(shown_verdict(row.verdict, row.known_issue) for row in self._rows[scenario])
+        parts = (f"{style.glyph} {counts[word]}" for word, style in SHOWN_STYLES.items() if counts[word])
+        return f"{escape(scenario)}: {' '.join(parts)}"
 
     def _severity(self, scenario: str) -> int:
         return max((row.rank[0] for row in self._rows[scenario]), default=-1)
 
-    def _is_remarkable(self, scenario: str) -> bool:
-        return any(r.verdict not in (Verdict.AGREES, Verdict.INFORMATION) for r in self._rows[scenario])
+
+def matrix_of_rows(rows: Iterable[Row], engines: Mapping[str, EngineInfo]) -> VerdictMatrix:
+    """Make the matrix of a finished run."""
+    matrix = VerdictMatrix(engines)
+    for row in rows:
+        matrix.add_rows(row.scenario, [row])
+    return matrix
 
 
 def coloured_glyph(row: Row) -> str:
@@ -108,11 +116,9 @@ def engine_heading(name: str, version: str) -> str:
 
 
 def _format_cell(rows: Sequence[Row]) -> str:
-    """Return one cell of the matrix: the worst row's glyph, the counts and the worst row's ratio."""
+    """Return one cell of the matrix: the worst row's glyph and ratio."""
     if not rows:
         return ""
     worst = max(rows, key=lambda row: row.rank)
-    agreeing = sum(row.verdict == Verdict.AGREES for row in rows)
-    checks = sum(row.verdict != Verdict.INFORMATION for row in rows)
-    ratio = "" if worst.ratio is None else f" {worst.ratio:.1g}"
-    return f"{coloured_glyph(worst)} {agreeing}/{checks}{ratio}"
+    ratio = "" if worst.ratio is None else f" {worst.ratio:.1g}".replace("e+0", "e").replace("e+", "e")
+    return f"{coloured_glyph(worst)}{ratio}"

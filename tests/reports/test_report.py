@@ -142,10 +142,9 @@ def test_terminal_and_report_show_the_same_row_of_each_cell(out, text):
             f"{r.level}, {r.quantity}" + (f", {r.integrator}" if r.integrator != "-" else ""): r for r in rows
         }
         row = parts[html.unescape(title).split(": ")[0]]
-        agreeing = sum(r.verdict == "agrees" for r in rows)
-        ratio = "" if row.ratio is None else f" {row.ratio:.1g}"
+        ratio = "" if row.ratio is None else f" {row.ratio:.1g}".replace("e+0", "e").replace("e+", "e")
         in_terminal = render(verdict_matrix._format_cell(rows)).plain
-        assert in_terminal == f"{row.verdict.style.glyph} {agreeing}/{len(rows)}{ratio}"
+        assert in_terminal == f"{row.verdict.style.glyph}{ratio}"
         in_report = Parsed(f"<p>{cell}</p>").words
         assert in_report.startswith(row.verdict.style.glyph)
         assert (str(row.verdict) if row.ratio is None else format_number(row.ratio)) in in_report

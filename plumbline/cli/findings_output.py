@@ -1,0 +1,136 @@
+"""What the terminal shows of a run: findings first, three lines each, then one line per family."""
+
+from __future__ import annotations
+
+import textwrap
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+from rich.markup import escape
+
+from plumbline.cli.verdict_matrix import VERDICT_COLOURS
+from plumbline.judging.findings import Finding
+from plumbline.judging.known_issues import KnownIssue
+from plumbline.judging.rows import SHOWN_STYLES, Row, Verdict, shown_verdict
+from plumbline.scenario.line_and_column_errors import shorten
+
+WIDTH = 80  # columns, where the terminal is no wider
+MAX_FINDINGS = 20  # written out; the report has all
+
+
+def describe_run(
+    rows: Sequence[Row], findings: Sequence[Finding], width: int, verdict_count: Mapping[Verdict, int]
+) -> Iterator[str]:
+    """Describe findings and families, in rich markup.
+
+    Args:
+        rows: of the run.
+        findings: of `find_findings`.
+        width: of the lines, in columns.
+        verdict_count: rows of random scenarios that are only counted.
+
+    """
+    new = [finding for finding in findings if finding.needs_attention]
+    for finding in new[:MAX_FINDINGS]:
+        yield from finding_lines(finding, width)
+    if len(new) > MAX_FINDINGS:
+        yield f"… and {len(new) - MAX_FINDINGS} more findings: the report has all"
+    if new:
+        yield "[dim]plumbline explain NAME prints everything that is known about one[/]"
+    for finding in findings:
+        if not finding.needs_attention:
+            yield recorded_line(finding, width)
+    yield from family_lines(rows, width, verdict_count)
+
+
+def finding_lines(finding: Finding, width: int) -> list[str]:
+    """Describe a finding that nothing expects in three lines."""
+    style, colour = SHOWN_STYLES[finding.verdict], VERDICT_COLOURS[finding.verdict]
+    size = "" if finding.largest_ratio is None else f", up to {finding.largest_ratio:.2g} times the tolerance"
+    head = "  ".join(filter(None, (finding.name, finding.version_range)))
+    return [
+        f"[{colour}]{style.glyph} {escape(shorten(head, width - 2))}[/]",
+        escape(shorten(f"  {finding.sentence}", width)),
+        escape(shorten(f"  {coverage(finding)}{size}", width)),
+    ]
+
+
+def recorded_line(finding: Finding, width: int) -> str:
+    """Describe a recorded finding in one line."""
+    shown = shown_verdict(finding.verdict, finding.known_issue)
+    size = "" if finding.largest_ratio is None else f", up to {finding.largest_ratio:.2g} tolerances"
+    text = f"{finding.name} ({finding.engine}): {coverage(finding)}{size}"
+    return f"[dim]{SHOWN_STYLES[shown].glyph} {escape(shorten(text, width - 2))}[/]"
+
+
+def coverage(finding: Finding) -> str:
+    """Say which rows a finding has: "4 rows, four-bar and 2 more"."""
+    scenarios, count = finding.scenarios, len(finding.rows)
+    more = f" and {len(scenarios) - 1} more" if len(scenarios) > 1 else ""
+    return f"{count} {'row' if count == 1 else 'rows'}, {scenarios[0]}{more}"
+
+
+def family_lines(rows: Iterable[Row], width: int, verdict_count: Mapping[Verdict, int]) -> Iterator[str]:
+    """Count scenarios and verdicts of each family."""
+    counts: dict[str, Counter[str]] = {}
+    scenarios: dict[str, set[str]] = {}
+    for row in rows:
+        shown = shown_verdict(row.verdict, row.known_issue)
+        counts.setdefault(row.family, Counter())[shown] += 1
+        scenarios.setdefault(row.family, set()).add(row.scenario)
+    if verdict_count:
+        counts.setdefault("random", Counter()).update({str(v): n for v, n in verdict_count.items()})
+    longest = max(map(len, counts), default=0)
+    for family, found in counts.items():
+        number = len(scenarios.get(family, ()))
+        text = f"{family:{longest}}  {number:3} {'scenario ' if number == 1 else 'scenarios'}"
+        parts = [f"{style.glyph} {found[word]:,}" for word, style in SHOWN_STYLES.items() if found[word]]
+        yield escape(shorten("  ".join([text, *parts]), width))
+
+
+def legend(found: Iterable[Row]) -> list[str]:
+    """List the glyphs that a run shows, with their words."""
+    shown = {shown_verdict(row.verdict, row.known_issue) for row in found}
+    return [f"{style.glyph} {word}" for word, style in SHOWN_STYLES.items() if word in shown]
+
+
+def explain(
+    finding: Finding, issue: KnownIssue | None, scripts: Mapping[str, str], width: int
+) -> Iterator[str]:
+    """Describe everything that is known about a finding, in plain text."""
+    yield finding.name
+    yield from wrap(f"{finding.engine} {finding.version_range}: {finding.title}", width, "  ")
+    yield from wrap(finding.sentence, width, "  ")
+    if issue is not None:
+        yield ""
+        yield f"recorded as {finding.known_issue}:"
+        yield from wrap(issue.reason, width, "  ")
+        yield from wrap(f"Evidence: {issue.evidence}", width, "  ")
+        if issue.since:
+            yield f"  Since version {issue.since}."
+    if finding.cause is not None and finding.cause.equal:
+        yield ""
+        yield "The data do not distinguish this from:"
+        for other in finding.cause.equal:
+            yield from wrap(" ".join((other.term, other.place, other.change)), width, "  ")
+    yield ""
+    yield f"{coverage(finding)}; smallest scenario first:"
+    for row in finding.rows:
+        ratio = "" if row.ratio is None else f"  {row.ratio:.3g} tolerances"
+        yield f"  {row.style.glyph} {row.key}{ratio}"
+    smallest = finding.rows[0]
+    yield ""
+    yield from wrap(f"In {smallest.scenario}: {smallest.reason}", width, "")
+    if smallest.diagnosis and smallest.diagnosis != finding.sentence:
+        yield from wrap(smallest.diagnosis, width, "")
+    yield ""
+    level = f" --level {smallest.level}" if smallest.level in ("state", "step", "trajectory") else ""
+    yield f"again:  plumbline run {smallest.scenario} --engine {smallest.engine}{level}"
+    script = next((scripts[row.key] for row in finding.rows if row.key in scripts), None)
+    if script:
+        yield f"script: {script}"
+
+
+def wrap(text: str, width: int, indent: str) -> list[str]:
+    """Wrap a sentence into indented lines."""
+    return textwrap.wrap(text, width, initial_indent=indent, subsequent_indent=indent, break_on_hyphens=False)

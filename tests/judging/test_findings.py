@@ -1,0 +1,156 @@
+"""Rows grouped to findings: one engine, one cause, whatever the scenarios."""
+
+from dataclasses import asdict, replace
+
+import pytest
+
+from plumbline.diagnosis.cause import Cause
+from plumbline.judging.findings import find_findings
+from plumbline.judging.rows import Row, Verdict
+
+SPRINGS = "without the springs between points"
+BODIES = {"small": 1, "middle": 2, "large": 3}
+
+
+def row(
+    scenario="small", *causes, engine="mujoco", quantity="joint_reaction", verdict=Verdict.DISAGREES, **more
+):
+    return Row(
+        scenario, "test", engine, engine.partition("@")[2] or "4.0.0", more.pop("level", "state"),
+        more.pop("integrator", "-"), quantity, "N", 1.0, 0.1, verdict, f"reason of {quantity}", ratio=10.0,
+        causes=tuple(map(asdict, causes)), **more,
+    )  # fmt: skip
+
+
+def output(change, general="", **more):
+    return Cause("output", "joint reaction", "", change, general=general, **more)
+
+
+def number(term, amount, nominal=1.0, **more):
+    return Cause("number", term, "body 2", "", (amount,), (nominal,), **more)
+
+
+def missing(term, place, general=""):
+    return Cause("number", term, place, "missing", (0.0,), (1.0,), general=general)
+
+
+def names(*rows):
+    return {f.name: sorted(r.scenario for r in f.rows) for f in find_findings(rows, BODIES)}
+
+
+def test_one_cause_at_several_places_is_one_finding_with_the_smallest_scenario_first():
+    rows = [row("large", output(SPRINGS, SPRINGS)), row("middle", output("without spring 1", SPRINGS))]
+    (found,) = find_findings(rows, BODIES)
+    assert found.name == "mujoco-joint-reaction-without-springs-between-points"
+    assert found.scenarios == ["middle", "large"] and "spring 1" in found.sentence
+
+
+def test_another_scenario_renames_nothing():
+    rows = [
+        row("middle", output("without spring 1", SPRINGS)),
+        row("middle", number("mass", 1.1), quantity="acceleration"),
+    ]
+    before = names(*rows)
+    after = names(
+        *rows,
+        row("small", output(SPRINGS, SPRINGS)),
+        row("large", number("mass", 2.2, 2.0), quantity="acceleration"),
+    )
+    assert before.keys() == after.keys() and len(before) == 2
+
+
+APART = {
+    "another change": (
+        output(SPRINGS),
+        output("with twice spring 1", "with twice the springs between points"),
+    ),
+    "another part": (
+        output(SPRINGS),
+        output("without that of joint 6", "without those of the closing joints"),
+    ),
+    "missing and wrong": (
+        missing("damping", "joint 1"),
+        Cause("number", "damping", "joint 2", "", (0.3,), (0.2,)),
+    ),
+    "missing and reversed": (
+        missing("damping", "joint 1"),
+        Cause("number", "damping", "", "reversed", (-1.0,), (1.0,)),
+    ),
+    "two factors": (number("mass", 1.1), number("mass", 2.4, 2.0)),
+    "number and term": (number("drag", 1.5), Cause("term", "drag", "all bodies", "", (1.5,), (1.0,), "×")),
+    "two elements": (
+        missing("stiffness", "joint 1"),
+        missing("stiffness", "spring 1", "stiffness of springs"),
+    ),
+    "frame and point": (output("in the body frame"), output("of the joint's point")),
+    "two needs": (
+        Cause("unexplained", "acceleration", quantities=("joint_reaction",), needs=("gravity",)),
+        Cause("unexplained", "acceleration", quantities=("joint_reaction",), needs=("motion", "gravity")),
+    ),
+    "rounding": (
+        Cause("rounding", "joint reaction", "", "lose", quantities=("joint_reaction",)),
+        output(SPRINGS),
+    ),
+}
+
+
+@pytest.mark.parametrize("what", APART)
+def test_two_mistakes_in_one_term_or_quantity_stay_apart(what):
+    one, other = APART[what]
+    found = find_findings([row("small", one), row("large", other)], BODIES)
+    assert len(found) == 2 and len({f.name for f in found}) == 2
+    assert [len(f.rows) for f in found] == [1, 1]
+
+
+@pytest.mark.parametrize(
+    "pair", [((1.1, 1.0), (2.2, 2.0)), ((1.1, 1.0), (2.1, 2.0)), ((9.8, 9.81), (9.8, 1.6))]
+)
+def test_one_factor_one_difference_or_one_number_is_one_mistake(pair):
+    assert len(names(*(row(s, number("mass", *p)) for s, p in zip(BODIES, pair, strict=False)))) == 1
+
+
+def test_what_the_data_cannot_distinguish_joins_the_finding_that_explains_both():
+    ambiguous = replace(missing("effort", "joint 1"), equal=(missing("rest position", "joint 1"),))
+    rows = [row("small", ambiguous), row("large", missing("rest position", "joint 3"))]
+    (found,) = find_findings(rows, BODIES)
+    assert found.name == "mujoco-rest-position-missing" and "rest position" in found.sentence
+
+
+def test_versions_are_one_finding_with_a_range_and_the_version_that_is_right():
+    rows = [row("small", output(SPRINGS), engine=f"mujoco@{v}") for v in ("3.10.0", "3.2.0")]
+    right = row("small", engine="mujoco@4.0.0", verdict=Verdict.AGREES)
+    (found,) = find_findings([*rows, right], BODIES)
+    assert found.version_range == "3.2.0 to 3.10.0 (not 4.0.0)"
+
+
+def test_rows_without_a_diagnosis_follow_from_the_causes_of_their_cell():
+    motion = row("small", quantity="order", level="trajectory", integrator="RK4")
+    elsewhere = row("large", quantity="order", level="trajectory", integrator="RK4")
+    found = find_findings([row("small", output(SPRINGS)), motion, elsewhere], BODIES)
+    of_elsewhere, with_cause = sorted(([r.key for r in f.rows] for f in found), key=len)
+    assert of_elsewhere == [elsewhere.key]
+    assert with_cause == ["small/mujoco/state/-/joint_reaction", motion.key]
+
+
+def test_a_cause_is_about_its_own_quantities():
+    causes = (
+        output(SPRINGS, quantities=("joint_reaction",)),
+        Cause("unexplained", "kinetic energy", quantities=("kinetic_energy",), needs=("motion",)),
+    )
+    rows = [row("small", *causes), row("small", *causes, quantity="kinetic_energy")]
+    found = find_findings(rows, BODIES)
+    assert {f.name: f.quantities for f in found} == {
+        f"mujoco-joint-reaction-{SPRINGS.replace('the ', '').replace(' ', '-')}": ["joint_reaction"],
+        "mujoco-wrong-energies-with-motion": ["kinetic_energy"],
+    }
+
+
+def test_recorded_rows_are_one_finding_by_entry_and_declared_gaps_are_none():
+    rows = [
+        row("small", known_issue="known"), row("large", known_issue="known", quantity="acceleration"),
+        row("small", verdict=Verdict.UNSUPPORTED, known_issue="declared: joints", quantity="all"),
+        row("small", verdict=Verdict.UNSUPPORTED, quantity="order"),
+    ]  # fmt: skip
+    new, known = find_findings(rows, BODIES)
+    assert (known.name, len(known.rows), known.needs_attention) == ("known", 2, False)
+    assert new.verdict == Verdict.UNSUPPORTED and new.needs_attention
