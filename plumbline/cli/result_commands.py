@@ -206,7 +206,7 @@ def explain(name: str | None, folder: Path) -> None:
         hint = did_you_mean(name, [f.name for f in chosen or found])
         several = f"{len(chosen)} findings begin so" if chosen else "no finding has this name"
         raise click.UsageError(f"{name!r}: {several}" + (f"; {hint}" if hint else ""))
-    issues = {issue.id: issue for issue in project_known_issues()}
+    issues = {issue.name: issue for issue in project_known_issues()}
     width = min(max(make_console(sys.stdout).width, output.WIDTH), MAX_WIDTH)
     for line in output.explain(chosen[0], issues.get(chosen[0].known_issue or ""), scripts, width):
         click.echo(line)

@@ -472,19 +472,28 @@ class Outputs:
         model, state = self.case
         right = [self.right.get(name, np.zeros(self._near.shape)) for name in WRENCHES]
         parts = list[Part]()
-        every = np.zeros((2, *state.v.shape))
-        for k in range(model.n, len(model.kind)):
-            applied = np.zeros((2, *state.v.shape))
-            for body, sign in zip(model.body[k], (-1.0, 1.0), strict=True):
-                if body >= 0:
-                    applied[0, :, body] += sign * right[0][:, k]
-                    lever = self._near[:, k] - state.r[:, body]
-                    applied[1, :, body] += sign * (right[1][:, k] + cross(lever, right[0][:, k]))
-            every += applied
-            part = self._carried(f"that of the closing joint {k + 1}", *applied)
-            parts.append(replace(part, every=CLOSING_JOINTS))
-        if len(parts) > 1:
-            parts.append(self._carried(CLOSING_JOINTS, *every))
+        closing = range(model.n, len(model.kind))
+        for what, every, share in (
+            ("that of", CLOSING_JOINTS, (1.0, 1.0)),
+            ("the moment of", "the moments of the closing joints", (0.0, 1.0)),
+        ):
+            total = np.zeros((2, *state.v.shape))
+            for k in closing:
+                applied, force, moment = (
+                    np.zeros_like(total),
+                    share[0] * right[0][:, k],
+                    share[1] * right[1][:, k],
+                )
+                for body, sign in zip(model.body[k], (-1.0, 1.0), strict=True):
+                    if body >= 0:
+                        applied[0, :, body] += sign * force
+                        lever = self._near[:, k] - state.r[:, body]
+                        applied[1, :, body] += sign * (moment + cross(lever, force))
+                total += applied
+                part = self._carried(f"{what} the closing joint {k + 1}", *applied)
+                parts.append(replace(part, every=every))
+            if len(closing) > 1:
+                parts.append(self._carried(every, *total))
         carried = np.zeros((2, *self._near.shape))
         for k in range(model.n):
             far = int(model.body[k, 0])

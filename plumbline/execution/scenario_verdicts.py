@@ -452,8 +452,7 @@ class ScenarioRun:
     def _diagnosis_tasks(self, answer: Outcome, found: JudgingResult) -> list[Task]:
         """The task that searches the cause of a cell's disagreement, or measures how the error scatters.
 
-        A cause that is on record is not searched again. In random scenarios, most of which have no relations,
-        the scatter is measured instead, by which the recorded mechanism is checked.
+        A mechanism that is on record is not searched again: the scatter is measured, by which it is checked.
         """
         disputed = [row for row in found.rows if row.verdict == Verdict.DISAGREES]
         model, marked = self.scenario.model, disputed
@@ -461,7 +460,7 @@ class ScenarioRun:
             marked = self._known.mark_known(disputed, model.n, inertia_ratio(model))
         is_known = all(row.known_issue is not None for row in marked)
         key: TaskKey = answer.key
-        if not disputed or (is_known and not self._is_random):
+        if not disputed:
             return []
         from plumbline.diagnosis.diagnose import explain_disagreement  # few runs need them
         from plumbline.diagnosis.integrator_search import explain_disagreeing_steps

@@ -136,7 +136,8 @@ def find_findings(rows: Iterable[Row], bodies: Mapping[str, int]) -> list[Findin
 
     """
     every = list(rows)
-    wrong = [row for row in every if row.verdict.needs_attention and not is_declared(row.known_issue)]
+    wrong = [row for row in every if Verdict(row.verdict).needs_attention]
+    wrong = [row for row in wrong if not is_declared(row.known_issue)]
     groups = _Groups()
     for row in wrong:
         if row.known_issue is not None:
@@ -199,7 +200,7 @@ class _Group:
         return Finding(
             name="",
             engine=self.engine,
-            verdict=max((row.verdict for row in order), key=lambda v: VERDICT_STYLES[v].severity),
+            verdict=max((Verdict(row.verdict) for row in order), key=lambda v: VERDICT_STYLES[v].severity),
             title=_title(identity, cause, first),
             sentence=first.reason if cause is None else describe([cause]),
             known_issue=self.known,
@@ -223,7 +224,10 @@ def _identity(cause: Cause) -> Identity:
         return cause.kind, quantity_class(cause.quantities)
     if cause.kind == "unexplained":
         return cause.kind, quantity_class(cause.quantities) or cause.term, *cause.needs
-    return cause.identity
+    kind, term, change = cause.identity
+    if kind == "output" and cause.quantities and set(cause.quantities) <= set(CLASSES["joint forces"]):
+        term = "joint forces"  # one mistake in wrenches shows in both of their halves
+    return kind, term, change
 
 
 def _title(identity: Identity, cause: Cause | None, row: Row) -> str:

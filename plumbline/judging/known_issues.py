@@ -1,11 +1,11 @@
 """Known discrepancies and expected gaps: the only files that may excuse a verdict.
 
-Each entry of known_issues.yaml has scenario, engine, version range, level, integrator, quantity (patterns
-with *; scenario, integrator and quantity may be lists), the expected verdict, its evidence and its reason.
-An expected disagreement also has the largest ratio of error and tolerance that it covers, and a mechanism,
-which is checked where the run has the rows for it: what exceeds the entry is a new disagreement. Of a missing
-term the effect is computed; the entry covers that, and nothing that is left beyond the tolerance.
-An entry that matches cells of the run but none of their verdicts is stale and fails the run.
+An entry of known_issues.yaml records a finding: engine, cause or needs, version range, evidence and reason,
+and the rows that it covers, with their largest ratio of error and tolerance.  Rows of states and steps are
+matched by the cause that the diagnosis names, or, where a mechanism is recorded, as far as the run can check
+it; of other levels by patterns of integrator, quantity and scenario.  What exceeds the entry is a new
+disagreement.  Of a missing term the effect is computed; the entry covers that, and nothing that is left above
+the tolerance.  An entry that matches cells of the run but none of their verdicts is stale and fails the run.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from pydantic import (
     model_validator,
 )
 
+from plumbline.diagnosis.cause import CauseKind
 from plumbline.engines.declared_names import declared_integrators, declared_texts
 from plumbline.engines.registry import ENGINES, IMPORTERS, USER_ENGINES
 from plumbline.importers.neutral_model import MODEL_UNITS
@@ -55,6 +56,7 @@ from plumbline.truth.step_comparison import CONSTRAINED_UNITS, STEP_UNITS
 
 RowKind = tuple[str, str, str, str, str]  # of a row: engine, its version, level, integrator, quantity
 KNOWN_ISSUES_FILE = Path(__file__).with_name("known_issues.yaml")
+DIAGNOSED_LEVELS = ("state", "step")  # whose rows have causes
 LEVELS: tuple[Level, ...] = ("state", "step", "invariants", "trajectory", "relations", "model")
 ANY_LENGTH = 10**9  # bodies
 # Bounds are 64 roundings of the largest term and more: an answer that is off by a million times the quantity
@@ -80,7 +82,7 @@ MECHANISMS: dict[Mechanism, str] = {
 class KnownIssue:
     """One expected verdict that is not "agrees"."""
 
-    id: str
+    id: str  # of these rows of an entry, unique
     scenario: str
     engine: str
     verdict: str
@@ -99,14 +101,34 @@ class KnownIssue:
     intermittent: str = ""  # why the verdict may or may not occur; empty: it must
     extra_refinements_only: bool = False  # only with the additional smaller steps of the nightly
     since: str = ""  # the first version that shows it, as `plumbline bisect` finds it; empty: not searched
+    cause: Mapping[str, str] = field(default_factory=dict)  # fields of a cause that rows must have
+    needs: tuple[str, ...] | None = None  # of what no cause explains; None: not recorded
+    entry: str = ""  # id of the entry; empty: its own
+
+    @property
+    def name(self) -> str:
+        """The finding's name: the id of the entry."""
+        return self.entry or self.id
 
     @property
     def diagnosis(self) -> str | None:
         """The recorded mechanism and cause, for rows without a diagnosis; None where none is stated."""
-        if not self.mechanism:
+        if not (self.mechanism or self.cause or self.needs is not None):
             return None
         since = f" Since version {self.since}." if self.since else ""
-        return f"recorded: {MECHANISMS[self.mechanism]}. {self.reason}{since}"
+        mechanism = f"{MECHANISMS[self.mechanism]}. " if self.mechanism else ""
+        return f"recorded: {mechanism}{self.reason}{since}"
+
+    def has_cause(self, row: Row) -> bool:
+        """Return whether the diagnosis of a row's cell names what is recorded."""
+        if row.level not in DIAGNOSED_LEVELS or not (self.cause or self.needs is not None):
+            return True
+        return any(
+            all(wanted in (one[name], one["general"]) for name, wanted in self.cause.items())
+            and self.needs in (None, tuple(one["needs"]))
+            for cause in row.causes
+            for one in (cause, *cause["equal"])
+        )
 
     def matches_kind(self, kind: RowKind) -> bool:
         """Return whether the entry is about rows of this kind, in its scenarios.
@@ -174,23 +196,25 @@ class KnownIssue:
             Why the entry does not cover the row; empty where it does.
 
         """
+        if not self.has_cause(row):
+            return f"the entry {self.name} records another cause"
         ratio = math.inf if row.ratio is None else row.ratio
         if not ratio <= covered and covered < math.inf:
-            return f"the entry {self.id} covers {covered:g} times the tolerance at most"
+            return f"the entry {self.name} covers {covered:g} times the tolerance at most"
         if self.mechanism == "missing term" and not (left := row.extra.get(UNEXPLAINED, math.inf)) <= 1:
             return (
-                f"the entry {self.id} records a missing term, which leaves {left:.3g} tolerances unexplained"
+                f"the entry {self.name} records a missing term; it leaves {left:.3g} tolerances unexplained"
             )
         shown = self.scatter_of(row, scatter)
         least = MIN_OWN_SCATTER if "scatter" in row.extra else MIN_SCATTER
         if self.mechanism == "rounding" and shown is not None and shown < least * ratio:
             return (
-                f"the entry {self.id} records rounding, but equivalent descriptions of the problem differ by "
-                f"only {shown:.2g} times their tolerance"
+                f"the entry {self.name} records rounding, but equivalent descriptions of the problem differ "
+                f"by only {shown:.2g} times their tolerance"
             )
         if self.mechanism == "equations" and shown is not None and shown > max(1.0, MIN_SCATTER * ratio):
             return (
-                f"the entry {self.id} records other equations, but equivalent descriptions of the problem "
+                f"the entry {self.name} records other equations, but equivalent descriptions of the problem "
                 f"differ by {shown:.2g} times their tolerance"
             )
         return ""
@@ -228,32 +252,92 @@ def _field(description: str, default: Any = ...) -> Any:
     return Field(default, description=description)
 
 
-class _Entry(BaseModel):
-    """An entry as the file has it: lists stand for an issue of each name."""
+class _Selector(BaseModel):
+    """Rows that an entry covers: lists stand for each name, of which each must occur."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    id: str = _field("A name of the entry, unique in all files.")
-    scenario: _Texts = _field("Name or pattern of scenarios, or a list of them.")
-    engine: str = _field("Name or pattern of engines.")
-    versions: str = _field("A version range, as '>=1.13,<2'.", "")
+    scenario: _Texts = _field("Name or pattern of scenarios, or a list of them.", ["*"])
+    engine: str = _field("Name or pattern of engines; of the entry by default.", "")
     level: str = _field("A level, or *.", "*")
     integrator: _Texts = _field("Name or pattern of integrators, or a list of them.", ["*"])
     quantity: _Texts = _field("Name or pattern of quantities, or a list of them.", ["*"])
-    verdict: Literal["disagrees", "unresolved", "unsupported", "failed"] = _field("The expected verdict.")
+    verdict: Literal["disagrees", "unresolved", "unsupported", "failed"] = _field(
+        "The expected verdict.", "disagrees"
+    )
     max_ratio: Annotated[dict[PositiveInt, _Ratio], BeforeValidator(_as_ratios)] = _field(
         "The largest ratio of error and tolerance, or a mapping from numbers of bodies to it.", {}
     )
     max_ratio_by_inertia: _Ratio | None = _field(
         "The largest ratio of error and tolerance, over the chain's largest ratio of inertias.", None
     )
-    mechanism: Mechanism | None = _field("The mechanism of a disagreement.", None)
     shown_by: str = _field("The engine whose rows show the mechanism.", "")
     intermittent: str = _field("Why the verdict may or may not occur.", "")
     extra_refinements_only: bool = _field("Whether the nightly's smaller steps alone show it.", False)
+
+    def check(self, engine: str, mechanism: Mechanism | None, has_cause: bool) -> None:
+        """Raise the validation error of what an entry with a mechanism may not expect."""
+        is_size_computed = mechanism == "missing term"
+        missing = [] if self.max_ratio or self.max_ratio_by_inertia or is_size_computed else ["max_ratio"]
+        missing += [] if mechanism or has_cause else ["cause or mechanism"]
+        if self.verdict == "disagrees" and missing:
+            raise invalid_value_error(
+                f"expects a disagreement without {' and '.join(missing)}",
+                "max_ratio: the largest error over tolerance, and cause: fields of the cause that `explain` "
+                "prints, or mechanism: " + ", ".join(MECHANISMS),
+            )
+        if self.verdict == "disagrees" and "*" in (self.engine or engine):
+            raise invalid_value_error("expects a disagreement of every engine", "the engine that is wrong")
+        is_random = all(name.startswith(f"{RANDOM_FAMILY}-") for name in self.scenario)
+        if self.intermittent and not (self.verdict == "unresolved" or mechanism == "rounding" or is_random):
+            raise invalid_value_error(
+                "is intermittent",
+                "`intermittent` for the verdict unresolved, the mechanism rounding, or random scenarios "
+                f"({RANDOM_FAMILY}-*)",
+            )
+
+    def issues(self, name: str, common: Mapping[str, Any]) -> Iterator[KnownIssue]:
+        """Make an issue of each name of the lists, with its own id: each must occur.
+
+        Args:
+            name: of these rows.
+            common: fields of the entry.
+
+        """
+        own = {one: getattr(self, one) for one in _Selector.model_fields}
+        own["engine"] = self.engine or common["engine"]
+        lists = {one: own[one] for one in ("scenario", "integrator", "quantity")}
+        for names in product(*lists.values()):
+            varied = [one for one, given in zip(names, lists.values(), strict=True) if len(given) > 1]
+            chosen = dict(zip(lists, names, strict=True))
+            yield KnownIssue(**{**common, **own, **chosen, "id": ": ".join([name, *varied])})
+
+
+class _Cause(BaseModel):
+    """Fields of `plumbline.diagnosis.cause.Cause` that those of the rows must have."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    kind: CauseKind = _field("number, term, output, frame, method, rounding or unexplained.")
+    term: str = _field("The number, term or quantity.", "")
+    change: str = _field("missing, doubled, reversed, in the body frame, …", "")
+
+
+class _Entry(_Selector):
+    """An entry as the file has it: a finding, and the rows that it covers."""
+
+    id: str = _field("A name of the entry, unique in all files: the finding's.")
+    engine: str = _field("Name or pattern of engines.")
+    versions: str = _field("A version range, as '>=1.13,<2'.", "")
+    cause: _Cause | None = _field(
+        "The cause that the diagnosis names, as `plumbline explain` prints it.", None
+    )
+    needs: list[str] | None = _field("What a difference without a cause needs.", None)
+    mechanism: Mechanism | None = _field("The mechanism of a disagreement.", None)
     since: str = _field("The first version that shows it, as '4.1.0' or '3.3.1 or earlier'.", "")
     evidence: str = _field("A measurement, a script, a document.")
     reason: str = _field("The cause.")
+    rows: list[_Selector] = _field("Rows that it covers; none: those of the entry's own patterns.", [])
 
     @field_validator("id")
     @classmethod
@@ -293,37 +377,24 @@ class _Entry(BaseModel):
         return text
 
     @model_validator(mode="after")
-    def _check_disagreement(self) -> _Entry:
-        is_size_computed = self.mechanism == "missing term"
-        missing = [] if self.max_ratio or self.max_ratio_by_inertia or is_size_computed else ["max_ratio"]
-        missing += [] if self.mechanism else ["mechanism"]
-        if self.verdict == "disagrees" and missing:
-            raise invalid_value_error(
-                f"expects a disagreement without {' and '.join(missing)}",
-                "max_ratio: the largest error over tolerance, and mechanism: " + ", ".join(MECHANISMS),
-            )
-        if self.verdict == "disagrees" and "*" in self.engine:
-            raise invalid_value_error("expects a disagreement of every engine", "the engine that is wrong")
-        may_vary = (
-            self.verdict == "unresolved"
-            or self.mechanism == "rounding"
-            or all(name.startswith(f"{RANDOM_FAMILY}-") for name in self.scenario)
-        )
-        if self.intermittent and not may_vary:
-            raise invalid_value_error(
-                "is intermittent",
-                "`intermittent` for the verdict unresolved, the mechanism rounding, or random scenarios "
-                f"({RANDOM_FAMILY}-*)",
-            )
+    def _check_rows(self) -> _Entry:
+        for selector in self.rows or [self]:
+            selector.check(self.engine, self.mechanism, self.cause is not None or self.needs is not None)
         return self
 
-    def issues(self) -> Iterator[KnownIssue]:
-        """Make an issue of each name of the lists, with its own id: each must occur."""
-        lists = {name: getattr(self, name) for name in ("scenario", "integrator", "quantity")}
-        for names in product(*lists.values()):
-            varied = [name for name, given in zip(names, lists.values(), strict=True) if len(given) > 1]
-            chosen = dict(zip(lists, names, strict=True))
-            yield KnownIssue(**{**self.__dict__, **chosen, "id": ": ".join([self.id, *varied])})
+    def every_issue(self) -> Iterator[KnownIssue]:
+        """Make the issues of all rows."""
+        common = {
+            name: getattr(self, name) for name in _Entry.model_fields.keys() - {"rows", "cause", "needs"}
+        }
+        cause = {} if self.cause is None else self.cause.model_dump()
+        common["cause"] = {name: value for name, value in cause.items() if value}
+        common["needs"] = None if self.needs is None else tuple(self.needs)
+        common["entry"] = self.id
+        for number, selector in enumerate(self.rows, 1):
+            yield from selector.issues(f"{self.id} ({number})", common)
+        if not self.rows:
+            yield from _Selector.issues(self, self.id, common)
 
 
 def load_known_issues(
@@ -366,7 +437,7 @@ def load_known_issues(
     problems += _name_problems(source, entries, {*other_scenarios, *beside})
     if problems:
         raise ScenarioError(problems)
-    return [issue for entry in entries for issue in entry.issues()]
+    return [issue for entry in entries for issue in entry.every_issue()]
 
 
 @cache
@@ -387,7 +458,7 @@ def _id_problems(source: YamlSource, entries: Sequence[_Entry], places: dict[str
     """Problems of ids that are used twice, in one file or in two."""
     for number, entry in enumerate(entries):
         path = (number, "id")
-        ids = {entry.id, *(issue.id for issue in entry.issues())}
+        ids = {entry.id, *(issue.id for issue in entry.every_issue())}
         if twice := sorted(ids & places.keys()):
             message = f"the id {shorten(repr(twice[0]))} is used twice, first at {places[twice[0]]}"
             yield _problem(source, path, message, "an id of its own")
@@ -410,11 +481,13 @@ def _name_problems(source: YamlSource, entries: Sequence[_Entry], others: set[st
         "quantity": _quantities(),
     }
     for number, entry in enumerate(entries):
-        for name, words in known.items():
-            given = getattr(entry, name)
+        places: list[tuple[tuple[PathKey, ...], _Selector]] = [((number,), entry)]
+        places += [((number, "rows", i), selector) for i, selector in enumerate(entry.rows)]
+        for (at, selector), (name, words) in product(places, known.items()):
+            given = getattr(selector, name)
             for place, pattern in enumerate(given if isinstance(given, list) else [given]):
                 if pattern and not any(fnmatchcase(word, pattern) for word in words):
-                    path: tuple[PathKey, ...] = (number, name)
+                    path: tuple[PathKey, ...] = (*at, name)
                     if (*path, place) in source.value_positions:
                         path = (*path, place)
                     hint = did_you_mean(pattern, sorted(words)) or f"`list` and the docs have every {name}"
@@ -518,15 +591,17 @@ class KnownIssues:
             if row.ratio is not None and covered < math.inf:
                 known = self.worst_ratios.get(match.id, (0.0, covered))
                 self.worst_ratios[match.id] = max(known, (row.ratio / covered, covered))
-            diagnosis = row.diagnosis or match.diagnosis
+            is_measured = bool(row.causes) and all(cause["kind"] == "rounding" for cause in row.causes)
+            own = None if is_measured else row.diagnosis
+            diagnosis = own or match.diagnosis
             shown = match.scatter_of(row, scatter)
-            if match.mechanism == "rounding" and not row.diagnosis and shown is not None:
+            if match.mechanism == "rounding" and not own and shown is not None:
                 diagnosis = f"{diagnosis} Checked: they differ by {shown:.2g} tolerances."
-            if match.mechanism == "missing term" and not row.diagnosis:
+            if match.mechanism == "missing term" and not own:
                 diagnosis = (
                     f"{diagnosis} Checked: without it {row.extra[UNEXPLAINED]:.2g} tolerances are left."
                 )
-            return replace(row, known_issue=match.id, diagnosis=diagnosis)
+            return replace(row, known_issue=match.name, diagnosis=diagnosis)
         return replace(row, reason=f"{row.reason}; {objections[0]}") if objections else row
 
     def wide_issues(self) -> list[str]:

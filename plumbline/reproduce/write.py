@@ -250,7 +250,7 @@ def _version_sentence(rows: list[StoredRow], changes: dict[str, dict[str, Any]])
         if row["key"] in changes:
             return str(changes[row["key"]]["note"])
     ids = {row["known_issue"] for row in rows}
-    since = next((issue.since for issue in project_known_issues() if issue.id in ids and issue.since), "")
+    since = next((issue.since for issue in project_known_issues() if issue.name in ids and issue.since), "")
     return f"Since version {since}." if since else ""
 
 

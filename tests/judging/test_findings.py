@@ -23,6 +23,7 @@ def row(
 
 
 def output(change, general="", **more):
+    more = {"quantities": ("joint_reaction",)} | more
     return Cause("output", "joint reaction", "", change, general=general, **more)
 
 
@@ -41,7 +42,7 @@ def names(*rows):
 def test_one_cause_at_several_places_is_one_finding_with_the_smallest_scenario_first():
     rows = [row("large", output(SPRINGS, SPRINGS)), row("middle", output("without spring 1", SPRINGS))]
     (found,) = find_findings(rows, BODIES)
-    assert found.name == "mujoco-joint-reaction-without-springs-between-points"
+    assert found.name == "mujoco-joint-forces-without-springs-between-points"
     assert found.scenarios == ["middle", "large"] and "spring 1" in found.sentence
 
 
@@ -140,7 +141,7 @@ def test_a_cause_is_about_its_own_quantities():
     rows = [row("small", *causes), row("small", *causes, quantity="kinetic_energy")]
     found = find_findings(rows, BODIES)
     assert {f.name: f.quantities for f in found} == {
-        f"mujoco-joint-reaction-{SPRINGS.replace('the ', '').replace(' ', '-')}": ["joint_reaction"],
+        f"mujoco-joint-forces-{SPRINGS.replace('the ', '').replace(' ', '-')}": ["joint_reaction"],
         "mujoco-wrong-energies-with-motion": ["kinetic_energy"],
     }
 

@@ -3,13 +3,14 @@
 import json
 import math
 import re
-from dataclasses import FrozenInstanceError, replace
+from dataclasses import FrozenInstanceError, asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 from plumbline.cli.terminal_output import print_result
+from plumbline.diagnosis.cause import Cause
 from plumbline.engines.declared_names import declared_integrators
 from plumbline.engines.registry import ENGINES, load_adapter
 from plumbline.execution.random_batch import RandomBatch
@@ -104,7 +105,7 @@ def loaded(tmp_path, *entries, **more):
 @pytest.mark.parametrize(
     ("text", "at", "words"),
     [
-        ("- {id: a}", "1:3", "[0].scenario: is missing; valid would be name or pattern of scenarios"),
+        ("- {id: a}", "1:3", "[0].engine: is missing; valid would be name or pattern of engines"),
         ("id: a", "1:1", "is not a list; valid would be a list of entries"),
         ("- 3", "1:3", "[0]: is the number 3"),
         ("- [", "1:4", "expected the node content"),
@@ -143,7 +144,10 @@ def test_a_malformed_file_is_a_problem_with_a_position(tmp_path, text, at, words
             "quantity: no quantity matches 'aceleration'; did you mean 'acceleration'?",
         ),
         ({"quantity": "by crbaa"}, "quantity: no quantity matches 'by crbaa'; did you mean 'by crba'?"),
-        ({"verdict": "disagrees"}, "expects a disagreement without max_ratio and mechanism"),
+        ({"verdict": "disagrees"}, "expects a disagreement without max_ratio and cause or mechanism"),
+        ({"rows": [OFF | {"mechanism": "rounding"}]}, "rows[0].mechanism: unknown field"),
+        ({"rows": [{"verdict": "failed", "quantity": "acelleration"}]}, "did you mean 'acceleration'?"),
+        ({"cause": {"kind": "nunber"}}, "cause.kind: is 'nunber'"),
         (OFF | {"mechanism": "magic"}, "mechanism: is 'magic'"),
         (OFF | {"max_ratio": -1}, "max_ratio: is -1"),
         (OFF | {"max_ratio": "much"}, "max_ratio"),
@@ -494,3 +498,49 @@ def test_an_id_cannot_look_like_a_declared_gap(tmp_path):
     )
     with pytest.raises(ScenarioError, match="an id without 'declared: '"):
         known_issues.load_known_issues(path)
+
+
+CAUSE = {"kind": "output", "term": "joint reaction", "change": "without the springs between points"}
+
+
+def with_cause(level="state", **changes):
+    cause = asdict(Cause("output", "joint reaction", "", "without spring 1", general=CAUSE["change"]))
+    return replace(ratio_row(10.0, level), causes=(cause | changes,))
+
+
+@pytest.mark.parametrize(
+    ("found", "is_known"),
+    [
+        (with_cause(), True),
+        (with_cause(general="", change=CAUSE["change"]), True),
+        (with_cause(general="", change="reversed"), False),
+        (with_cause(general="", change="x", equal=[with_cause().causes[0]]), True),
+        (with_cause(term="joint moment"), False),
+        (replace(with_cause(), causes=()), False),
+        (replace(with_cause(), ratio=40.0), False),
+        (replace(with_cause(), engine_version="9.0"), False),
+        (replace(with_cause(), quantity="kinetic_energy"), False),
+        (replace(with_cause(), scenario="any-other"), True),
+    ],
+)
+def test_an_entry_is_matched_by_cause_size_and_version_in_any_scenario(tmp_path, found, is_known):
+    rows = [{"level": "state", "quantity": ["acceleration", "joint_reaction"], "max_ratio": 30}]
+    changes = {"scenario": "*", "verdict": "disagrees", "versions": "<5", "cause": CAUSE, "rows": rows}
+    judged = judged_by([found], loaded(tmp_path, changes), whole=True).rows[0]
+    assert (judged.known_issue == "a") is is_known, judged.reason
+
+
+def test_an_entry_of_what_no_cause_explains_is_matched_by_needs(tmp_path):
+    changes = {"scenario": "*", "verdict": "disagrees", "max_ratio": 30, "needs": ["motion"]}
+    entries = loaded(tmp_path, changes)
+    for needs, known in ((("motion",), "a"), (("motion", "gravity"), None), ((), None)):
+        row_ = with_cause(kind="unexplained", needs=list(needs))
+        assert judged_by([row_], entries, whole=True).rows[0].known_issue == known
+
+
+def test_each_row_of_an_entry_must_occur(tmp_path):
+    rows = [{"level": "state", "max_ratio": 30}, {"level": "relations", "max_ratio": 30}]
+    changes = {"scenario": "*", "verdict": "disagrees", "mechanism": "rounding", "rows": rows}
+    agreeing = ratio_row(0.5, "relations", "rotated world", verdict="agrees")
+    stale = judged_by([ratio_row(10.0), agreeing], loaded(tmp_path, changes), whole=True).stale
+    assert [(issue.name, issue.level) for issue in stale] == [("a", "relations")]
