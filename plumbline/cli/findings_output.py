@@ -10,6 +10,7 @@ from rich.markup import escape
 
 from plumbline.cli.verdict_matrix import VERDICT_COLOURS
 from plumbline.judging.findings import Finding
+from plumbline.judging.known_issue_text import entry_lines, entry_of
 from plumbline.judging.known_issues import KnownIssue
 from plumbline.judging.rows import SHOWN_STYLES, Row, Verdict, shown_verdict
 from plumbline.scenario.line_and_column_errors import shorten
@@ -129,6 +130,10 @@ def explain(
     script = next((scripts[row.key] for row in finding.rows if row.key in scripts), None)
     if script:
         yield f"script: {script}"
+    if finding.needs_attention and finding.verdict != Verdict.HARNESS_FAILED:
+        yield ""
+        yield "To record it, write evidence and reason into this entry of a file for --known:"
+        yield from entry_lines(entry_of(finding))
 
 
 def wrap(text: str, width: int, indent: str) -> list[str]:

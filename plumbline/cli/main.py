@@ -46,6 +46,7 @@ COMMANDS = {  # where each is, and its line in the list; imported when it is typ
     "verify": ("proof_commands:verify", "Prove certificates again."),
     "history": ("result_commands:history", "Compare stored nights."),
     "explain": ("result_commands:explain", "Print everything that is known about a finding."),
+    "known": ("result_commands:known", "Write files of known issues by finding."),
     "report": ("result_commands:report", "Write the report of stored results again."),
     "check": ("scenario_commands:check", "Check scenario files."),
     "contract": ("engine_commands:contract", "Test an engine of your own."),

@@ -13,7 +13,7 @@ import reports
 from plumbline import layout
 from plumbline.cli import options
 from plumbline.cli.help_texts import examples
-from plumbline.cli.terminal_output import MAX_WIDTH, count_noun, make_console, print_table
+from plumbline.cli.terminal_output import count_noun, line_width, make_console, print_table
 from plumbline.scenario.line_and_column_errors import did_you_mean
 from plumbline.storage.results_store import read_results
 
@@ -207,6 +207,22 @@ def explain(name: str | None, folder: Path) -> None:
         several = f"{len(chosen)} findings begin so" if chosen else "no finding has this name"
         raise click.UsageError(f"{name!r}: {several}" + (f"; {hint}" if hint else ""))
     issues = {issue.name: issue for issue in project_known_issues()}
-    width = min(max(make_console(sys.stdout).width, output.WIDTH), MAX_WIDTH)
-    for line in output.explain(chosen[0], issues.get(chosen[0].known_issue or ""), scripts, width):
+    issue, width = issues.get(chosen[0].known_issue or ""), line_width(make_console(sys.stdout))
+    for line in output.explain(chosen[0], issue, scripts, width):
         click.echo(line)
+
+
+@click.command(epilog=examples("known mine.yaml > mine-by-finding.yaml"))
+@click.argument("files", nargs=-1, required=True, metavar="FILE...", type=click.Path(path_type=Path))
+def known(files: tuple[Path, ...]) -> None:
+    """Print entries of files of known issues by finding: those of one engine and one reason as one.
+
+    Older files have an entry for each selection of rows; they stay valid.
+    """
+    from plumbline.judging.known_issue_text import entry_lines, merge_entries
+    from plumbline.scenario.yaml_reader import read_yaml
+
+    options.read_known_issues(files, [])  # ends with every problem of the files
+    for entry in merge_entries([entry for path in files for entry in read_yaml(path).data]):
+        for line in entry_lines(entry):
+            click.echo(line)

@@ -35,6 +35,11 @@ def make_console(file: Any) -> Console:
     return Console(file=file, width=None if is_set else PIPED_WIDTH, highlight=False)
 
 
+def line_width(out: Console) -> int:
+    """Return the width of sentences: that of a terminal or of COLUMNS, within limits; in a pipe 80 columns."""
+    return WIDTH if out.width == PIPED_WIDTH else max(WIDTH, min(out.width, MAX_WIDTH))
+
+
 def wrap_items(items: Iterable[str], width: int) -> str:
     """Write items side by side and begin a line before one that does not fit; none is broken.
 
@@ -148,7 +153,7 @@ def print_result(result: RunResult, *, has_matrix: bool = False) -> None:
 
     """
     out = make_console(sys.stdout)
-    width = max(WIDTH, min(out.width, MAX_WIDTH)) if out.width != PIPED_WIDTH else WIDTH
+    width = line_width(out)
     if has_matrix:
         print_matrix(matrix_of_rows(result.rows, result.engines))
     for line in describe_run(result.rows, result.findings, width, result.random_batch.counts_by_verdict):

@@ -108,10 +108,9 @@ class Terms:
             yield Cause("term", "loop", place, "left open"), self.answers(change)
         if self.ends:
             change = self._solved(self.ends, "without velocity terms").solution - self.found.solution
-            yield (
-                Cause("term", "velocity terms", "the rows that close loops", "missing"),
-                self.answers(change),
-            )
+            place = "the rows that close loops"
+            cause = Cause("term", "velocity terms", place, "missing", general=f"velocity terms of {place}")
+            yield cause, self.answers(change)
 
     def _rows(self, k: int) -> Iterator[tuple[str, Array]]:
         """Rows of the table of kinds: of points along axes of several frames, of attitudes about u × w."""
