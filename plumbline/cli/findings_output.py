@@ -16,6 +16,7 @@ from plumbline.judging.rows import SHOWN_STYLES, Row, Verdict, shown_verdict
 from plumbline.scenario.line_and_column_errors import shorten
 
 WIDTH = 80  # columns, where the terminal is no wider
+MAX_REASON = 2000  # characters of what an engine raised
 MAX_FINDINGS = 20  # written out; the report has all
 
 
@@ -31,7 +32,7 @@ def describe_run(
         verdict_count: rows of random scenarios that are only counted.
 
     """
-    new = [finding for finding in findings if finding.needs_attention]
+    new = [f for f in findings if f.needs_attention and f.verdict != Verdict.HARNESS_FAILED]
     for finding in new[:MAX_FINDINGS]:
         yield from finding_lines(finding, width)
     if len(new) > MAX_FINDINGS:
@@ -45,13 +46,16 @@ def describe_run(
 
 
 def finding_lines(finding: Finding, width: int) -> list[str]:
-    """Describe a finding that nothing expects in three lines."""
+    """Describe a finding that nothing expects in three lines; of what failed the whole reason."""
     style, colour = SHOWN_STYLES[finding.verdict], VERDICT_COLOURS[finding.verdict]
     size = "" if finding.largest_ratio is None else f", up to {finding.largest_ratio:.2g} times the tolerance"
     head = "  ".join(filter(None, (finding.name, finding.version_range)))
+    sentence = [shorten(f"  {finding.sentence}", width)]
+    if finding.verdict == Verdict.FAILED:
+        sentence = wrap(shorten(finding.sentence, MAX_REASON), width, "  ")
     return [
         f"[{colour}]{style.glyph} {escape(shorten(head, width - 2))}[/]",
-        escape(shorten(f"  {finding.sentence}", width)),
+        *map(escape, sentence),
         escape(shorten(f"  {coverage(finding)}{size}", width)),
     ]
 
@@ -138,4 +142,11 @@ def explain(
 
 def wrap(text: str, width: int, indent: str) -> list[str]:
     """Wrap a sentence into indented lines."""
-    return textwrap.wrap(text, width, initial_indent=indent, subsequent_indent=indent, break_on_hyphens=False)
+    return textwrap.wrap(
+        text,
+        width,
+        initial_indent=indent,
+        subsequent_indent=indent,
+        break_on_hyphens=False,
+        break_long_words=False,
+    )

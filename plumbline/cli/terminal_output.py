@@ -17,7 +17,7 @@ from rich.table import Table
 from plumbline.cli.findings_output import WIDTH, describe_run, legend, wrap
 from plumbline.cli.verdict_matrix import VerdictMatrix, matrix_of_rows
 from plumbline.execution.runner import RunResult
-from plumbline.judging.rows import SHOWN_STYLES
+from plumbline.judging.rows import SHOWN_STYLES, Verdict
 
 MAX_WIDTH = 160  # columns of a wide terminal that sentences use
 PIPED_WIDTH = 10_000  # columns: in a pipe or a log nothing is cut or wrapped, unless COLUMNS is set
@@ -36,7 +36,7 @@ def make_console(file: Any) -> Console:
 
 
 def line_width(out: Console) -> int:
-    """Return the width of sentences: that of a terminal or of COLUMNS, within limits; in a pipe 80 columns."""
+    """Return the width of sentences: that of a terminal or of COLUMNS; in a pipe 80 columns."""
     return WIDTH if out.width == PIPED_WIDTH else max(WIDTH, min(out.width, MAX_WIDTH))
 
 
@@ -154,6 +154,11 @@ def print_result(result: RunResult, *, has_matrix: bool = False) -> None:
     """
     out = make_console(sys.stdout)
     width = line_width(out)
+    in_doubt = {row.reason: None for row in result.rows if row.verdict == Verdict.HARNESS_FAILED}
+    for reason in in_doubt:
+        text = f"{Verdict.HARNESS_FAILED.style.glyph} the harness failed: {reason}"
+        for line in wrap(text, width, ""):
+            out.print(f"[magenta bold]{escape(line)}[/]")
     if has_matrix:
         print_matrix(matrix_of_rows(result.rows, result.engines))
     for line in describe_run(result.rows, result.findings, width, result.random_batch.counts_by_verdict):

@@ -271,7 +271,9 @@ def test_stdout_holds_json_alone_with_the_users_tolerance(tmp_path):
 def test_a_scenario_by_path(tmp_path):
     mine = tmp_path / "my pendulum.yaml"
     mine.write_text((ROOT / "scenarios" / "single" / "rest.yaml").read_text())
-    result = invoke("run", mine, "--engine", "pinocchio", "--level", "state", "--out", tmp_path / "out")
+    result = invoke(
+        "run", mine, "--engine", "pinocchio", "--level", "state", "--matrix", "--out", tmp_path / "o"
+    )
     assert result.exit_code == 0, result.output
     assert "my pendulum" in result.stdout
     result = invoke("check", mine)
@@ -284,7 +286,9 @@ def test_a_name_stays_text_on_the_terminal_in_html_and_in_junit(tmp_path):
     mine = tmp_path / "hostile.yaml"
     rest = (ROOT / "scenarios" / "single" / "rest.yaml").read_text()
     mine.write_text(rest.replace("schema_version: 1", f"schema_version: 1\nname: {json.dumps(name)}"))
-    result = invoke("run", mine, "--engine", "mujoco", "--level", "state", "--out", tmp_path / "out")
+    result = invoke(
+        "run", mine, "--engine", "mujoco", "--level", "state", "--matrix", "--out", tmp_path / "out"
+    )
     assert result.exit_code == 0, result.output
     assert name[:30] in result.stdout
     assert "<img" not in (tmp_path / "out" / "report.html").read_text()
