@@ -1,4 +1,4 @@
-"""The pages of a stored run: report.html, junit.xml and summary.md; and sweep.html of a sweep.
+"""The pages of a stored run: report.html, junit.xml, summary.md, findings.sarif; and sweep.html of a sweep.
 
 Input: an output folder as `plumbline.storage` writes it, and the folder of earlier nights.
 Output: files in the output folder. Nothing is computed anew and no engine runs.
@@ -11,7 +11,7 @@ from typing import Any
 
 
 def write(folder: Path, history: Path | None = None, document: dict[str, Any] | None = None) -> Path:
-    """Write report.html, junit.xml and summary.md of a stored run.
+    """Write report.html, junit.xml, summary.md and findings.sarif of a stored run.
 
     Args:
         history: folder of earlier nights, or None.
@@ -22,11 +22,12 @@ def write(folder: Path, history: Path | None = None, document: dict[str, Any] | 
         DamagedResults: a file of the folder is missing or damaged.
 
     """
-    from reports import html_report, junit, step_summary
+    from reports import html_report, junit, sarif, step_summary
     from reports.stored_results import Results
 
     results = Results.load(folder, document)
     page = html_report.write(results, history)  # first: it reads every table, so nothing is half written
     junit.write(results)
     step_summary.write(results)
+    sarif.write(results)
     return page

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -59,6 +60,25 @@ class History:
     def last_passed(self) -> EarlierRun | None:
         """The latest earlier run that ended with exit code 0."""
         return next((night for night in reversed(self.nights) if night.has_passed), None)
+
+    def first_seen(self, rows: Sequence[Record]) -> str | None:
+        """Return when a finding was first seen: the start of the earliest of the last nights with it.
+
+        Args:
+            rows: of the finding.
+
+        Returns:
+            Date and time; None where no earlier night had it, or there is none.
+
+        """
+        first = None
+        for night in reversed(self.nights):
+            before = [night.rows.get(row["key"]) for row in rows]
+            if not any(one is not None and one["verdict"] == row["verdict"]
+                       for one, row in zip(before, rows, strict=True)):  # fmt: skip
+                break
+            first = str(night.run["started"])
+        return first
 
     def is_new(self, row: Record) -> bool:
         """Report whether a row's disagreement was not in the last run that passed.

@@ -16,10 +16,11 @@ from urllib.parse import urlencode
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from plumbline.judging.rows import SHOWN_STYLES, is_declared
+from plumbline.judging.rows import SHOWN_STYLES
 from plumbline.storage.results_store import write_atomically
 from reports import coverage_table, reference_tables, report_data
 from reports.earlier_runs import History
+from reports.findings_list import declared_gaps, findings_for_page
 from reports.stored_results import Record, Results
 from reports.verdicts import (
     count_all_verdicts,
@@ -28,9 +29,7 @@ from reports.verdicts import (
     format_number,
     needs_attention,
     rank,
-    severity,
     shown_verdict,
-    unexpected_rows,
 )
 
 REPORTS_FOLDER = Path(__file__).parent
@@ -89,28 +88,31 @@ def _render_template(
     results: Results, shown: Results, history: History, chunks: dict[str, str], points: int
 ) -> str:
     script, style = bundle_script(), stylesheet()
-    attention = _unexpected_findings(results.rows)
+    findings = findings_for_page(results, history)
+    attention = [finding for finding in findings if finding["known_issue"] is None]
     unshown = results.scenarios.keys() - shown.scenarios.keys()
     return (
         template_environment()
         .get_template("report.html")
         .render(
             run=results.run,
+            headline=_headline(results, attention, len(findings) - len(attention)),
             policy=content_security_policy(style, script),
             script=Markup(script),
             css=Markup(style),
             chunks=chunks,
             counts=count_all_verdicts(results),
-            compared=any(row["verdict"] in ("agrees", "disagrees") for row in results.rows),
+            compared=_has_compared(results),
             total=count_all_verdicts(results).total(),
             random_batch=_random_scenario_summary(results),
             engines=results.engines,
             families=_matrix_by_family(shown),
             unshown=len(unshown),
-            unshown_fine=not any(entry["row"]["scenario"] in unshown for entry in attention),
+            unshown_fine=not any(needs_attention(r) for r in results.rows if r["scenario"] in unshown),
             attention=attention[:MAX_FINDINGS],
             unlisted=len(attention) - MAX_FINDINGS,
-            expected=_known_findings(results.rows),
+            recorded=[finding for finding in findings if finding["known_issue"] is not None],
+            gaps=declared_gaps(results),
             link=_row_link,
             comparison=_changes_since_last_passed(results, history),
             damaged=history.unreadable,
@@ -123,6 +125,19 @@ def _render_template(
             rendered=time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),
         )
     )
+
+
+def _has_compared(results: Results) -> bool:
+    return any(row["verdict"] in ("agrees", "disagrees") for row in results.rows)
+
+
+def _headline(results: Results, attention: list[Record], recorded: int) -> str:
+    """Say in one line whether anything needs attention."""
+    if attention:
+        return f"{len(attention)} finding{' needs' if len(attention) == 1 else 's need'} attention"
+    if not _has_compared(results):
+        return "Nothing was compared"
+    return "Nothing needs attention" + (f"; {recorded} recorded" if recorded else "")
 
 
 def _row_link(row: Record) -> str:
@@ -167,36 +182,6 @@ def _ratio_position(ratio: float | None) -> float | None:
     if ratio is None:
         return None
     return round(min(max((math.log10(max(ratio, 1e-30)) + 4) * 12, 0), 96), 1)
-
-
-def _unexpected_findings(rows: list[Record]) -> list[Record]:
-    """Group the rows that need attention: an entry per cell and verdict, gaps of one reason together.
-
-    An entry has its worst row, the number of other rows and the other scenarios in which they are.
-    """
-    found: dict[tuple[str, ...], Record] = {}
-    for row in unexpected_rows(rows):
-        gap = row["verdict"] == "unsupported"
-        key = (row["engine"], row["verdict"], row["reason"] if gap else row["scenario"])
-        entry = found.setdefault(key, {"row": row, "more": -1, "scenarios": {}})
-        entry["more"] += 1
-        entry["scenarios"][row["scenario"]] = None
-    for entry in found.values():
-        del entry["scenarios"][entry["row"]["scenario"]]
-        entry["more"] -= len(entry["scenarios"])
-    return list(found.values())
-
-
-def _known_findings(rows: list[Record]) -> list[Record]:
-    """Group the rows of known issues by entry of known_issues.yaml, with one of them as example."""
-    found: dict[tuple[str, str], Record] = {}
-    for row in rows:
-        if known := row.get("known_issue"):
-            key = known, row["engine"] if is_declared(known) else ""
-            entry = found.setdefault(key, {"row": row, "count": 0, "engines": {}, "scenarios": {}})
-            entry["count"] += 1
-            entry["engines"][row["engine"]] = entry["scenarios"][row["scenario"]] = None
-    return sorted(found.values(), key=lambda e: (-severity(e["row"]), -e["count"]))
 
 
 def _changes_since_last_passed(results: Results, history: History) -> Record | None:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
 from plumbline.judging.rows import is_declared
 from plumbline.storage.results_store import write_atomically
 from reports.stored_results import Record, Results
-from reports.verdicts import format_number, needs_attention, shown_verdict
+from reports.verdicts import finding_by_row, format_number, needs_attention, shown_verdict
 
 OWN = "an own scenario"
 
@@ -23,12 +24,13 @@ def write(results: Results) -> Path:
     """
     suites = ET.Element("testsuites", name="plumbline", time=f"{float(results.run['duration']):.3f}")
     totals = {"tests": 0, "failures": 0, "errors": 0, "skipped": 0}
+    names = finding_by_row(results)
     for name, scenario in results.scenarios.items():
         found = [results.rows[place] for place in results.row_indices[name]]
         if scenario["own"]:  # unresolved rows are shown, and fail no run
             found = [row | {"known_issue": OWN} if row["verdict"] == "unresolved" else row for row in found]
         about = {"family": scenario["family"], "run": str(results.run["sentence"])}
-        suite, counted = add_suite(suites, name, found, about)
+        suite, counted = add_suite(suites, name, found, about, names)
         suite.set("timestamp", str(results.run["started"])[:19])
         totals = {k: v + counted[k] for k, v in totals.items()}
     suites.attrib |= {k: str(v) for k, v in totals.items()}
@@ -38,13 +40,18 @@ def write(results: Results) -> Path:
 
 
 def add_suite(
-    suites: ET.Element, name: str, found: Sequence[Record], properties: Mapping[str, str]
+    suites: ET.Element,
+    name: str,
+    found: Sequence[Record],
+    properties: Mapping[str, str],
+    findings: Mapping[str, str] = MappingProxyType({}),
 ) -> tuple[ET.Element, dict[str, int]]:
     """Add a suite with a test case per check.
 
     Args:
         found: all rows; those that are information are only counted, in a property.
         properties: further properties of the suite.
+        findings: name of its finding by key of a row, for the message.
 
     Returns:
         The suite, and how many tests, failures, errors and skipped tests it has.
@@ -57,7 +64,7 @@ def add_suite(
         ET.SubElement(element, "property", name=key, value=value)
     counted = {"tests": 0, "failures": 0, "errors": 0, "skipped": 0}
     for row in rows:
-        outcome = _add_test_case(suite, row)
+        outcome = _add_test_case(suite, row, findings.get(row["key"], ""))
         counted["tests"] += 1
         if outcome:
             counted[outcome] += 1
@@ -66,7 +73,7 @@ def add_suite(
     return suite, counted
 
 
-def _add_test_case(suite: ET.Element, row: Record) -> str | None:
+def _add_test_case(suite: ET.Element, row: Record, finding: str) -> str | None:
     """Add the row's test case; return the total that it counts in besides "tests"."""
     what = row["quantity"] if row["integrator"] == "-" else f"{row['quantity']}[{row['integrator']}]"
     case = ET.SubElement(
@@ -79,6 +86,7 @@ def _add_test_case(suite: ET.Element, row: Record) -> str | None:
     message = f"{row['verdict']}: {row['reason']}"
     if needs_attention(row):
         kind = "error" if row["verdict"] in ("failed", "harness failed") else "failure"
+        message = f"{finding}: {message}" if finding else message
         ET.SubElement(case, kind, message=message, type=row["verdict"]).text = _failure_text(row)
         return "errors" if kind == "error" else "failures"
     if row["verdict"] != "agrees":

@@ -10,7 +10,7 @@ from typing import Any
 from plumbline.judging.rows import SHOWN_STYLES
 from plumbline.storage.results_store import write_atomically
 from reports.stored_results import Record, Results
-from reports.verdicts import count_all_verdicts, error_ratio, format_number, shown_verdict, unexpected_rows
+from reports.verdicts import count_all_verdicts, format_number, shown_verdict
 
 MAX_SUMMARY_BYTES = 1_000_000  # bytes; GitHub drops a step's summary above 1 MiB = 1,048,576 bytes
 _MARKDOWN_SPECIAL = re.compile(r"[^0-9A-Za-z .,;:()/+%=\u0080-\uffff-]")
@@ -41,7 +41,7 @@ def escape_markdown(text: Any, max_length: int = 400) -> str:
 
 
 def render(results: Results) -> str:
-    """Render the summary: sentence, counts, engines by family, then as many findings as fit.
+    """Render the summary: sentence, counts, engines by family, then as many findings as fit, new ones first.
 
     Returns:
         Markdown of at most `MAX_SUMMARY_BYTES`.
@@ -60,27 +60,30 @@ def render(results: Results) -> str:
         *_random_scenario_summary(results),
         "",
     ]
-    attention = unexpected_rows(results.rows)
     about = (
         f"Run {run['id']}, {run['started']}, {float(run['duration']):.0f} s, commit {run['commit'] or '–'}, "
         f"Python {run['python']}, {run['platform']}. The artefact report.html has every cell."
     )
     tail = ["", escape_markdown(about, 2000), ""]
-    if attention:
-        lines += [
-            "### What needs attention",
-            "",
-            "| | scenario | engine | quantity | error / tolerance | reason |",
-        ]
-        lines += ["|---|---|---|---|---|---|"]
-    room = MAX_SUMMARY_BYTES - len("\n".join(lines + tail).encode()) - 200
-    for place, row in enumerate(attention):
-        line = _finding_line(row)
-        room -= len(line.encode()) + 1
-        if room < 0:
-            lines += ["", f"… and {len(attention) - place} more."]
-            break
-        lines.append(line)
+    new = [finding for finding in results.findings if finding["known_issue"] is None]
+    recorded = [finding for finding in results.findings if finding["known_issue"] is not None]
+    room = MAX_SUMMARY_BYTES - len("\n".join(lines + tail).encode()) - 1000
+    for title, findings in (("What needs attention", new), ("Recorded", recorded)):
+        if findings:
+            lines += [
+                f"### {title}",
+                "",
+                "| | finding | versions | rows | up to | cause |",
+                "|---|---|---|---|---|---|",
+            ]
+        for place, finding in enumerate(findings):
+            line = _finding_line(finding)
+            room -= len(line.encode()) + 1
+            if room < 0:
+                lines += ["", f"… and {len(findings) - place} more."]
+                break
+            lines.append(line)
+        lines.append("")
     return "\n".join(lines + tail)
 
 
@@ -123,17 +126,18 @@ def _random_scenario_summary(results: Results) -> list[str]:
     return ["", text + "."]
 
 
-def _finding_line(row: Record) -> str:
-    what = ", ".join(row[k] for k in ("level", "integrator", "quantity") if row[k] != "-")
-    why = escape_markdown(row["reason"]) + (
-        f" *{escape_markdown(row['diagnosis'])}*" if row.get("diagnosis") else ""
-    )
+def _finding_line(finding: Record) -> str:
+    verdict = shown_verdict(finding)
+    where = f"{len(finding['rows'])} in {', '.join(finding['scenarios'][:3])}"
+    more = len(finding["scenarios"]) - 3
+    versions = ", ".join(finding["versions"])
+    right = f"; not {', '.join(finding['right_versions'])}" if finding["right_versions"] else ""
     cells = (
-        f"{SHOWN_STYLES[row['verdict']].glyph} {row['verdict']}",
-        escape_markdown(row["scenario"], 120),
-        escape_markdown(row["engine"]),
-        escape_markdown(what),
-        format_number(error_ratio(row)),
-        why,
+        f"{SHOWN_STYLES[verdict].glyph} {verdict}",
+        escape_markdown(finding["name"], 200),
+        escape_markdown(f"{finding['engine']} {versions}{right}", 120),
+        escape_markdown(where + (f" and {more} more" if more > 0 else ""), 200),
+        format_number(finding["largest_ratio"]),
+        escape_markdown(finding["sentence"]),
     )
     return "| " + " | ".join(cells) + " |"

@@ -11,8 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from plumbline.judging.findings import find_findings
 from plumbline.model.datatypes import Indices, Int
 from plumbline.storage.results_store import read_results, read_table
+from plumbline.storage.schema_upgrade import row_of_record
 from plumbline.storage.script_index import read_script_index, scripts_folder
 
 Record = dict[str, Any]
@@ -125,6 +127,12 @@ class Results:
         """
         kept = {name: about for name, about in self.scenarios.items() if name in names}
         return replace(self, scenarios=kept, rows=[row for row in self.rows if row["scenario"] in kept])
+
+    @cached_property
+    def findings(self) -> list[Record]:
+        """The rows that do not agree, by cause: those that nothing expects first."""
+        bodies = {name: about["bodies"] for name, about in self.scenarios.items()}
+        return [finding.record() for finding in find_findings(map(row_of_record, self.rows), bodies)]
 
     @cached_property
     def scripts(self) -> dict[str, str]:

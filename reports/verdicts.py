@@ -65,14 +65,14 @@ def rank(row: Record) -> tuple[int, float]:
     return rows.cell_rank(row["verdict"], row.get("known_issue"), error_ratio(row))
 
 
-def unexpected_rows(candidates: Iterable[Record]) -> list[Record]:
-    """Select the rows that need attention.
+def finding_by_row(results: Results) -> dict[str, str]:
+    """Look up the finding of each row that does not agree.
 
     Returns:
-        Those of them that need attention, the most severe first.
+        The first finding's name by the row's key.
 
     """
-    return sorted(filter(needs_attention, candidates), key=rank, reverse=True)
+    return {key: finding["name"] for finding in reversed(results.findings) for key in finding["rows"]}
 
 
 def count_verdicts(records: Iterable[Record]) -> Counter[str]:

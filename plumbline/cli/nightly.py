@@ -14,7 +14,7 @@ import json
 import os
 import secrets
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -27,7 +27,7 @@ from plumbline.execution.exit_codes import ExitCode
 from plumbline.execution.plan import LevelSelection, Plan, ProgressCallback, RunObserver
 from plumbline.execution.proofs import prove_changed_motions
 from plumbline.execution.result_cache import DiskResultCache, night_cells_folder
-from plumbline.execution.runner import RunResult, run_plan, save
+from plumbline.execution.runner import RunResult, exit_code, run_plan, save
 from plumbline.execution.selftest import SelfTestResult
 from plumbline.judging.known_issues import KnownIssue, project_known_issues
 from plumbline.model.features import Feature, features
@@ -106,6 +106,7 @@ def run_nightly(
     proof_cpu_seconds: float = 0.0,
     known_issues: Sequence[KnownIssue] | None = None,
     are_engines_required: bool = False,
+    seen_findings: Collection[str] = (),
     progress: ProgressCallback,
     observer: RunObserver | None = None,
     log: Callable[[str], None],
@@ -126,6 +127,7 @@ def run_nightly(
             path; None for no self-test.
         known_issues: expected verdicts; None for those of the project's file.
         are_engines_required: whether an engine that is not installed has failed.
+        seen_findings: names of those that do not count for the exit code.
         progress: called after every task.
         observer: gets the rows of named scenarios as they are judged.
         log: called with sentences for the user.
@@ -177,6 +179,8 @@ def run_nightly(
         prove_changed_motions(scenarios, jobs, limits, proof_cpu_seconds, log) if proof_cpu_seconds else None
     )
     result = run_plan(plan, progress, observer)
+    if seen_findings and result.metadata["exit_code"] == ExitCode.DISAGREEMENT:
+        result.metadata["exit_code"] = int(exit_code(result, seen_findings))
     place = unused_path(history / result.metadata["id"])
     result.metadata |= {"id": place.name, "night": next_night_number(history)}
     result.metadata |= {"started": night.started, "random": night.random_count, "seed": night.seed}

@@ -27,7 +27,7 @@ MAKES_ONE = "`python -m plumbline nightly` makes one in the folder `nightly`"
 @click.option("--key", "pattern", help="Trend of the rows whose key matches (* and ?).")
 @options.json_option
 def history(folder: Path, pattern: str | None, as_json: bool) -> None:
-    """Print verdict counts, first bad nights and changes since the last green one of the nights in FOLDER."""
+    """Print verdict counts, findings with their lives and changes since the last green night in FOLDER."""
     from plumbline.storage.history_of_nights import History
 
     _check_history_folder(folder)
@@ -42,9 +42,26 @@ def history(folder: Path, pattern: str | None, as_json: bool) -> None:
         )
 
 
+def _print_issue(folder: Path, name: str) -> None:
+    from reports.issue_text import issue_text
+    from reports.stored_results import Results
+
+    with options.exit_on_damaged_results():
+        results = Results.load(folder)
+        finding = next((f for f in results.findings if f["name"] == name), None)
+        if finding is None:
+            names = [f["name"] for f in results.findings]
+            hint = did_you_mean(name, names) or "`plumbline explain` lists them"
+            raise click.UsageError(f"no finding {name!r}; {hint}")
+        click.echo(issue_text(results, finding))
+
+
 def _print_history(folder: Path, document: dict[str, Any], pattern: str | None) -> None:
     trend = document.get("trend", [])
     print_table(document["nights"], "nights")
+    print_table(
+        [{k: v for k, v in life.items() if k != "sentence"} for life in document["findings"]], "findings"
+    )
     print_table(trend, "trend")
     lines = list(_history_lines(document))
     if not document["nights"]:
@@ -69,9 +86,6 @@ def _check_history_folder(folder: Path) -> None:
 
 def _history_lines(document: dict[str, Any]) -> list[str]:
     lines = [f"version: {sentence}" for sentence in document["versions"]]
-    for bad in document["first_bad"]:
-        good = f"last good {bad['last_good']}" if bad["last_good"] else "never good"
-        lines.append(f"{bad['key']} {bad['verdict']} since {bad['first_bad']} ({good}): {bad['reason']}")
     since = f"since the last green {document['last_green']}"
     return lines + [f"{since}: {c['key']} {c['was']} → {c['is']}" for c in document["since_green"]]
 
@@ -120,8 +134,17 @@ def _reproduce_model(folder: Path, keys: tuple[str, ...], form: str | None) -> N
     type=options.FolderPath(),
     help="Folder of earlier nights: adds trends and the comparison with the last green one.",
 )
-def report(folder: Path, history_folder: Path | None) -> None:
-    """Write report.html, junit.xml and summary.md again, from the results in FOLDER."""
+@click.option(
+    "--issue", metavar="FINDING", help="Print the text of an issue for the engine's tracker instead."
+)
+def report(folder: Path, history_folder: Path | None, issue: str | None) -> None:
+    """Write report.html, junit.xml, summary.md and findings.sarif again, from the results in FOLDER.
+
+    With --issue: print what to tell the engine's maintainers about a finding, in their tracker's form.
+    """
+    if issue is not None:
+        _print_issue(folder, issue)
+        return
     if history_folder is not None:
         _check_history_folder(history_folder)
     with options.exit_on_damaged_results():

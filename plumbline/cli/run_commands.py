@@ -17,13 +17,22 @@ from plumbline.cli.run_display import RunDisplay
 from plumbline.cli.terminal_output import command_line, print_matrix, print_result
 from plumbline.engines.registry import ENGINES
 from plumbline.execution import scenario_verdicts
+from plumbline.execution.exit_codes import ExitCode
 from plumbline.execution.plan import Plan
 from plumbline.execution.result_cache import DiskResultCache, user_cells_folder
-from plumbline.execution.runner import RunResult, run_plan, save
+from plumbline.execution.runner import RunResult, exit_code, run_plan, save
 from plumbline.processes.worker_pool import Limits, start_warm_process
 from plumbline.storage.results_store import read_results, row_record, to_json_value
 
 MAX_PROOF_CPU_SECONDS = 1e6
+
+
+new_only_option = click.option(
+    "--new-only",
+    type=options.FolderPath(),
+    metavar="NIGHTS",
+    help="Folder of nights: exit with 1 only for findings that the last of them did not have.",
+)
 
 
 @click.command(
@@ -60,13 +69,14 @@ MAX_PROOF_CPU_SECONDS = 1e6
     "does not change.",
 )
 @click.option("--matrix", "has_matrix", is_flag=True, help="Print each cell, scenarios × engines, too.")
+@new_only_option
 @click.option("--fresh", is_flag=True, help="Compute everything again, also what earlier runs computed.")
 @options.timeout_option(300.0)
 @options.memory_option
 def run(
     names: tuple[str, ...], families: tuple[str, ...], engines: list[str], level: Any, jobs: int,
     scheduler: str | None, known_files: tuple[Path, ...], out: Path, as_json: bool, user_rtol: float | None,
-    has_matrix: bool, fresh: bool, timeout: float, memory: float,
+    has_matrix: bool, new_only: Path | None, fresh: bool, timeout: float, memory: float,
 ) -> None:  # fmt: skip
     """Compare scenarios (names of the catalogue, or paths of files; default: all) on all engines.
 
@@ -79,6 +89,7 @@ def run(
         if s.is_from_model_file:
             _log(f"{s.path}: {s.purpose}")
     known_issues = options.read_known_issues(known_files, chosen)
+    seen = _seen_findings(new_only)
     folder = options.claim_folder(out)
     cache = DiskResultCache(user_cells_folder(), _log, is_fresh=fresh)
     options.announce_result_cache(cache)
@@ -99,6 +110,7 @@ def run(
 
     with options.exit_on_io_error():
         result = _run_visibly(plan, as_json, fresh)
+        _leave_out_seen(result, seen)
         save(result, folder, command_line())
         with result.cpu_times.measure("report"):
             document = read_results(folder)
@@ -172,13 +184,14 @@ def run(
 @options.scheduler_option
 @options.known_option
 @options.out_option(layout.output_folder("nightly"), "; complete nights are in its folder `history`")
+@new_only_option
 @options.timeout_option(1800.0)
 @options.memory_option
 def nightly(
     names: tuple[str, ...], engines: list[str], random_count: int, random_trajectories: int, seed: int | None,
     extra_refinements: int, long_run_seconds: float, self_test: bool,
     proof_cpu_seconds: float, jobs: int, scheduler: str | None,
-    known_files: tuple[Path, ...], out: Path, timeout: float, memory: float,
+    known_files: tuple[Path, ...], out: Path, new_only: Path | None, timeout: float, memory: float,
 ) -> None:  # fmt: skip
     """Run the catalogue with finer steps, long runs, random scenarios and the self-test.
 
@@ -191,6 +204,7 @@ def nightly(
     options.check_history_tool()
     chosen = options.choose_scenarios(names, ())
     known_issues = options.read_known_issues(known_files, chosen)
+    seen = _seen_findings(new_only)
     folder = options.claim_folder(out)
     display = RunDisplay(sys.stderr)
     with options.exit_on_io_error(), display as progress:
@@ -202,9 +216,24 @@ def nightly(
             self_test=run_self_test if self_test and not layout.IS_INSTALLED else None, progress=progress,
             proof_cpu_seconds=proof_cpu_seconds,
             observer=display, command=command_line(), log=_log, known_issues=known_issues,
-            are_engines_required=options.are_engines_named(),
+            are_engines_required=options.are_engines_named(), seen_findings=seen,
         )  # fmt: skip
     _finish(result, place / "report.html", as_json=False)
+
+
+def _seen_findings(nights: Path | None) -> frozenset[str]:
+    """The names of the findings of the last night."""
+    if nights is None:
+        return frozenset()
+    from plumbline.storage.history_of_nights import last_findings
+
+    return last_findings(nights)
+
+
+def _leave_out_seen(result: RunResult, seen: frozenset[str]) -> None:
+    """Let findings of the last night not count for the exit code."""
+    if seen and result.metadata["exit_code"] == ExitCode.DISAGREEMENT:
+        result.metadata["exit_code"] = int(exit_code(result, seen))
 
 
 def _run_visibly(plan: Plan, as_json: bool, is_fresh: bool) -> RunResult:

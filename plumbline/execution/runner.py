@@ -8,7 +8,7 @@ import platform
 import subprocess
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property
@@ -363,18 +363,26 @@ def _share(expected: dict[str, int], count: int) -> str:
     return f" {parts[0]}" if count in expected.values() else f" ({', '.join(parts)})"
 
 
-def exit_code(result: RunResult) -> ExitCode:
+def exit_code(result: RunResult, seen: Collection[str] = ()) -> ExitCode:
     """Return the exit code of a run.
 
     Args:
         result: the run; unresolved rows of the user's own scenarios do not count.
+        seen: names of findings that do not count where they disagree, because an earlier run had them.
 
     Returns:
         As `exit_code_of_rows`.
 
     """
     own = result.own_scenarios
-    counted = [row for row in result.rows if not (row.verdict == Verdict.UNRESOLVED and row.scenario in own)]
+    left_out = {row.key for found in result.findings if found.name in seen for row in found.rows}
+    left_out -= {row.key for found in result.findings if found.name not in seen for row in found.rows}
+    left_out -= {row.key for row in result.rows if row.verdict in (Verdict.FAILED, Verdict.HARNESS_FAILED)}
+    counted = [
+        row
+        for row in result.rows
+        if row.key not in left_out and not (row.verdict == Verdict.UNRESOLVED and row.scenario in own)
+    ]
     return exit_code_of_rows(
         counted, has_stale_issues=bool(result.stale_issues), has_comparison=has_comparison(result)
     )

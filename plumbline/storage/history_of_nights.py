@@ -11,7 +11,7 @@ import contextlib
 import itertools
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,7 @@ class StoredRun:
 
     folder: Path
     metadata: Record  # the entry ``run`` of results.json
+    findings: list[Record] = field(default_factory=list)
 
     @property
     def id(self) -> str:
@@ -248,6 +249,34 @@ class History:
         )
         return green[0]["id"], changes
 
+    def findings(self) -> list[Record]:
+        """Follow the findings over the nights.
+
+        Returns:
+            One record per finding, present ones first: ``state`` in the last night (new, present, recorded or
+            gone), ids of the nights in which it was ``first_seen`` and ``last_seen``, in how many ``nights``,
+            the ``versions`` that showed it, and of the last sight its sentence.
+
+        """
+        lives: dict[str, Record] = {}
+        for index, night in enumerate(self.nights):
+            for finding in night.findings:
+                life = lives.setdefault(
+                    finding["name"],
+                    {
+                        "finding": finding["name"],
+                        "state": "",
+                        "first_seen": night.id,
+                        "nights": 0,
+                        "versions": [],
+                    },
+                )
+                life["versions"] = list(dict.fromkeys([*life["versions"], *finding["versions"]]))
+                life |= {"last_seen": night.id, "nights": life["nights"] + 1, "sentence": finding["sentence"]}
+                life["state"] = "gone" if index < len(self.nights) - 1 else _state(finding, life)
+        order = ("new", "present", "recorded", "gone")
+        return sorted(lives.values(), key=lambda life: order.index(life["state"]))
+
     def version_changes(self) -> list[str]:
         """List the changes of the engines' versions from one night to the next.
 
@@ -278,6 +307,7 @@ class History:
             "nights": self.overview(),
             "damaged": [f"{name}: {reason}" for name, reason in self.damaged.items()],
             "versions": self.version_changes(),
+            "findings": self.findings(),
             "first_bad": self.first_bad(),
             "last_green": green,
             "since_green": changes,
@@ -296,7 +326,8 @@ def stored_runs(folder: Path) -> Iterator[StoredRun]:
     """
     for path in night_folders(folder):
         with contextlib.suppress(OSError, DamagedResults):
-            yield StoredRun(path, read_results(path)["run"])
+            document = read_results(path)
+            yield StoredRun(path, document["run"], document["findings"])
 
 
 def next_night_number(folder: Path) -> int:
@@ -312,7 +343,7 @@ def next_night_number(folder: Path) -> int:
 def _read_complete_run(folder: Path) -> StoredRun:
     """Read a run's metadata; raise DamagedResults where results.json or the summary is damaged."""
     document = read_results(folder)
-    run = StoredRun(folder, document["run"])
+    run = StoredRun(folder, document["run"], document["findings"])
     table = read_table(folder, "summary")
     expected = len(document["rows"])
     expected += sum((run.metadata["random_batch"] or {}).get("counts_by_verdict", {}).values())
@@ -323,3 +354,16 @@ def _read_complete_run(folder: Path) -> StoredRun:
             f"summary.parquet has the verdict {shorten(repr(min(unknown)))}, which no run gives"
         )
     return run
+
+
+def last_findings(folder: Path) -> frozenset[str]:
+    """Return the names of the findings of the last night of a folder; none where it has no night."""
+    last = max(stored_runs(folder), key=lambda run: run.order, default=None)
+    return frozenset() if last is None else frozenset(finding["name"] for finding in last.findings)
+
+
+def _state(finding: Record, life: Record) -> str:
+    """What a finding of the last night is."""
+    if finding["known_issue"] is not None:
+        return "recorded"
+    return "new" if life["nights"] == 1 else "present"

@@ -97,7 +97,14 @@ _NEVER_NULL = {  # columns by which readers group and sort
     "variant", "rtol", "time", "reason", "kind", "parameter", "proof",
 }  # fmt: skip
 # What is made of results.json after it has been written; see `write_results`.
-_MADE_OF_RESULTS = ("report.html", "junit.xml", "summary.md", "scripts/index.json", "scripts/*.py")
+_MADE_OF_RESULTS = (
+    "report.html",
+    "junit.xml",
+    "summary.md",
+    "findings.sarif",
+    "scripts/index.json",
+    "scripts/*.py",
+)
 
 
 def write_atomically(path: Path, data: bytes) -> None:

@@ -22,7 +22,10 @@ async function show() {
   const index = /** @type {import("./report_data").Index} */ (await chunk("index"));
   if (mine !== latest) return;
   closeCell();
-  for (const name of ["matrix", "cell", "cost", "trend"]) byId(name + "-view").hidden = name !== view;
+  for (const name of ["matrix", "cell", "cost", "trend", "gaps"]) {
+    const section = document.getElementById(name + "-view");
+    if (section) section.hidden = name !== view;
+  }
   byId("verdict").hidden = view !== "matrix";
   for (const link of document.querySelectorAll(".views a")) {
     if (link.getAttribute("href") === "#view=" + view) link.setAttribute("aria-current", "page");
@@ -33,7 +36,7 @@ async function show() {
     showMatrix(index, fields);
   } else if (view === "cell") await showCell(byId("cell-view"), index, fields, back);
   else if (view === "cost") await showCost(byId("cost-view"), index, fields);
-  else await showTrend(byId("trend-view"), index, fields);
+  else if (view === "trend") await showTrend(byId("trend-view"), index, fields);
   viewed = fields;
   document.documentElement.dataset.shown = view;
 }

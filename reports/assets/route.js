@@ -25,5 +25,5 @@ export function amend(changes) {
 /** @param {Record<string, string>} fields */
 export function viewOf(fields) {
   if (fields.scenario !== undefined && fields.engine !== undefined && !fields.view) return "cell";
-  return fields.view === "cost" || fields.view === "trend" ? fields.view : "matrix";
+  return ["cost", "trend", "gaps"].includes(fields.view) ? fields.view : "matrix";
 }

@@ -26,8 +26,10 @@ from rich.markup import render
 from plumbline.cli import verdict_matrix
 from plumbline.judging.rows import VERDICT_STYLES, Row, Verdict
 from plumbline.model.kinematics import quaternion_product
-from reports import chunks, html_report, junit, report_data, step_summary
+from reports import chunks, html_report, junit, report_data, sarif, step_summary
 from reports.earlier_runs import History
+from reports.findings_list import declared_gaps, findings_for_page
+from reports.issue_text import issue_text
 from reports.stored_results import Results, replace_unprintable
 from reports.verdicts import css_class, error_ratio, format_number, needs_attention, rank
 from tests.helpers import example_results as fixture
@@ -109,7 +111,8 @@ def test_the_sentence_counts_and_versions_come_first(out, text):
 
 def test_every_cell_is_in_the_static_matrix_with_glyph_text_and_class(out, text):
     results = Results.load(out)
-    table = text[text.index('<table class="matrix"') : text.index("</table>")]
+    start = text.index('<table class="matrix"')
+    table = text[start : text.index("</table>", start)]
     lines = table.split('<tr class="line"')[1:]
     assert len(lines) == len(results.scenarios)
     for line, name in zip(lines, results.scenarios, strict=True):
@@ -421,17 +424,41 @@ def test_a_run_of_the_state_level_alone_has_a_page(out, tmp_path):
     assert data["scenario-0"]["curves"] == [] and data["scenario-0"]["motion"] is None
 
 
-def test_gaps_of_one_reason_are_one_finding(out):
+def test_gaps_of_one_reason_are_one_finding_and_declared_ones_have_a_page(out):
     results = Results.load(out)
     gap = next(row for row in results.rows if row["verdict"] == "unsupported")
-    rows = [{**gap, "known_issue": None, "scenario": f"s{k}"} for k in range(9)]
-    rows += [{**gap, "known_issue": None, "scenario": "s0", "quantity": "energy"}]
-    rows += [{**gap, "known_issue": None, "scenario": "s1", "reason": "another"}]
-    first, second = html_report._unexpected_findings(rows)
-    assert (len(first["scenarios"]), first["more"]) == (8, 1) and first["row"]["scenario"] not in first[
-        "scenarios"
-    ]
-    assert (len(second["scenarios"]), second["more"]) == (0, 0)
+    names = list(results.scenarios)
+    rows = [{**gap, "known_issue": None, "scenario": name, "key": f"{name}/a"} for name in names]
+    rows += [{**gap, "known_issue": None, "reason": "another"}]
+    declared = [{**gap, "known_issue": "declared: x", "scenario": n, "key": f"{n}/b"} for n in names]
+    shown = replace(results, rows=[*rows, *declared])
+    first, second = findings_for_page(shown, History())
+    assert {len(first["scenarios"]), len(second["scenarios"])} == {len(names), 1}
+    (group,) = declared_gaps(shown)
+    assert (group["count"], list(group["scenarios"])) == (len(names), names)
+    words = Parsed(html_report.render(shown, History())).words
+    assert "Declared gaps" in words and "2 findings need attention" in words
+
+
+def test_a_finding_has_its_mechanism_with_the_worst_body_marked_a_plot_and_its_numbers(out):
+    results = Results.load(out)
+    first = next(f for f in results.findings if f["verdict"] == "disagrees")
+    row = next(row for row in results.rows if row["key"] == first["rows"][0])
+    row["extra"] = {"body": 1.0}
+    scenario = results.scenarios[row["scenario"]]
+    start = {"p": [1.0, 0, 0, 0], "omega": [0.0] * 3, "u": [0.0, 0, 1], "udot": [0.0] * 3}
+    scenario["state"] = {name: [x] * scenario["bodies"] for name, x in start.items()}
+    found = findings_for_page(results, History())
+    assert [f["name"] for f in found] == [f["name"] for f in results.findings]
+    (finding,) = (f for f in found if f["row"] is row)
+    points = finding["drawing"]["points"]
+    assert len(points) == scenario["bodies"]
+    assert [p["name"] for p in points if p["is_marked"]] == ["body 1"]
+    assert len(finding["plot"]["dots"]) == sum(
+        bool(r["ratio"]) for r in results.rows if r["key"] in finding["rows"]
+    )
+    page = html_report.render(results, History())
+    assert all(html.escape(f["name"]) in page for f in found) and 'class="robot"' in page
 
 
 def test_a_run_that_compared_nothing_is_not_shown_as_agreement(out):
@@ -470,6 +497,35 @@ def test_junit_counts_what_it_holds_and_survives_every_text(out):
     assert any("behaves as if gravity" in (failure.text or "") for failure in root.findall(".//failure"))
 
 
+def test_sarif_has_a_result_per_finding_and_suppresses_recorded_ones(out):
+    results = Results.load(out)
+    log = json.loads(sarif.write(results).read_text())
+    found = log["runs"][0]["results"]
+    assert [one["ruleId"] for one in found] == [finding["name"] for finding in results.findings]
+    for one, finding in zip(found, results.findings, strict=True):
+        assert ("suppressions" in one) == (finding["known_issue"] is not None)
+
+
+def test_junit_and_the_summary_name_the_finding(out):
+    results = Results.load(out)
+    root = ET.parse(junit.write(results)).getroot()
+    messages = [f.get("message") for f in (*root.iter("failure"), *root.iter("error"))]
+    names = [f["name"] for f in results.findings if f["known_issue"] is None]
+    assert all(any(message.startswith(f"{name}: ") for name in names) for message in messages)
+    summary = html.unescape(step_summary.render(results))
+    assert all(finding["name"] in summary for finding in results.findings)
+
+
+def test_the_text_of_an_issue_has_script_versions_and_the_expected_number(out):
+    results = Results.load(out)
+    finding = next(f for f in results.findings if f["verdict"] == "disagrees")
+    text = issue_text(results, finding)
+    assert "## Reproduction steps" in text and finding["sentence"] in text
+    assert "times what rounding explains" in text and f"Wrong in {finding['versions'][0]}" in text
+    scripts = [results.scripts[key] for key in finding["rows"] if key in results.scripts]
+    assert not scripts or scripts[0].rstrip() in text
+
+
 def test_the_step_summary_shows_text_as_text_and_keeps_its_limit(out):
     text = step_summary.write(Results.load(out)).read_text(encoding="utf-8")
     assert "<" not in text and "`" not in text
@@ -477,7 +533,9 @@ def test_the_step_summary_shows_text_as_text_and_keeps_its_limit(out):
     assert not re.search(r"(?<!&)[|*_#\[\]`<>@]", step_summary.escape_markdown("|*_#[]`<>@me"))
     results = Results.load(out)
     bad = next(row for row in results.rows if row["verdict"] == "disagrees")
-    results.rows.extend({**bad, "scenario": f"s{k}", "reason": "long " * 60} for k in range(5000))
+    results.rows.extend(
+        {**bad, "quantity": f"q{k}", "key": f"k{k}", "reason": "long " * 60} for k in range(5000)
+    )
     summary = step_summary.render(results)
     assert len(summary.encode()) <= 1024 * 1024
     assert re.search(r"… and \d{3,} more", summary)

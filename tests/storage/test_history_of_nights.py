@@ -12,7 +12,7 @@ from plumbline.cli.main import main
 from plumbline.execution.exit_codes import ExitCode
 from plumbline.judging.rows import RowContext
 from plumbline.storage import results_store
-from plumbline.storage.history_of_nights import History, next_night_number
+from plumbline.storage.history_of_nights import History, last_findings, next_night_number
 from reports.earlier_runs import History as ReportHistory
 from reports.stored_results import Results
 
@@ -179,7 +179,7 @@ def test_a_damaged_night_is_named_and_left_out(tmp_path, spoil):
 def test_an_empty_folder_has_no_nights(tmp_path):
     document = History(tmp_path).to_document("*")
     assert document.pop("last_green") is None
-    assert set(document) == {"nights", "damaged", "versions", "first_bad", "since_green", "trend"}
+    assert set(document) == {"nights", "damaged", "versions", "findings", "first_bad", "since_green", "trend"}
     assert all(part == [] for part in document.values())
 
 
@@ -203,8 +203,24 @@ def test_the_command_reports_it(tmp_path):
     store_run(tmp_path / "history", 2, ["disagrees"])
     reported = CliRunner().invoke(main, ["history", str(tmp_path)])
     assert reported.exit_code == 0, reported.output
-    assert f"{KEY} disagrees since 20260102T000000Z" in " ".join(reported.output.split())
+    name = "mujoco-acceleration-at-level-state"
+    assert f"{name} new 20260102T000000Z 1 4.0 20260102T000000Z" in " ".join(reported.output.split())
     data = CliRunner().invoke(main, ["history", str(tmp_path), "--key", "s/*", "--json"])
     assert len(json.loads(data.output)["trend"]) == 2
     nothing = CliRunner().invoke(main, ["history", str(tmp_path / "absent")])
     assert nothing.exit_code == 2
+
+
+def test_the_life_of_a_finding(tmp_path):
+    name, gap = "mujoco-acceleration-at-level-state", "mujoco-unresolved-acceleration-at-level-state"
+    store_run(tmp_path, 1, ["unresolved"])
+    store_run(tmp_path, 2, ["disagrees"])
+    store_run(tmp_path, 3, ["disagrees", "disagrees"], version="4.1")
+    present, gone = History(tmp_path).findings()
+    assert (present["finding"], present["state"], present["nights"]) == (name, "present", 2)
+    assert (present["first_seen"], present["versions"]) == ("20260102T000000Z", ["4.0", "4.1"])
+    assert (gone["finding"], gone["state"], gone["last_seen"]) == (gap, "gone", "20260101T000000Z")
+    assert last_findings(tmp_path) == {name} and last_findings(tmp_path / "empty") == frozenset()
+    store_run(tmp_path, 4, ["disagrees"], known="k")
+    last = History(tmp_path).findings()[0]
+    assert (last["finding"], last["state"]) == ("k", "recorded")
