@@ -11,10 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from plumbline.judging.findings import find_findings
 from plumbline.model.datatypes import Indices, Int
 from plumbline.storage.results_store import read_results, read_table
-from plumbline.storage.schema_upgrade import row_of_record
+from plumbline.storage.schema_upgrade import findings_of_records
 from plumbline.storage.script_index import read_script_index, scripts_folder
 
 Record = dict[str, Any]
@@ -131,8 +130,7 @@ class Results:
     @cached_property
     def findings(self) -> list[Record]:
         """The rows that do not agree, by cause: those that nothing expects first."""
-        bodies = {name: about["bodies"] for name, about in self.scenarios.items()}
-        return [finding.record() for finding in find_findings(map(row_of_record, self.rows), bodies)]
+        return [finding.record() for finding in findings_of_records(self.rows, self.scenarios)]
 
     @cached_property
     def scripts(self) -> dict[str, str]:

@@ -209,16 +209,14 @@ def explain(name: str | None, folder: Path) -> None:
     FINDING is a name that `run` prints, or its beginning.
     """
     from plumbline.cli import findings_output as output
-    from plumbline.judging.findings import find_findings
     from plumbline.judging.known_issues import project_known_issues
-    from plumbline.storage.schema_upgrade import row_of_record
+    from plumbline.storage.schema_upgrade import findings_of_records
     from plumbline.storage.script_index import read_script_index, scripts_folder
 
     with options.exit_on_damaged_results():
         document = read_results(folder)
         scripts = {key: str(scripts_folder(folder) / file) for key, file in read_script_index(folder).items()}
-    bodies = {scenario: about["bodies"] for scenario, about in document["scenarios"].items()}
-    found = find_findings(map(row_of_record, document["rows"]), bodies)
+    found = findings_of_records(document["rows"], document["scenarios"])
     if name is None:
         for finding in found:
             click.echo(f"{finding.name}: {output.coverage(finding)}")

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from typing import Any
 
 import pyarrow as pa
 
-from plumbline.judging.findings import find_findings
+from plumbline.judging.findings import Finding, find_findings
 from plumbline.judging.rows import Row, Verdict, error_ratio
 
 Record = dict[str, Any]
@@ -45,16 +46,26 @@ def upgrade_document(document: Record) -> Record:
         rows = [row | {"causes": []} for row in document["rows"]]
         document = document | {"schema_version": 3, "rows": rows}
     if document["schema_version"] == 3:
-        bodies = {name: about["bodies"] for name, about in document["scenarios"].items()}
-        found = find_findings(map(row_of_record, document["rows"]), bodies)
+        found = findings_of_records(document["rows"], document["scenarios"])
         document = document | {"schema_version": 4, "findings": [finding.record() for finding in found]}
     return document
 
 
-def row_of_record(record: Record) -> Row:
-    """Make a row of its entry in results.json."""
-    own = {one.name: record[one.name] for one in fields(Row)}
-    return Row(**own | {"verdict": Verdict(record["verdict"])})
+def findings_of_records(rows: Iterable[Record], scenarios: Mapping[str, Record]) -> list[Finding]:
+    """Find the findings of stored rows.
+
+    Args:
+        rows: of results.json.
+        scenarios: of results.json.
+
+    """
+    names = [one.name for one in fields(Row)]
+    every = [
+        Row(**{name: row[name] for name in names} | {"verdict": Verdict(row["verdict"])})
+        for row in rows
+        if row["verdict"] not in (Verdict.AGREES, Verdict.INFORMATION) or "@" in row["engine"]
+    ]
+    return find_findings(every, {name: about["bodies"] for name, about in scenarios.items()})
 
 
 def _upgrade_first(document: Record) -> Record:
