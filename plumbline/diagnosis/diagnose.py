@@ -8,7 +8,7 @@ scatters where little more than the last bits of the problem change has no such 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -22,7 +22,7 @@ from plumbline.diagnosis.prediction import QUANTITIES, SUMS, VECTORS, WRENCHES, 
 from plumbline.diagnosis.readings import other_branches
 from plumbline.diagnosis.terms import Terms, force_places, is_spanned
 from plumbline.engines.registry import load_adapter
-from plumbline.model.datatypes import Array, Model, StateQuantities
+from plumbline.model.datatypes import Array, Model, State, StateQuantities
 from plumbline.model.kinematics import complete_state, stack_states
 from plumbline.truth.ground_truth import StateTruth
 
@@ -149,7 +149,7 @@ class _Diagnosing:
         return (
             found
             or self._single(View(), are_sums_apart=True)
-            or self._single_of_loops()
+            or (self._single_of_loops() if set(VECTORS[:2]) & set(wrong) else ())
             or self._with_outputs(wrong)
             or self._pairs()
             or self._forces()
@@ -236,17 +236,17 @@ class _Diagnosing:
         """Loops that are closed on another branch at some states."""
         predictor = difference.predictor
         wanted, accepted = difference.values, difference.accepted(difference.everything)
+
+        def is_explained(s: int, poses: Sequence[Callable[[State], State]]) -> bool:
+            here = difference.state == s
+            if np.max(np.abs(wanted[here])) <= accepted:
+                return True
+            with np.errstate(all="ignore"):
+                left = (np.abs(wanted - difference.effect_elsewhere(pose, s))[here] for pose in poses)
+                return any(bool(np.max(one) <= accepted) for one in left)
+
         for cause, poses in other_branches(self.model):
-            is_explained = np.array(
-                [np.max(np.abs(wanted[difference.state == s])) <= accepted for s in range(predictor.count)]
-            )
-            for pose in poses:
-                effect = difference.effects_elsewhere(pose)
-                for s in range(predictor.count):
-                    here = difference.state == s
-                    with np.errstate(all="ignore"):
-                        is_explained[s] |= bool(np.max(np.abs(wanted - effect)[here]) <= accepted)
-            if np.all(is_explained):
+            if all(is_explained(s, poses) for s in range(predictor.count)):
                 return (replace(cause, states=predictor.count),)
         return ()
 

@@ -129,18 +129,16 @@ class Difference:
             return np.zeros((0, len(self.values)))
         return np.asarray((self._flat(self.predictor.predict(cases)) - self._right) / self.weight)
 
-    def effects_elsewhere(self, pose: Callable[[State], State]) -> Array:
-        """Return the effect (m,) of other poses of loops; not numbers where there is none."""
+    def effect_elsewhere(self, pose: Callable[[State], State], s: int) -> Array:
+        """Return the effect (m,) of another pose of loops at one state; not numbers where there is none."""
         predictor = self.predictor
         found = {name: np.full(x.shape, np.nan) for name, x in predictor.right.items()}
-        for s, state in enumerate(predictor.states):
-            try:
-                there = Predictor(self.model, [pose(state)], self.view)
-                answers = there.right
-            except (ValueError, np.linalg.LinAlgError):
-                continue
-            for name, x in answers.items():
-                found[name][s] = x[0]
+        try:
+            answers = Predictor(self.model, [pose(predictor.states[s])], self.view).right
+        except (ValueError, np.linalg.LinAlgError):
+            return np.full(len(self.values), np.nan)
+        for name, x in answers.items():
+            found[name][s] = x[0]
         return np.asarray((self._flat(found) - self._right) / self.weight)
 
     def evaluate(self, lanes: Sequence[tuple[Combination, Array]]) -> Array:

@@ -13,12 +13,13 @@ from functools import cached_property
 import numpy as np
 
 from plumbline.diagnosis.cause import Cause, significant
+from plumbline.diagnosis.edits import gyroscopic_moment
 from plumbline.diagnosis.prediction import WRENCHES, Answers, Case
 from plumbline.equations.arithmetic import floats
 from plumbline.equations.tree import Tree
 from plumbline.model.datatypes import Array, State
 from plumbline.model.kinematics import JointFrame, cross, rotate_vectors, rotation_matrix
-from plumbline.model.loops import determinate_projectors, wrench_length
+from plumbline.model.loops import cut_open, determinate_projectors, wrench_length
 
 Choose = Callable[[Array], Array]  # of the rows of some bodies or joints
 MakeCause = Callable[..., Cause]  # of words and amounts
@@ -494,6 +495,7 @@ class Outputs:
                 parts.append(replace(part, every=every))
             if len(closing) > 1:
                 parts.append(self._carried(every, *total))
+        parts += self._welds_of_cuts()
         carried = np.zeros((2, *self._near.shape))
         for k in range(model.n):
             far = int(model.body[k, 0])
@@ -504,6 +506,36 @@ class Outputs:
         if np.any(carried):
             parts.append(self._wrench("what the bodies beyond apply", *carried))
         return parts
+
+    def _welds_of_cuts(self) -> list[Part]:
+        """Moments of the welds that hold the parts of bodies that are cut so that loops are open.
+
+        A part has the pose of its body and a share of mass and inertia; on it act the closing joint, gravity
+        and the weld.
+        """
+        model, state = self.case
+        if not model.has_loops or not self.right.keys() >= {"acceleration", *WRENCHES}:
+            return []
+        cut, parts = cut_open(model), list[Part]()
+        every, total = "the moments of the welds in cut bodies", np.zeros(self._near.shape)
+        inertial = np.matvec(model.inertia, self.right["angular_acceleration"]) + gyroscopic_moment(self.case)
+        inertial = np.matvec(self._turns, inertial)
+        for k in range(model.n, len(model.kind)):
+            body = int(model.body[k, 1])
+            share = float(cut.model.mass[cut.place[k]] / model.mass[body])
+            lever = self._near[:, k] - state.r[:, body]
+            force, moment = (self.right[name][:, k] for name in WRENCHES)
+            weld = share * inertial[:, body] - moment - cross(lever, force)
+            value = np.zeros(self._near.shape)
+            value[:, k] += weld
+            for first, sign in ((int(model.body[k, 0]), 1.0), (body, -1.0)):
+                at = first
+                while at >= 0:
+                    value[:, at] += sign * weld
+                    at = int(model.body[at, 0])
+            total += value
+            parts.append(self._wrench(f"the moment of the weld in body {body + 1}", 0 * value, value, every))
+        return [*parts, self._wrench(every, 0 * total, total)] if len(parts) > 1 else parts
 
     @cached_property
     def _levers(self) -> list[Part]:
