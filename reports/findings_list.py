@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from plumbline.judging.known_issues import project_known_issues
 from plumbline.judging.rows import RUN_FAMILY, is_declared
 from plumbline.model.datatypes import Model
 from plumbline.model.kinematics import state_from_minimal
@@ -26,25 +25,22 @@ def findings_for_page(results: Results, history: History) -> list[Record]:
 
     Returns:
         The findings of results.json, each with its representative ``row``, the place marked in a ``drawing``
-        of the smallest scenario, a ``plot`` of its rows, the ``issue`` that records it and ``first_seen``.
+        of the smallest scenario, a ``plot`` of its rows, ``first_seen`` and whether it has a script.
 
     """
     by_key = {row["key"]: row for row in results.rows}
-    issues = {issue.name: issue for issue in project_known_issues()}
     found = list[Record]()
     for finding in results.findings:
         rows = [by_key[key] for key in finding["rows"] if key in by_key]
         if not rows:
             continue
         is_drawn = len(found) < MAX_DRAWN
-        issue = issues.get(finding["known_issue"] or "")
         found.append(
             finding
             | {
                 "row": rows[0],
                 "drawing": _drawing(results.scenarios[rows[0]["scenario"]], rows[0]) if is_drawn else None,
                 "plot": _plot(rows) if is_drawn else None,
-                "issue": issue and {"reason": issue.reason, "evidence": issue.evidence, "since": issue.since},
                 "first_seen": history.first_seen(rows),
                 "is_scripted": any(row["key"] in results.scripts for row in rows),
             }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from plumbline.engines.environments import split_version
 from reports.stored_results import Record, Results
 from reports.verdicts import format_number
 
@@ -24,7 +23,7 @@ def issue_text(results: Results, finding: Record) -> str:
     by_key = {row["key"]: row for row in results.rows}
     rows = [by_key[key] for key in finding["rows"]]
     first = rows[0]
-    package = split_version(finding["engine"])[0].partition("-")[0]
+    package = finding["engine"].partition("-")[0]
     happens, expects, how, where = HEADINGS.get(package, OTHER_HEADINGS)
     wrong = ", ".join(finding["versions"]) or "unknown"
     right = (

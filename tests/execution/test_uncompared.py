@@ -46,7 +46,7 @@ def test_a_singular_initial_pose_is_unresolved_and_the_others_are_compared():
     singular = {row.engine: row for row in result.rows if row.quantity == SINGULAR_POSE}
     assert set(singular) == {"reference", "mujoco"}  # the third refuses loops
     for row in singular.values():
-        assert row.verdict == Verdict.UNRESOLVED and row.known_issue == "flat-four-bars"
+        assert row.verdict == Verdict.UNRESOLVED and row.known_issue == "four-bars-reach-their-flat-pose"
         assert row.value < 1e-14 and row.reason.startswith("singular: ")
     compared = [row for row in result.rows if row.verdict == Verdict.AGREES]
     assert len(compared) == 2 * 7 and {row.extra["states"] for row in compared} == {3.0}
