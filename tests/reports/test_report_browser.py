@@ -145,7 +145,8 @@ def timed(chromium, path):
 def test_without_javascript_the_matrix_and_findings_are_there(open_page, out):
     page = open_page(java_script_enabled=False)
     results = Results.load(out)
-    assert page.locator("h1").inner_text() == results.run["sentence"]
+    assert page.locator("h1").inner_text() == "4 findings need attention"
+    assert page.locator(".sentence").inner_text() == results.run["sentence"]
     assert len(visible_lines(page)) == len(results.scenarios)
     assert page.locator("td.cell.disagrees:visible").count() == 2
     assert page.locator("#findings:visible li").count() >= 3
