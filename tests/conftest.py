@@ -9,10 +9,15 @@ pytest-dev/pytest-xdist#1386.)
 import itertools
 import os
 import re
+import sys
 
 import pytest
 
-from tests.helpers import array_checks
+# Bytecode is compiled once and kept, whatever the machine's default: the tests start many processes.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+
+from tests.helpers import array_checks  # noqa: E402 (bytecode of the tests too)
 
 array_checks.install()
 

@@ -174,11 +174,11 @@ def test_states_obey_newton_and_euler(engine, joints, loaded):
     least = {"acceleration": g, "angular_acceleration": g / 0.25, "joint_reaction": weight}
     levers = np.cumsum(0.5 + subject.length)
     for at, true, got in zip(states, truth, answers or [], strict=False):
-        bound = state_rounding_bound(subject, at)
+        bound = state_rounding_bound(subject, at) if engine == "pinocchio-aba" else None
         for name, size in least.items():
             expected = getattr(true, name)
             limit = 1e-11 * max(size, np.abs(expected).max())
-            if engine == "pinocchio-aba":
+            if bound is not None:
                 limit = getattr(bound, name)[:, None]
             assert_agrees(engine, got, name, expected, limit, 1.0)
         energy, height = newton_euler.kinetic_energy(subject, at), newton_euler.potential_energy(subject, at)
@@ -415,33 +415,31 @@ def bad_inputs():
     """Model, state, and a word of the message that refuses them."""
     subject = pendulums.make_model("rb")
     at = pendulums.state_from_seed(subject)
-    bad = {
-        (name, value): (*replace_entry(name, value), name)
-        for name in ARRAYS.split()
-        for value in (np.nan, np.inf)
-    }
+    for name in ARRAYS.split():
+        for value in (np.nan, np.inf):
+            yield *replace_entry(name, value), name
     for factor in (0.0, 1.1, 1 + 1e-13, -0.5):
-        bad["p times", factor] = subject, replace(at, p=at.p * [[1.0], [factor]]), "normalised"
-    bad["omega", "shape"] = subject, replace(at, omega=at.omega[:1]), "shape"
-    bad["p", "type"] = subject, replace(at, p=at.p.astype(np.float32)), "float32"
-    return [pytest.param(*case, id="-".join(map(str, name))) for name, case in bad.items()]
+        yield subject, replace(at, p=at.p * [[1.0], [factor]]), "normalised"
+    yield subject, replace(at, omega=at.omega[:1]), "shape"
+    yield subject, replace(at, p=at.p.astype(np.float32)), "float32"
 
 
 TAMPER = {"_evaluate": fail_if_called, "_simulate": fail_if_called}
 
 
-@pytest.mark.parametrize(("subject", "at", "message"), bad_inputs())
-def test_refuses_bad_states(engine, subject, at, message):
-    with pytest.raises(BadInput, match=message):
-        worker.call_adapter(engine, "evaluate", subject, [at], overrides=TAMPER)
+def test_refuses_bad_states(engine):
+    for subject, at, message in bad_inputs():
+        with pytest.raises(BadInput, match=message):
+            worker.call_adapter(engine, "evaluate", subject, [at], overrides=TAMPER)
 
 
-@pytest.mark.parametrize(("subject", "at", "message"), bad_inputs())
 @every_integrator
-def test_refuses_runs_from_bad_states(engine, integrator, subject, at, message):
-    with pytest.raises(BadInput, match=message):
-        size = step_or_tolerance(integrator)
-        worker.call_adapter(engine, "simulate", subject, at, TIMES, integrator.name, size, overrides=TAMPER)
+def test_refuses_runs_from_bad_states(engine, integrator):
+    size = step_or_tolerance(integrator)
+    for subject, at, message in bad_inputs():
+        with pytest.raises(BadInput, match=message):
+            args = subject, at, TIMES, integrator.name, size
+            worker.call_adapter(engine, "simulate", *args, overrides=TAMPER)
 
 
 # -- what must not leave unnoticed -------------------------------------------------------------

@@ -12,6 +12,7 @@ from plumbline.model.random_mechanisms import random_loop_mechanism
 from plumbline.model.sampling import random_loop_states
 from plumbline.truth.certified_state import certify_state
 from plumbline.truth.rounding_bound import state_rounding_bound
+from tests.helpers.nightly_tests import SLOW
 from tests.helpers.planting import number_change, turned_by
 from tests.helpers.shared_answers import sharing
 from tests.helpers.true_answers import assert_reported, assert_within_bound, sizes
@@ -28,22 +29,21 @@ def shared_truths():
         yield
 
 
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=SLOW)])
 @pytest.mark.parametrize("closing", CLOSING)
 @pytest.mark.parametrize("engine", ENGINES)
-def test_states_of_random_loops_are_right(engine, closing):
-    adapter = load_adapter(engine)
-    for seed in range(2):
-        model, start = random_loop_mechanism(seed, 6, CLOSING[closing])
-        states = [start, *random_loop_states(model, start, 1, seed)]
-        for state, found in zip(states, adapter.evaluate(model, states), strict=True):
-            truth, bound = certify_state(model, state).quantities, state_rounding_bound(model, state)
-            assert_within_bound(found, truth, bound)
-            for name, scale in bound.scale.items():
-                assert name == "mass_matrix" or np.max(bound.tolerance(name)) < 1e-9 * np.max(scale), name
-            for name in VECTORS:
-                value = getattr(truth, name)
-                off = np.max(sizes(getattr(found, name) - value))
-                assert off <= 1e-10 * np.max(np.abs(value)), (name, seed)
+def test_states_of_random_loops_are_right(engine, closing, seed):
+    model, start = random_loop_mechanism(seed, 6, CLOSING[closing])
+    states = [start, *random_loop_states(model, start, 1, seed)]
+    for state, found in zip(states, load_adapter(engine).evaluate(model, states), strict=True):
+        truth, bound = certify_state(model, state).quantities, state_rounding_bound(model, state)
+        assert_within_bound(found, truth, bound)
+        for name, scale in bound.scale.items():
+            assert name == "mass_matrix" or np.max(bound.tolerance(name)) < 1e-9 * np.max(scale), name
+        for name in VECTORS:
+            value = getattr(truth, name)
+            off = np.max(sizes(getattr(found, name) - value))
+            assert off <= 1e-10 * np.max(np.abs(value)), name
 
 
 @pytest.mark.parametrize("engine", ["exudyn-tree", "pinocchio-aba", "reference-printed"])

@@ -12,6 +12,7 @@ from plumbline.model.kinematics import complete_state
 from plumbline.model.random_mechanisms import random_tree
 from plumbline.model.sampling import random_states
 from plumbline.truth.reference_motions import simulate_notes_form
+from tests.helpers.nightly_tests import SLOW
 from tests.helpers.shared_answers import sharing
 from tests.helpers.true_answers import converging_runs
 
@@ -70,7 +71,10 @@ def test_motions_of_random_trees_converge_to_the_truth(engine, mix):
 ELEMENTS = ("armature", "damping", "stiffness", "effort", "springs")
 
 
-@pytest.mark.parametrize("kinds", [("hinge", "slide", "universal", "cylindrical", "rod"), ("ball", "hinge")])
+@pytest.mark.parametrize(
+    "kinds",
+    [("hinge", "slide", "universal", "cylindrical", "rod"), pytest.param(("ball", "hinge"), marks=SLOW)],
+)
 @pytest.mark.parametrize("element", ELEMENTS)
 @pytest.mark.parametrize("engine", ENGINES)
 def test_motions_with_elements_converge_to_the_truth_and_conserve_energy(engine, element, kinds):

@@ -52,10 +52,8 @@ def test_help_has_examples_and_exit_codes():
         "3  an engine failed",
     ):
         assert words in result.stdout
-    assert (
-        "\n    python -m plumbline run --family chain --level state\n"
-        in run_plumbline("run", "--help").stdout
-    )
+    example = "\n    python -m plumbline run --family chain --level state\n"
+    assert example in invoke("run", "--help").stdout
     assert "\\b" not in result.stdout
 
 
@@ -262,10 +260,10 @@ def test_a_run_writes_everything_and_exits_by_its_verdict(tmp_path):
 
 def test_stdout_holds_json_alone_with_the_users_tolerance(tmp_path):
     options = "--engine mujoco --level state --json --user-rtol 1e-6 --out"
-    result = run_plumbline("run", "rest", *options.split(), tmp_path)
+    result = invoke("run", "rest", *options.split(), tmp_path)
     document = json.loads(result.stdout)
     assert {row["user_rtol"] for row in document["rows"]} == {1e-6}
-    assert document["run"]["exit_code"] == result.returncode == 0
+    assert document["run"]["exit_code"] == result.exit_code == 0
 
 
 def test_a_scenario_by_path(tmp_path):

@@ -26,7 +26,6 @@ def outcomes(folder, server, *words):
 def test_tests_pass_fail_skip_and_are_expected_to_fail(tmp_path):
     known, wrong = tmp_path / "plumbline-known.toml", tmp_path / "wrong.py"
     wrong.write_text(TOY.read_text().replace("omega, J @ omega", "omega, 1.001 * J @ omega"))
-    assert outcomes(tmp_path, TOY)[1] == {"passed": 2, "skipped": 14}
     known.write_text('"state/tumbling-ball/acceleration" = "the spin is off"\n')
     text, found = outcomes(tmp_path, wrong)
     assert found == {"xfailed": 1, "failed": 1, "skipped": 14} and "times the rounding bound" in text, text

@@ -2,7 +2,6 @@
 
 import json
 import shlex
-import subprocess
 import sys
 from pathlib import Path
 
@@ -125,14 +124,8 @@ def test_an_adapter_of_a_file_is_a_column(tmp_path):
 def test_a_contract_names_what_differs_with_its_cause_and_writes_junit(tmp_path):
     wrong = tmp_path / "wrong.py"
     wrong.write_text(TOY.read_text().replace("omega, J @ omega", "omega, 1.001 * J @ omega"))
-    words = [sys.executable, "-m", "plumbline", "contract", f"cmd:{sys.executable} {wrong}"]
-    done = subprocess.run(
-        [*words, "--level", "state", "--junit", tmp_path / "junit.xml"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 1, done.stderr
+    done = run("contract", toy(wrong), "--level", "state", "--junit", tmp_path / "junit.xml")
+    assert done.exit_code == 1, done.stderr
     assert "✗ tumbling-ball/wrong/state/-/acceleration" in done.stdout
     assert "unsupported as declared" in done.stdout
     assert "<failure" in (tmp_path / "junit.xml").read_text()

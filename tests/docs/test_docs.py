@@ -25,7 +25,7 @@ PAGES = [
     "model-files.md", "test-your-robot.md", *(["test-your-engine-in-cpp.md"] if shutil.which("g++") else []),
 ]  # fmt: skip
 BLOCK = re.compile(r"^```([^\n]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-IGNORED = shutil.ignore_patterns(".*", "__pycache__", "node_modules", "out")
+IGNORED = shutil.ignore_patterns(".*", "node_modules", "out")
 
 
 def run_code_blocks(page, folder):

@@ -11,7 +11,7 @@ from plumbline.model.kinematics import rotation_matrix
 from plumbline.model.sampling import random_states
 from plumbline.scenario.loader import catalogue, load_scenario
 from plumbline.truth.ground_truth import state_truth
-from tests.helpers.nightly_tests import slow, some_fast
+from tests.helpers.nightly_tests import SLOW, slow, some_fast
 from tests.helpers.planted_defects import STATE_DEFECTS
 from tests.helpers.planted_joints import ELEMENT_DEFECTS, JOINT_DEFECTS, LOOP_DEFECTS
 from tests.helpers.planting import (
@@ -29,7 +29,7 @@ for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
 
 
 @pytest.mark.parametrize(
-    "defect", [*some_fast(ELEMENT_DEFECTS, 1), *some_fast(JOINT_DEFECTS, 6), *some_fast(LOOP_DEFECTS, 6)]
+    "defect", [*some_fast(ELEMENT_DEFECTS, 3), *some_fast(JOINT_DEFECTS, 6), *some_fast(LOOP_DEFECTS, 6)]
 )
 def test_every_defect_is_reported(defect):
     assert evaluated(defect)[1], f"nothing reports {defect.name}"
@@ -57,11 +57,15 @@ USED = {(d.engine, d.mechanism) for d in (*ELEMENT_DEFECTS, *JOINT_DEFECTS, *LOO
 USED -= {("mujoco", "wrecking-ball")}  # known_issues.yaml: the rounding of its moments exceeds the bound
 
 
-@pytest.mark.parametrize(
-    ("engine", "mechanism"), sorted(USED | {("reference", EVERY_JOINT), ("pinocchio", RANDOM_LOOP)})
-)
-def test_the_engines_without_defect_are_not_reported(engine, mechanism):
-    assert evaluated(Defect("clean", engine=engine, mechanism=mechanism))[1] == []
+CLEAN = [
+    Defect(f"{engine} on {mechanism}", engine=engine, mechanism=mechanism)
+    for engine, mechanism in sorted(USED | {("reference", EVERY_JOINT), ("pinocchio", RANDOM_LOOP)})
+]
+
+
+@pytest.mark.parametrize("clean", some_fast(CLEAN, 4))
+def test_the_engines_without_defect_are_not_reported(clean):
+    assert evaluated(clean)[1] == []
 
 
 def test_a_misread_velocity_that_only_energies_show_is_named_without_gravity():
@@ -94,10 +98,11 @@ OF_BODIES_NOT_JOINTS = (
 )  # fmt: skip
 
 
+@pytest.mark.parametrize("step", [5, pytest.param(1, marks=SLOW)])
 @pytest.mark.parametrize("mechanism", [EVERY_JOINT, RANDOM_LOOP])
-def test_defects_of_chains_are_reported_in_trees_and_loops(mechanism):
-    """Those of numbers, conventions and answers, wherever they make a difference."""
-    chosen = [d for d in STATE_DEFECTS if not d.patch and d.name != "digits-lost-along-chain"]
+def test_defects_of_chains_are_reported_in_trees_and_loops(mechanism, step):
+    """Those of numbers, conventions and answers, wherever they make a difference; fast every fifth."""
+    chosen = [d for d in STATE_DEFECTS if not d.patch and d.name != "digits-lost-along-chain"][::step]
     moved = [
         replace(d, engine="pinocchio", mechanism=mechanism, loaded=False)
         for d in chosen

@@ -9,8 +9,6 @@ from plumbline.execution.plan import TaskKind
 from plumbline.execution.scenario_verdicts import uncompared_kinds
 from plumbline.scenario.loader import Scenario
 
-MAX_BODIES = 10  # at state level; of mechanisms with loops
-MAX_LOOP_BODIES = 3
 MOTIONS = {  # scenario: what it adds to those above it, of the cheapest ones
     "conical": "a rod, a closed form",
     "loaded-ball": "a ball, every load",
@@ -25,6 +23,19 @@ STEPS = MOTIONS | {
     "planar-top": "a planar joint",
     "universal-pendulum": "a universal joint",
     "wrecking-ball": "a weld",
+}
+STATES = STEPS | {
+    "double-loaded-rods": "every load on rods",
+    "double-mass-ratio-1000": "masses far apart",
+    "chain-5-mixed": "rods and balls in turn",
+    "chain-10-rods": "a long chain",
+    "sprung-ball": "springs of balls",
+    "sprung-without-rotors": "no rotor",
+    "robot-arm": "a chain of hinges",
+    "hand-on-welds": "branches on welds",
+    "tree-of-seven-sprung": "every joint, load and element in one tree",
+    "four-bar": "a loop",
+    "slider-crank": "a loop with a slide",
 }
 LOADS = ("force", "moment", "drag_force", "drag_moment")
 KINDS = {"step": TaskKind.STEP, "trajectory": TaskKind.TRAJECTORY}
@@ -41,12 +52,7 @@ def levels(engine: str, scenario: Scenario) -> list[str]:
 
 def is_fast(scenario: Scenario, level: str) -> bool:
     """Whether the fast tests compare a scenario at a level."""
-    if level == "state":
-        is_special = scenario.closed_form is not None and scenario.name not in MOTIONS
-        return not is_special and scenario.model.n <= (
-            MAX_LOOP_BODIES if scenario.model.has_loops else MAX_BODIES
-        )
-    return scenario.name in (STEPS if level == "step" else MOTIONS)
+    return scenario.name in {"state": STATES, "step": STEPS, "trajectory": MOTIONS}[level]
 
 
 def features(scenario: Scenario) -> set[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import pytest
 
@@ -22,14 +22,19 @@ def slow(test: Any) -> Any:
     return test
 
 
-class _Named(Protocol):
-    @property
-    def name(self) -> str: ...
-
-
-def some_fast(cases: Sequence[_Named], step: int) -> list[Any]:
+def some_fast(cases: Sequence[Any], step: int) -> list[Any]:
     """Parameters of a test, by name, of which every ``step``-th runs fast and the others nightly."""
-    return [pytest.param(case, id=case.name, marks=SLOW if k % step else []) for k, case in enumerate(cases)]
+    return [
+        pytest.param(case, id=getattr(case, "name", case), marks=SLOW if k % step else [])
+        for k, case in enumerate(cases)
+    ]
+
+
+def fast_are(names: Sequence[str], cases: Sequence[Any]) -> list[Any]:
+    """Parameters of a test, by name, of which those of ``names`` run fast and the others nightly."""
+    missing = {*names} - {case.name for case in cases}
+    assert not missing, f"no cases: {missing}"
+    return [pytest.param(c, id=c.name, marks=[] if c.name in names else SLOW) for c in cases]
 
 
 def is_nightly(nodeid: str) -> bool:

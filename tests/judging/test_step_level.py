@@ -22,7 +22,7 @@ from plumbline.model.sampling import compared_states, random_states
 from plumbline.model.step_methods import ConstrainedMethod, JointSpaceMethod, classical_runge_kutta
 from plumbline.scenario.generator import RandomScenarios, random_scenario
 from plumbline.scenario.loader import find_scenario_file, load_scenario
-from plumbline.truth import step_formulas
+from plumbline.truth import step_comparison, step_formulas
 from plumbline.truth.certified_state import certify_state
 from plumbline.truth.step_charts import StepCharts
 from plumbline.truth.step_comparison import step_counts
@@ -31,6 +31,7 @@ from tests.helpers.nightly_tests import SLOW, some_fast
 from tests.helpers.pendulums import JOINT_PATTERNS
 from tests.helpers.planted_steps import STEP_DEFECTS, stale_velocity, step_defect, velocity_verlet
 from tests.helpers.planting import Defect, planted
+from tests.helpers.shared_answers import by_content
 
 for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
     pytest.importorskip(engine)
@@ -110,12 +111,24 @@ def defect_report(defect, loop=""):
         return judged(adapter, integrator, model, states)
 
 
-@pytest.mark.parametrize("defect", STEP_DEFECTS, ids=[d.name for d in STEP_DEFECTS])
+SHARED_STEPS = by_content(step_comparison.joint_space_steps)
+
+
+@pytest.fixture
+def shared_steps():
+    """The declared steps of a mechanism are computed once for all planted ones."""
+    with patch.object(step_comparison, "joint_space_steps", SHARED_STEPS):
+        yield
+
+
+@pytest.mark.usefixtures("shared_steps")
+@pytest.mark.parametrize("defect", some_fast(STEP_DEFECTS, 2))
 def test_every_other_integrator_is_reported(defect):
     rows = defect_report(defect)
     assert any(row.verdict == Verdict.DISAGREES for row in rows), [row.reason for row in rows]
 
 
+@pytest.mark.usefixtures("shared_steps")
 def test_the_planting_itself_is_honest():
     """The declared step, taken by the helpers that plant others, is not reported."""
     from tests.helpers import planted_steps as steps
@@ -231,7 +244,7 @@ def tree(seed, elements=ELEMENTS):
 
 
 @pytest.mark.parametrize("free", ["point and rotation", "rigid motion"])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=SLOW) for seed in range(1, 4))])
 @pytest.mark.parametrize("kinds", [tuple(KINDS), ("slide", "ball", "rod")], ids=["every joint", "slides"])
 def test_accelerations_of_trees_equal_the_certified_ones(seed, free, kinds):
     model = random_tree(np.random.default_rng(seed), 7, kinds, elements=ELEMENTS)
@@ -300,6 +313,7 @@ WRONG_METHODS = {
 }  # fmt: skip
 
 
+@pytest.mark.usefixtures("shared_steps")
 @pytest.mark.parametrize("name", WRONG_METHODS)
 def test_every_other_step_of_a_tree_is_reported(name):
     """The same as an engine that takes the other step where the right one is declared."""
@@ -314,7 +328,9 @@ def test_every_other_step_of_a_tree_is_reported(name):
 @pytest.mark.parametrize(
     "field", ["rest", "stiffness", "damping", "spring_length", "spring_damping", "point"]
 )
-@pytest.mark.parametrize("engine", ["mujoco", "pinocchio", "exudyn-tree"])
+@pytest.mark.parametrize(
+    "engine", ["mujoco", *(pytest.param(x, marks=SLOW) for x in ("pinocchio", "exudyn-tree"))]
+)
 def test_a_wrong_number_of_a_tree_is_reported_by_its_steps(engine, field):
     model, states = branches()
     integrator = methods(engine)[-1]
@@ -407,6 +423,7 @@ def loop_defects():
     yield step_defect("verlet-for-rk4", "", "pinocchio", "rkmk4", velocity_verlet)
 
 
+@pytest.mark.usefixtures("shared_steps")
 @pytest.mark.parametrize("defect", some_fast(list(loop_defects()), 5))
 def test_every_other_integrator_of_a_loop_is_reported(defect):
     rows = defect_report(defect, "four-bar")

@@ -31,11 +31,19 @@ from plumbline.model.sampling import random_states
 from plumbline.scenario.loader import find_scenario_file, load_scenario
 from plumbline.truth.rounding_bound import state_rounding_bound
 from tests.helpers.random_chains import random_chain
+from tests.helpers.shared_answers import sharing
 
 Q = np.array([0.5, -0.5, 0.5, 0.5])
 TREE = load_scenario(find_scenario_file("tree-of-seven"))
 BY_TENDONS = "by tendon equalities"
 LOOP_ENGINES = ["reference", "mujoco", "pinocchio", "pinocchio-maximal", "exudyn"]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def shared_bounds():
+    """Engines with and without a defect are judged by the same bounds."""
+    with sharing("plumbline.measurements.state_relations", "rounding_bounds"):
+        yield
 
 
 def ratios(engine, model, states):

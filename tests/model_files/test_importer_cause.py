@@ -13,6 +13,7 @@ from plumbline.model_files.model_comparison import model_states
 from plumbline.model_files.model_rows import Answer, state_seed
 from plumbline.model_files.prepared_file import prepare_file
 from tests.helpers.importer_columns import MUJOCO, judge_file
+from tests.helpers.nightly_tests import some_fast
 from tests.helpers.planted_files import MJCF_DEFECTS, URDF_DEFECTS
 from tests.helpers.random_robots import random_mjcf, random_urdf
 
@@ -63,7 +64,7 @@ def is_named(result, expected):
     return found == {tuple(expected)}
 
 
-@pytest.mark.parametrize("name", [*URDF_DEFECTS, *MJCF_DEFECTS])
+@pytest.mark.parametrize("name", some_fast([*URDF_DEFECTS, *MJCF_DEFECTS], 3))
 def test_a_planted_defect_is_reported_and_named(tmp_path, name):
     result, expected = planted(tmp_path, name, 0)
     assert any(row.verdict == Verdict.DISAGREES for row in result.rows), name

@@ -234,10 +234,8 @@ def test_a_cell_that_no_step_is_short_enough_for_ends_soon_and_alone(tmp_path):
     text = f"{head}{vary}\nduration: 0.25\nengines: {{mujoco: RK4}}\n"
     spec, cells = sweep_file.load(write_sweep_file(tmp_path, text))
     done = []
-    begin = time.monotonic()
     with limited_time(20):
         rows = run_sweep(spec, cells, progress=lambda *counts: done.append(counts)).to_pylist()
-    assert time.monotonic() - begin < 120, "of it most is the machine's other work"
     found = {(row["cell"], row["implementation"]): row for row in rows}
     assert [found[0, name]["verdict"] for name in ("reference", "mujoco")] == ["agrees", "agrees"]
     assert found[1, "reference"]["verdict"] == "failed"

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from plumbline.model.datatypes import EngineFailure
-from plumbline.scenario.loader import catalogue, find_scenario_file, load_scenario
+from plumbline.scenario.loader import find_scenario_file, load_scenario
 from plumbline.truth import TruthUnavailable, certificate_proof, import_truth_tool
 from plumbline.truth.certificate_file import Certificate, parse_certificate
 from plumbline.truth.certificate_proof import (
@@ -25,6 +25,8 @@ from plumbline.truth.certificate_proof import (
 from plumbline.truth.certified_state import certify_state
 from plumbline.truth.taylor import simulate_taylor
 from plumbline.truth.trajectory_truth import trajectory_truth
+from tests.helpers.catalogue import catalogue_scenarios
+from tests.helpers.nightly_tests import SLOW
 from tests.helpers.random_chains import random_chain
 from tests.helpers.stored_certificates import FOLDER as STORED
 from tests.helpers.stored_certificates import stored_mechanism
@@ -42,11 +44,7 @@ NAMES = ("r", "p", "v", "omega")
 NARROW = {"r": 100, "p": 10, "v": 100, "omega": 10}  # radius over error; as measured 43, 6, 49, 4
 # every joint but rod and ball, with elements, and a spring between points
 TREES = ("sprung-cylinder", "sprung-universal", "spring-pendulum", "balls-with-elements")
-PROVABLE = [
-    s
-    for s in (load_scenario(path) for path in catalogue().values())
-    if s.model.n <= 8 and not reason_not_provable(s.model)
-]
+PROVABLE = [s for s in catalogue_scenarios().values() if s.model.n <= 8 and not reason_not_provable(s.model)]
 OVERLAPPING = ("free-body-with-rotors", "chain-3-balls", "chain-3-rods")  # besides one and two bodies
 MEANT = [s for s in PROVABLE if not s.model.is_chain or s.name == "double-ball-then-rod"]
 PUBLISHED = json.loads((Path(__file__).parents[2] / "docs" / "reference-solutions.json").read_text("utf-8"))
@@ -362,7 +360,7 @@ def true_enclosure(document, proof):
 
 @pytest.mark.parametrize("name", [*CHAINS, *TREES])
 @pytest.mark.parametrize("bits, expected", [(20, "wider"), (109, "reject")])
-@pytest.mark.parametrize("power", [0, 1, 5])
+@pytest.mark.parametrize("power", [0, pytest.param(1, marks=SLOW), 5])
 def test_a_wrong_coefficient_is_rejected_or_covered(proofs, name, bits, expected, power):
     """Also one that opens a gap between steps."""
     document = json.loads(json.dumps(proofs[name][2]))

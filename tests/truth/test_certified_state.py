@@ -1,7 +1,6 @@
 """The certified truth: enclosures that hold, and two formulations that share nothing with it."""
 
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -130,14 +129,6 @@ def test_a_rod_at_rest_hangs_by_its_weight():
     weight = model.mass * 9.81
     assert np.all(answer.quantities.acceleration == 0)
     assert answer.quantities.joint_reaction[0] == pytest.approx([0, 0, weight[0]], rel=1e-15)
-
-
-def test_fifty_bodies_take_a_fraction_of_a_second():
-    for rods in ([0] * 50, [1] * 50):
-        model, state = random_chain(np.random.default_rng(0), rods)
-        start = time.perf_counter()
-        certify_state(model, state)
-        assert time.perf_counter() - start < 2.0
 
 
 def test_a_singular_system_is_not_certified():

@@ -19,11 +19,14 @@ from plumbline.truth.reference_motions import simulate_notes_form
 from plumbline.truth.taylor import load_heyoka, simulate_taylor
 from plumbline.truth.trajectory_truth import MAX_EXTENDED_PRECISION_BODIES, NOTES_RTOL, trajectory_truth
 from tests.helpers.catalogue import catalogue_scenarios
+from tests.helpers.nightly_tests import fast_are
 from tests.helpers.random_chains import random_chain
 
 TIMES = np.arange(41) * 0.05
 CATALOGUE = [s for s in catalogue_scenarios().values() if s.model.is_chain]
 BALL_JOINT_SCENARIOS = [s for s in CATALOGUE if not s.model.rods.any()]
+FAST_BALLS = ("loaded-ball", "double-mass-ratio-1000", "chain-3-balls")  # loads, masses far apart, several
+FAST_CLOSED_FORMS = ("planar-170", "lagrange-top", "spherical", "double-conical")  # one of each kind
 CLOSED_FORM_SCENARIOS = [s for s in CATALOGUE if (closed := closed_form_motion(s)) and closed.amplitude == 0]
 
 
@@ -96,7 +99,7 @@ def check_uncertainty_on_balls(scenario):
 
 
 @pytest.mark.parametrize(
-    "scenario", [s for s in BALL_JOINT_SCENARIOS if s.model.n < 10], ids=lambda s: s.name
+    "scenario", fast_are(FAST_BALLS, [s for s in BALL_JOINT_SCENARIOS if s.model.n < 10])
 )
 def test_the_uncertainty_is_below_a_picometre_on_balls(scenario):
     check_uncertainty_on_balls(scenario)
@@ -110,7 +113,7 @@ def test_the_uncertainty_is_below_a_picometre_on_long_chains_of_balls(scenario):
     check_uncertainty_on_balls(scenario)
 
 
-@pytest.mark.parametrize("scenario", CLOSED_FORM_SCENARIOS, ids=lambda s: s.name)
+@pytest.mark.parametrize("scenario", fast_are(FAST_CLOSED_FORMS, CLOSED_FORM_SCENARIOS))
 def test_the_truth_agrees_with_the_closed_forms(scenario):
     r, p = closed_form_motion(scenario)(TIMES)
     truth = trajectory_truth(scenario.model, scenario.state, TIMES, (r, p, "a book"))
