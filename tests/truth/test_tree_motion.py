@@ -9,7 +9,7 @@ import pytest
 from plumbline.model.datatypes import KINDS, Model
 from plumbline.model.invariants import attitude_error, compute_invariants, position_error
 from plumbline.model.kinematics import ball_spring_rest, complete_state, quaternion_rate, state_from_minimal
-from plumbline.model.random_mechanisms import random_tree
+from plumbline.model.random_mechanisms import ELEMENTS, random_tree
 from plumbline.model.sampling import random_states
 from plumbline.scenario.loader import find_scenario_file, load_scenario
 from plumbline.truth import ground_truth
@@ -21,6 +21,7 @@ from plumbline.truth.reference_motions import simulate_notes_form
 from plumbline.truth.taylor import simulate_taylor
 from plumbline.truth.trajectory_truth import NOTES_RTOL, trajectory_truth
 from reference_impl.joints import constraint_rows
+from tests.helpers.nightly_tests import SLOW
 
 TIMES = np.arange(9) * 0.125
 UNIT = np.array([1.0, 0.0, 0.0, 0.0])
@@ -35,7 +36,10 @@ def taylor(model, state, times=TIMES, precision="extended"):
     return np.asarray(run.r, float), np.asarray(run.p, float), run
 
 
-@pytest.mark.parametrize("kind", KINDS)
+FAST_KINDS = ("rod", "universal", "cylindrical", "free")  # compiled in a second each; engines run the others
+
+
+@pytest.mark.parametrize("kind", [pytest.param(x, marks=[] if x in FAST_KINDS else SLOW) for x in KINDS])
 def test_both_methods_agree_on_every_kind_of_joint(kind):
     model = random_tree(np.random.default_rng(5), 3, (kind, "hinge", "ball"))
     (state,) = random_states(model, 1, 2)
@@ -62,8 +66,14 @@ def test_both_methods_agree_on_mixed_trees():
         assert np.max(truth.uncertainty["position"]) < steps * np.finfo(float).eps * growth
 
 
-@pytest.mark.parametrize("element", ["armature", "damping", "stiffness", "effort", "springs"])
-@pytest.mark.parametrize("kinds", [("hinge", "cylindrical", "rod"), ("universal", "slide", "weld")], ids=str)
+@pytest.mark.parametrize(
+    ("kinds", "element"),
+    [
+        pytest.param(kinds, element, marks=SLOW if (i + k) % 2 else [])  # every element on one of the two
+        for i, kinds in enumerate([("hinge", "cylindrical", "rod"), ("universal", "slide", "weld")])
+        for k, element in enumerate(ELEMENTS)
+    ],
+)
 def test_both_methods_agree_on_every_element(kinds, element):
     model = random_tree(np.random.default_rng(3), 3, kinds, elements=(element,))
     (state,) = random_states(model, 1, 2)
