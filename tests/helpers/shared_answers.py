@@ -1,14 +1,20 @@
-"""Functions whose answers several tests share, where it is not their computing that is tested."""
+"""Answers and folders that several tests share, where it is not their making that is tested."""
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
+import os
 import pickle
+import shutil
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 from unittest.mock import patch
+
+import pytest
 
 
 def by_content(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -34,3 +40,17 @@ def sharing(module: str, *names: str) -> Iterator[None]:
         for name in names:
             stack.enter_context(patch(f"{module}.{name}", by_content(getattr(import_module(module), name))))
         yield
+
+
+def folder_made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], Any]) -> Path:
+    """A copy of a folder that the processes of pytest-xdist make once."""
+    base = factory.getbasetemp()
+    base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    folder, unfinished = base / name, base / f"{name}.unfinished"
+    with (base / f"{name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # until the file is closed
+        if not folder.exists():
+            shutil.rmtree(unfinished, ignore_errors=True)
+            make(unfinished)
+            unfinished.rename(folder)
+    return shutil.copytree(folder, factory.mktemp("shared") / name)

@@ -11,6 +11,7 @@ import pytest
 from reports import html_report, screenshot
 from reports.stored_results import Results
 from tests.helpers import example_results
+from tests.helpers.shared_answers import folder_made_once
 
 AXE = Path(html_report.__file__).parent / "node_modules" / "axe-core" / "axe.min.js"
 
@@ -18,7 +19,7 @@ AXE = Path(html_report.__file__).parent / "node_modules" / "axe-core" / "axe.min
 @pytest.fixture(scope="session")
 def example_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Output folder of a run with every verdict and hostile texts; copy it before changing it."""
-    return example_results.build(tmp_path_factory.mktemp("report") / "a run with spaces & more")
+    return folder_made_once(tmp_path_factory, "a run with spaces & more", example_results.build)
 
 
 @pytest.fixture(scope="session")
