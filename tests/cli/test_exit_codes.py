@@ -268,7 +268,8 @@ with contextlib.suppress(BaseException):
 @pytest.mark.parametrize(
     "statement",
     ["exec('raise KeyboardInterrupt')", "import swallow_SIGINT", "import swallow_SIGTERM"],
-)  # fmt: skip
+    ids=["raised", "SIGINT", "SIGTERM"],
+)
 def test_an_interruption_inside_an_import_has_the_exit_code_too(tmp_path, statement):
     """As of a dataclass that is being made, or of a compiled module that swallows exceptions."""
     for name in ("SIGINT", "SIGTERM"):
