@@ -87,7 +87,7 @@ def _parse_state(_: click.Context, __: click.Parameter, text: str | None) -> dic
     + EXIT_CODES
 )
 @click.argument("files", nargs=-1, required=True, metavar="FILE...")
-@options.base_option(is_passed=True)
+@options.model_file_options(are_passed=True)
 @click.option(
     "--engine",
     "engines",
@@ -116,12 +116,6 @@ def _parse_state(_: click.Context, __: click.Parameter, text: str | None) -> dic
     is_flag=True,
     help="Load a copy without visual and collision geometry, so that missing meshes do not matter. In MJCF "
     "only bodies with <inertial> are stripped: elsewhere geometry defines the mass.",
-)
-@click.option(
-    "--root",
-    type=click.Path(path_type=Path, exists=True, file_okay=False),
-    help="Folder outside of which no file is read, and to which package:// refers. Default: the nearest "
-    "folder above the file that has a package.xml, else the file's own.",
 )
 @options.known_option
 @options.jobs_option
@@ -152,7 +146,7 @@ def model(
     importer that refuses the file has answered; the exit code is then 1 only if --engine named it.
     """
     if scenario_file is not None:
-        return _write_scenario(files, base, scenario_file)
+        return _write_scenario(files, base, root, scenario_file)
     plan = ModelPlan(
         files, engines, options.are_engines_named(), base, root, strip_geometry, state_count,
         state, jobs, Limits(timeout, memory),
@@ -175,12 +169,12 @@ def model(
     sys.exit(result.exit_code)
 
 
-def _write_scenario(files: Sequence[str], base: Any, to: Path) -> None:
+def _write_scenario(files: Sequence[str], base: Any, root: Path | None, to: Path) -> None:
     """Write a model file as a scenario file, and what the mechanism leaves out."""
     if len(files) != 1:
         raise click.UsageError("--to-scenario takes one model file")
     try:
-        scenario, document = load_model_file(Path(files[0]), base)
+        scenario, document = load_model_file(Path(files[0]), base, root)
     except ScenarioError as error:
         options.exit_on_bad_file(error)
     with options.exit_on_io_error():

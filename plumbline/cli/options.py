@@ -33,11 +33,9 @@ from plumbline.truth.closed_form import ClosedFormMismatch, closed_form_motion
 if TYPE_CHECKING:
     from plumbline.execution.result_cache import DiskResultCache
 
-_ADAPTERS, _TRUST, _BASE = (
-    "plumbline.adapters",
-    "plumbline.trust",
-    "plumbline.base",
-)  # what the context of a command remembers
+# what the context of a command remembers
+_ADAPTERS, _TRUST = "plumbline.adapters", "plumbline.trust"
+_BASE, _ROOT = "plumbline.base", "plumbline.root"
 LOCK_FILE = ".lock"  # of an output folder, held by the command that writes to it
 MIN_TIMEOUT, MAX_TIMEOUT = 1.0, 1e7  # s; starting an engine takes longer than less
 MIN_MEMORY, MAX_MEMORY = 1.0, 1e6  # GB of address space; a worker with an engine does not start with less
@@ -168,9 +166,9 @@ def _note_trust(context: click.Context, _: click.Parameter, is_trusting: bool) -
     context.meta[_TRUST] = is_trusting
 
 
-def _note_base(context: click.Context, _: click.Parameter, base: str) -> str:
-    context.meta[_BASE] = base
-    return base
+def _note_value(context: click.Context, option: click.Parameter, value: Any) -> Any:
+    context.meta[f"plumbline.{option.name}"] = value
+    return value
 
 
 def _add_found_engine(name: str, *, is_trusting: bool) -> None:
@@ -234,25 +232,34 @@ def engines_option(command: Callable[..., Any]) -> Callable[..., Any]:
     return _trust_option(_adapter_option(_engine_option(command)))
 
 
-def base_option(*, is_passed: bool) -> _Decorator:
-    """Make the option ``--base``, which model files are read with.
+def model_file_options(*, are_passed: bool) -> _Decorator:
+    """Make the options ``--base`` and ``--root``, with which model files are read.
 
     Args:
-        is_passed: whether the command gets ``base``.
+        are_passed: whether the command gets ``base`` and ``root``.
 
     Returns:
         The decorator of a command.
 
     """
-    return click.option(
+    base = click.option(
         "--base",
         type=click.Choice(["auto", "fixed", "free"]),
         default="auto",
-        expose_value=is_passed,
-        callback=_note_base,
+        expose_value=are_passed,
+        callback=_note_value,
         help="Of a URDF: whether its root link is fixed to the world or moves freely. The format does not "
         "say; auto is fixed. An MJCF file says it itself.",
     )
+    root = click.option(
+        "--root",
+        type=click.Path(path_type=Path, exists=True, file_okay=False),
+        expose_value=are_passed,
+        callback=_note_value,
+        help="Folder outside of which no file is read for a model file, and to which package:// refers. "
+        "Default: the nearest folder above the file that has a package.xml, else the file's own.",
+    )
+    return lambda command: base(root(command))
 
 
 jobs_option = click.option(
@@ -311,7 +318,8 @@ def _load_scenario(path: Path) -> scenarios.Scenario:
     if path.suffix in scenarios.MODEL_FILE_SUFFIXES:
         from plumbline.model_files.mechanism_of_file import load_model_file  # few commands need it
 
-        return load_model_file(path, click.get_current_context().meta.get(_BASE, "auto"))[0]
+        meta = click.get_current_context().meta
+        return load_model_file(path, meta.get(_BASE, "auto"), meta.get(_ROOT))[0]
     scenario = scenarios.load_scenario(path)
     try:
         closed_form_motion(scenario)

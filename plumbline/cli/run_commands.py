@@ -46,7 +46,7 @@ new_only_option = click.option(
     + EXIT_CODES,
 )
 @options.names_argument
-@options.base_option(is_passed=False)
+@options.model_file_options(are_passed=False)
 @click.option("--family", "families", multiple=True, help="Only scenarios of this family (may be repeated).")
 @options.engines_option
 @click.option(

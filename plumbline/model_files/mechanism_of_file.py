@@ -47,11 +47,14 @@ MAX_LISTED = 700  # characters of what is left out, in the scenario's purpose
 CONTACTS = "contacts, limits of motion, friction and actuators"
 
 
-def load_model_file(path: Path, base: BaseChoice = "auto") -> tuple[Scenario, dict[str, Any]]:
+def load_model_file(
+    path: Path, base: BaseChoice = "auto", root: Path | None = None
+) -> tuple[Scenario, dict[str, Any]]:
     """Read a URDF or MJCF file as a scenario.
 
     Args:
         base: of a URDF, whether the root link is fixed; "auto" is fixed.
+        root: folder outside of which no file is read; None as for `prepare_file`.
 
     Returns:
         The scenario, and the content of a scenario file that describes it.
@@ -61,7 +64,7 @@ def load_model_file(path: Path, base: BaseChoice = "auto") -> tuple[Scenario, di
 
     """
     shown = str(path)
-    document = mechanism_of_model(read_neutral_model(shown, base), shown)
+    document = mechanism_of_model(read_neutral_model(shown, base, root), shown)
     source = YamlSource(shown, document, value_positions=defaultdict(lambda: (1, 1)))
     scenario = build_scenario(source, path)
     if (rate := fastest_decay(scenario.model, scenario.state)) > MAX_RATE:
@@ -86,19 +89,20 @@ def fastest_decay(model: Model, state: State) -> float:
     return float(np.max(np.abs(np.linalg.eigvals(decays)), initial=0.0))
 
 
-def read_neutral_model(shown: str, base: BaseChoice = "auto") -> NeutralModel:
+def read_neutral_model(shown: str, base: BaseChoice = "auto", root: Path | None = None) -> NeutralModel:
     """Read what a model file says, without geometry that is not needed for it.
 
     Args:
         shown: the file, as the user typed it.
         base: of a URDF, whether the root link is fixed.
+        root: folder outside of which no file is read.
 
     Raises:
         ModelFileError: the file cannot be used.
 
     """
     with ScratchFolder("plumbline-model-") as scratch:
-        prepared = prepare_file(shown, scratch, base=base, strip=True)
+        prepared = prepare_file(shown, scratch, root, base, strip=True)
         reading, failure = _mujoco_reading(prepared) if prepared.file.format == "mjcf" else (None, "")
         return prepared.neutral_model(reading, failure)
 
@@ -156,7 +160,8 @@ def mechanism_of_model(model: NeutralModel, shown: str) -> dict[str, Any]:
         if body.mass < MIN_INERTIA
     ]  # fmt: skip
     if not lumped.bodies:
-        hint = "--base free lets the root link of a URDF move"
+        is_urdf = Path(shown).suffix == ".urdf"
+        hint = "--base free lets the root link of a URDF move" if is_urdf else ""
         problems.append(Problem(shown, 1, 1, "", "nothing in it moves", "at least one joint", hint))
     if problems:
         raise ModelFileError(problems)
@@ -222,6 +227,10 @@ class _Writer:
 
     def _physical(self, body: NeutralBody) -> Array:
         """The inertia; where no distribution of mass has it, the second moments that are negative are 0."""
+        if 0 < np.max(np.abs(body.inertia)) < MIN_INERTIA:  # engines divide by it
+            what = f"inertia below {MIN_INERTIA:g} kg m², taken as 0"
+            self.left_out.append(Feature(what, body.name, body.fields.get("inertia", body.source)))
+            return np.zeros((3, 3))
         values, axes = np.linalg.eigh(np.trace(body.inertia) / 2 * np.eye(3) - body.inertia)
         if values[0] >= -FRAME_ROUNDING * abs(values[2]):
             return body.inertia

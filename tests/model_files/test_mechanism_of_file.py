@@ -236,6 +236,21 @@ def test_a_robot_whose_dampers_no_step_follows_is_compared_at_states(robot):
     assert fastest_decay(scenario.model, scenario.state) == pytest.approx(expected, rel=1e-6)
 
 
+def test_included_files_of_another_folder_need_the_root_that_holds_both(tmp_path):
+    (tmp_path / "main").mkdir(), (tmp_path / "parts").mkdir()
+    main, part = tmp_path / "main" / "m.xml", tmp_path / "parts" / "p.xml"
+    main.write_text('<mujoco><worldbody><include file="../parts/p.xml"/></worldbody></mujoco>')
+    body = '<body><joint/><inertial pos="0 0 1" mass="1" diaginertia="1 1 1"/></body>'
+    part.write_text(f"<mujocoinclude>{body}</mujocoinclude>")
+    refused = plumbline("model", main, "--to-scenario", tmp_path / "m.yaml")
+    assert refused.exit_code == 2 and "is outside" in refused.output and "--root" in refused.output
+    assert plumbline("model", main, "--to-scenario", tmp_path / "m.yaml", "--root", tmp_path).exit_code == 0
+    run = "run", main, "--level", "state", "--engine", "mujoco", "--jobs", 1, "--out", tmp_path / "out"
+    assert plumbline(*run).exit_code == 2
+    found = plumbline(*run, "--root", tmp_path)
+    assert found.exit_code == 0 and "8 agree" in found.output, found.output
+
+
 def test_a_bad_robot_is_bad_usage(tmp_path):
     for name, text, words in (
         ("lost.urdf", None, "no such file"),
