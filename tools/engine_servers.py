@@ -46,8 +46,8 @@ class Server:
 
     @property
     def adapter(self) -> str:
-        """The engine as `--adapter` takes it."""
-        return f"{self.name}=cmd:" + shlex.join(map(str, self.command))
+        """The engine as `--adapter` takes it; its column is called after the server's file."""
+        return "cmd:" + shlex.join(map(str, self.command))
 
 
 def _needs(program: str, why: str) -> Callable[[], str]:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from plumbline.engines.registry import ENGINES, IMPORTERS
 from plumbline.execution.comparison import compare
 from plumbline.judging.rows import Verdict
 from tools.engine_servers import ENGINE_SERVERS
@@ -39,6 +40,12 @@ def test_a_night_gets_the_servers_that_are_built():
     words = options.stdout.splitlines()
     assert [w for w in words if w in {s.adapter for s in built}] == [s.adapter for s in built]
     assert ("--engine" in words) == bool(built)
+
+
+def test_no_column_has_the_name_of_another_engine_or_importer():
+    columns = {Path(str(server.command[-1])).stem for server in ENGINE_SERVERS}
+    assert columns == {f"{server.name}_server" for server in ENGINE_SERVERS}
+    assert not columns & {*ENGINES, *IMPORTERS}
 
 
 @pytest.mark.parametrize("server", ENGINE_SERVERS, ids=lambda server: server.name)
