@@ -54,9 +54,8 @@ def _check_version(_: click.Context, parameter: click.Parameter, text: str | Non
 @click.option("--engine", callback=_check_engine, help="Of a model file: whose importer.")
 @click.option("--good", callback=_check_version, help="One end of the search. Default: the oldest version.")
 @click.option("--bad", callback=_check_version, help="The other end. Default: the newest version.")
-@click.option("--base", type=click.Choice(["auto", "fixed", "free"]), default="auto", help="As for `model`.")
+@options.model_file_options(are_passed=True)
 @click.option("--strip-geometry", is_flag=True, help="As for `model`.")
-@click.option("--root", type=click.Path(path_type=Path, exists=True, file_okay=False), help="As for `model`.")
 @options.jobs_option
 @options.timeout_option(300.0)
 @options.memory_option

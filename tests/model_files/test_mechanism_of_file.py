@@ -236,6 +236,22 @@ def test_a_robot_whose_dampers_no_step_follows_is_compared_at_states(robot):
     assert fastest_decay(scenario.model, scenario.state) == pytest.approx(expected, rel=1e-6)
 
 
+CLOSED = """<mujoco><worldbody>
+<body name="crank"><joint axis="0 1 0"/><inertial pos="0 0 -1" mass="1" diaginertia="1 1 1"/>
+<body name="rod" pos="0 0 -2"><joint axis="0 1 0"/><inertial pos="0 0 -1" mass="1" diaginertia="1 1 1"/>
+</body></body></worldbody><equality><connect name="loop" body1="rod" anchor="0 0 -2"/></equality></mujoco>"""
+
+
+def test_an_equality_is_listed_and_sixty_bodies_are_a_mechanism(tmp_path):
+    closed, long = tmp_path / "closed.xml", tmp_path / "long.urdf"
+    closed.write_text(CLOSED)
+    scenario, _ = load_model_file(closed)
+    assert scenario.model.kind == ("hinge", "hinge")
+    assert "1 × equality (loop, line 4)" in scenario.purpose
+    long.write_text(random_urdf(np.random.default_rng(3), 60))
+    assert load_model_file(long)[0].model.n == 60
+
+
 def test_included_files_of_another_folder_need_the_root_that_holds_both(tmp_path):
     (tmp_path / "main").mkdir(), (tmp_path / "parts").mkdir()
     main, part = tmp_path / "main" / "m.xml", tmp_path / "parts" / "p.xml"
