@@ -270,12 +270,12 @@ def test_cells_that_were_not_used_for_longest_are_removed_first(tmp_path):
     assert sorted(tmp_path.glob("*.cell")) == paths[:2]
 
 
-def test_a_judge_that_changes_has_another_cell():
+def test_a_judge_that_changes_has_another_cell(tmp_path):
     judged = Task("a", quiet, (), judge=quiet, judge_arguments=(1,))
     others = [
         replace(judged, judge_arguments=(2,)),
         replace(judged, judge=run_in_process),
-        replace(judged, python="/another/python"),
+        replace(judged, python=str(tmp_path / "bin" / "python")),
         replace(judged, needs_answer=quiet),
     ]
     assert len({task_hash(judged), *map(task_hash, others)}) == 5
