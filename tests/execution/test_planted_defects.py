@@ -64,7 +64,7 @@ def test_each_defect_has_its_own_name():
     assert len({d.name for d in (*DEFECTS, *CONTROLS)}) == len(DEFECTS) + len(CONTROLS)
 
 
-@pytest.mark.parametrize("defect", some_fast(STATE_DEFECTS, 3))
+@pytest.mark.parametrize("defect", **ids(STATE_DEFECTS))
 def test_every_state_defect_is_reported(defect):
     assert evaluated(defect)[1], f"nothing reports {defect.description}"
 

@@ -29,7 +29,7 @@ for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
 
 
 @pytest.mark.parametrize(
-    "defect", [*some_fast(ELEMENT_DEFECTS, 3), *some_fast(JOINT_DEFECTS, 6), *some_fast(LOOP_DEFECTS, 6)]
+    "defect", [*some_fast(ELEMENT_DEFECTS, 1), *some_fast(JOINT_DEFECTS, 6), *some_fast(LOOP_DEFECTS, 6)]
 )
 def test_every_defect_is_reported(defect):
     assert evaluated(defect)[1], f"nothing reports {defect.name}"
