@@ -64,7 +64,7 @@ def recorded_line(finding: Finding, width: int) -> str:
     """Describe a recorded finding in one line."""
     shown = shown_verdict(finding.verdict, finding.known_issue)
     size = "" if finding.largest_ratio is None else f", up to {finding.largest_ratio:.2g} tolerances"
-    text = f"{finding.name} ({finding.engine}): {coverage(finding)}{size}"
+    text = f"{finding.name}: {len(finding.rows)} rows of {len(finding.scenarios)} scenarios{size}"
     return f"[dim]{SHOWN_STYLES[shown].glyph} {escape(shorten(text, width - 2))}[/]"
 
 

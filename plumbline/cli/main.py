@@ -39,6 +39,7 @@ COMMANDS = {  # where each is, and its line in the list; imported when it is typ
     "run": ("run_commands:run", "Compare scenarios on engines."),
     "model": ("model_commands:model", "Compare what importers make of a URDF or MJCF file."),
     "nightly": ("run_commands:nightly", "Run everything unattended and keep the history."),
+    "fuzz": ("fuzz_command:fuzz", "Search for new findings with random mechanisms."),
     "sweep": ("study_commands:sweep", "Vary a scenario's parameters."),
     "drift": ("study_commands:drift", "Measure constraint and energy drift over long times."),
     "coverage": ("study_commands:coverage", "Compute the smallest mistakes that a run would report."),

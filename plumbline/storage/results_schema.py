@@ -240,7 +240,7 @@ class _Results(_Part):
     run: _Run
     scenarios: dict[str, _Scenario]
     engines: dict[str, _Engine]
-    findings: list[_Finding]
+    findings: list[_Finding] = []
     rows: list[_Row]
 
     @model_validator(mode="after")
@@ -275,6 +275,7 @@ def check_results(path: Path, document: Any) -> None:
         if len(details) > MAX_LISTED_PROBLEMS:
             lines.append(f"… and {len(details) - MAX_LISTED_PROBLEMS} more problems")
         raise DamagedResults("\n".join(lines)) from None
+    document.setdefault("findings", [])
     parts: list[tuple[type[_Part], dict[str, Any]]] = [(_Run, document["run"])]
     parts += [(_Scenario, about) for about in document["scenarios"].values()]
     parts += [(_Engine, about) for about in document["engines"].values()]

@@ -1,0 +1,232 @@
+"""Search for new findings: random mechanisms on engines until the time is over or enough is found.
+
+Scenario k of a seed is the same whatever the number of jobs.  What is found is grouped at once, so that one
+cause is one finding; a scenario of each new finding is made smaller as long as the finding shows, and stored
+as a scenario file.  A corpus keeps the mechanisms that have a pair of features not seen before.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+from plumbline.engines.adapter import EngineInfo
+from plumbline.execution.plan import Plan
+from plumbline.execution.runner import run_plan
+from plumbline.judging.findings import Finding, find_findings
+from plumbline.judging.rows import Row
+from plumbline.model.features import features
+from plumbline.processes.exceptions import PlumblineError
+from plumbline.scenario.generator import random_mechanism, random_scenario
+from plumbline.scenario.loader import Scenario, scenario_from_dict
+from plumbline.storage.results_store import write_atomically
+
+BATCH = 8  # scenarios compared together, whatever the number of jobs
+MAX_SHRINKINGS = 60  # smaller scenarios that are tried of one finding
+MAX_STORED = 50  # findings with a scenario file
+REMOVABLE = ("load", "drag")  # fields of bodies
+ELEMENTS = ("armature", "damping", "stiffness", "rest", "effort")  # fields of joints
+
+Document = dict[str, Any]
+
+
+@dataclass
+class FuzzResult:
+    """What a search found so far."""
+
+    seed: int
+    scenario_count: int = 0
+    rows: list[Row] = field(default_factory=list)
+    bodies: dict[str, int] = field(default_factory=dict)  # by scenario
+    engines: dict[str, EngineInfo] = field(default_factory=dict)
+    smallest: dict[str, Scenario] = field(default_factory=dict)  # by finding, made smaller
+    kept: int = 0  # mechanisms added to the corpus
+
+    @property
+    def findings(self) -> list[Finding]:
+        """All findings, those that nothing expects first."""
+        return find_findings(self.rows, self.bodies)
+
+    @property
+    def new(self) -> list[Finding]:
+        """Those that nothing expects."""
+        return [finding for finding in self.findings if finding.needs_attention]
+
+
+def scenario_of(seed: int, index: int) -> Scenario:
+    """Return scenario k of a seed: chains of rods and balls and mechanisms of any joints take turns."""
+    make = random_mechanism if index % 2 else random_scenario
+    return make(seed, index // 2)
+
+
+def search(
+    plan: Plan,
+    result: FuzzResult,
+    *,
+    seconds: float,
+    max_findings: int,
+    corpus: Corpus,
+    log: Callable[[str], None],
+) -> None:
+    """Compare scenarios until the time is over or enough is found; an interruption leaves what was found.
+
+    Args:
+        plan: engines, level, limits and known issues; its scenarios are not used.
+        result: is added to.
+        log: called with a sentence about each new finding.
+
+    """
+    end = time.monotonic() + seconds
+    for index in corpus.first_indices(result.seed):
+        if time.monotonic() > end or len(result.new) >= max_findings:
+            return
+        batch = [scenario_of(result.seed, k) for k in range(index, index + BATCH)]
+        known = {finding.name for finding in result.new}
+        _compare(plan, batch, result)
+        result.scenario_count += len(batch)
+        result.kept += sum(map(corpus.add, batch))
+        for finding in result.new:
+            if finding.name not in known and len(result.smallest) < MAX_STORED:
+                log(f"new: {finding.name} ({finding.scenarios[0]})")
+                start = next(s for s in batch if s.name in finding.scenarios)
+                result.smallest[finding.name] = shrink(plan, start, finding, end)
+
+
+def _compare(plan: Plan, scenarios: Sequence[Scenario], result: FuzzResult) -> None:
+    found = run_plan(replace(plan, scenarios=[], random_scenarios=scenarios), lambda *_: None)
+    result.engines = found.engines
+    result.rows += [row for row in found.rows if row.verdict.needs_attention]
+    result.bodies |= {scenario.name: scenario.model.n for scenario in scenarios}
+
+
+def shrink(plan: Plan, scenario: Scenario, finding: Finding, end: float) -> Scenario:
+    """Make a scenario smaller as long as it shows a finding.
+
+    Args:
+        end: monotonic time after which nothing more is tried.
+
+    """
+    engines = list(dict.fromkeys(row.engine for row in finding.rows))[:1]
+    plan, tried = replace(plan, engines=engines), 0
+    is_smaller = True
+    while is_smaller:
+        is_smaller = False
+        for document in _smaller(scenario.document):
+            if tried >= MAX_SHRINKINGS or time.monotonic() > end:
+                return scenario
+            try:
+                candidate = scenario_from_dict(document, f"{scenario.name}.yaml")
+            except PlumblineError:
+                continue  # no mechanism, or loops that do not close
+            tried += 1
+            result = FuzzResult(0)
+            _compare(plan, [candidate], result)
+            if any(one.identity == finding.identity for one in result.findings):
+                scenario, is_smaller = candidate, True
+                break
+    return scenario
+
+
+def _smaller(document: Document) -> Iterator[Document]:
+    """Documents with one thing less: a body without others on it, a closing joint, a spring, a load."""
+    bodies = document["bodies"]
+    named = [one for part in ("closes", "springs") for one in document.get(part) or ()]
+    used = json.dumps([[body.get("parent") for body in bodies], named])
+    for k in reversed(range(len(bodies))):
+        name = bodies[k].get("name")
+        is_last = k == len(bodies) - 1
+        if len(bodies) > 1 and (is_last if name is None else json.dumps(name) not in used):
+            yield _without(document, "bodies", k)
+    for part in ("closes", "springs"):
+        for k in range(len(document.get(part) or ())):
+            yield _without(document, part, k)
+    for k, body in enumerate(bodies):
+        for name in REMOVABLE:
+            if body.get(name):
+                yield _without(document, "bodies", k, name)
+        joint = body.get("joint")
+        for name in ELEMENTS if isinstance(joint, dict) else ():
+            if joint.get(name):
+                yield _without(document, "bodies", k, "joint", name)
+
+
+def _without(document: Document, *path: str | int) -> Document:
+    changed = copy.deepcopy(document)
+    *first, last = path
+    place: Any = changed
+    for key in first:
+        place = place[key]
+    del place[last]
+    return changed
+
+
+class Corpus:
+    """A folder of scenario files with combinations of features that no other has, up to a number."""
+
+    def __init__(self, folder: Path | None, capacity: int) -> None:
+        """Read which combinations the folder has."""
+        self.folder, self.capacity = folder, capacity
+        self._seen: set[tuple[Any, ...]] = set()
+        self._index = folder / "corpus.json" if folder else None
+        stored: Document = {}
+        if self._index and self._index.is_file():
+            stored = json.loads(self._index.read_text(encoding="utf-8"))
+        self._seen.update(tuple(map(tuple, pair)) for pair in stored.get("seen", ()))
+        self._next: dict[str, int] = stored.get("next", {})  # by seed: the first scenario that was not tried
+        self._count = len(list(folder.glob("*.yaml"))) if folder else 0
+
+    def first_indices(self, seed: int) -> Iterator[int]:
+        """List the first index of each batch; a search of the same seed goes on where the last one ended."""
+        index = self._next.get(str(seed), 0)
+        while True:
+            yield index
+            index += BATCH
+            self._next[str(seed)] = index
+            self._save()
+
+    def add(self, scenario: Scenario) -> bool:
+        """Keep a scenario with two features that were not seen together; return whether it is kept."""
+        if self.folder is None:
+            return False
+        own = {tuple(sorted(map(tuple, some))) for some in combinations(set(features(scenario.model)), 2)}
+        if own <= self._seen:
+            return False
+        self._seen |= own
+        if self._count >= self.capacity:
+            return False
+        self._count += 1
+        self.folder.mkdir(parents=True, exist_ok=True)
+        write_scenario(scenario, self.folder / f"{scenario.name}.yaml")
+        return True
+
+    def _save(self) -> None:
+        if self._index:
+            self._index.parent.mkdir(parents=True, exist_ok=True)
+            text = json.dumps({"next": self._next, "seen": sorted(self._seen)})
+            write_atomically(self._index, text.encode())
+
+
+def write_scenario(scenario: Scenario, path: Path) -> None:
+    """Write a scenario file; JSON is YAML."""
+    write_atomically(path, json.dumps(scenario.document, indent=1).encode())
+
+
+def write_findings(result: FuzzResult, folder: Path) -> Iterable[Path]:
+    """Write fuzz.json and a scenario file of each new finding."""
+    folder.mkdir(parents=True, exist_ok=True)
+    document = {
+        "seed": result.seed,
+        "scenarios": result.scenario_count,
+        "findings": [finding.record() for finding in result.findings],
+    }
+    write_atomically(folder / "fuzz.json", json.dumps(document, ensure_ascii=False, indent=1).encode())
+    for name, scenario in result.smallest.items():
+        path = folder / f"{name[:120]}.yaml"
+        write_scenario(scenario, path)
+        yield path

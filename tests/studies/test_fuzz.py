@@ -1,0 +1,72 @@
+"""The search for new findings: what it draws, keeps, makes smaller and finds."""
+
+import json
+
+from click.testing import CliRunner
+
+from plumbline.cli.main import main
+from plumbline.execution.exit_codes import ExitCode
+from plumbline.processes.exceptions import PlumblineError
+from plumbline.scenario.generator import random_mechanism
+from plumbline.scenario.loader import load_scenarios, scenario_from_dict
+from plumbline.studies.fuzz import BATCH, Corpus, _smaller, scenario_of
+
+PLANTED = """
+from dataclasses import replace
+from adapters.mujoco_engine import Mujoco
+
+class Planted(Mujoco):
+    name = "planted"
+
+    def _evaluate(self, model, states):
+        found = super()._evaluate(model, states)
+        if model.damping.any():
+            found = [replace(a, kinetic_energy=1.5 * a.kinetic_energy) for a in found]
+        return found
+"""
+
+
+def test_a_seed_gives_the_same_mechanisms():
+    names = [scenario_of(7, k).name for k in range(4)]
+    assert names == ["random-7-0", "random-mechanism-7-0", "random-7-1", "random-mechanism-7-1"]
+    assert scenario_of(7, 3).document == scenario_of(7, 3).document != scenario_of(8, 3).document
+
+
+def test_what_is_made_smaller_has_one_thing_less_and_most_of_it_is_a_mechanism():
+    document = random_mechanism(5, 3).document
+    size = len(json.dumps(document))
+    smaller = list(_smaller(document))
+    assert len(smaller) > 20 and all(len(json.dumps(one)) < size for one in smaller)
+    legal = 0
+    for one in smaller:
+        try:
+            legal += bool(scenario_from_dict(one, "x.yaml"))
+        except PlumblineError:
+            continue
+    assert legal > len(smaller) / 2
+
+
+def test_a_corpus_keeps_new_combinations_up_to_its_size_and_where_a_search_ended(tmp_path):
+    corpus = Corpus(tmp_path / "corpus", 2)
+    kept = [corpus.add(scenario_of(7, k)) for k in (1, 1, 3, 5)]
+    assert kept == [True, False, True, False]
+    indices = corpus.first_indices(7)
+    assert [next(indices), next(indices)] == [0, BATCH]
+    again = Corpus(tmp_path / "corpus", 9)
+    assert next(again.first_indices(7)) == BATCH and next(again.first_indices(8)) == 0
+    assert not again.add(scenario_of(7, 3))  # its combinations were seen
+    assert len(load_scenarios([str(path) for path in (tmp_path / "corpus").glob("*.yaml")])) == 2
+
+
+def test_a_planted_defect_is_found_named_and_shown_by_the_smallest_mechanism(tmp_path):
+    planted = tmp_path / "planted.py"
+    planted.write_text(PLANTED)
+    words = ["--adapter", f"{planted}:Planted", "--seed", "3", "--findings", "1", "--jobs", "1", "--json"]
+    done = CliRunner().invoke(main, ["fuzz", *words, "--minutes", "20", "--out", str(tmp_path / "out")])
+    assert done.exit_code == ExitCode.DISAGREEMENT, done.output
+    (found,) = json.loads(done.stdout)
+    assert found["name"] == "planted-kinetic-energy-multiplied-by"
+    (smallest,) = (tmp_path / "out").glob("*.yaml")
+    (scenario,) = load_scenarios([str(smallest)])
+    assert scenario.model.n == 1 and scenario.model.damping.any()
+    assert "new: planted-kinetic-energy-multiplied-by" in done.stderr
