@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +18,10 @@ import numpy as np
 
 from plumbline.engines.importer_calls import read_model_file
 from plumbline.importers.importer import Reading
-from plumbline.importers.lumping import lump_fixed_bodies
-from plumbline.importers.neutral_model import ElementaryJoint, Feature, NeutralBody, NeutralModel
-from plumbline.importers.xml_tree import ModelFileError
-from plumbline.model.datatypes import BALL, FREE, KINDS, Array, Kind, Model, State
+from plumbline.importers.lumping import fixed_parts, lump_fixed_bodies
+from plumbline.importers.neutral_model import ElementaryJoint, Feature, NeutralBody, NeutralModel, Source
+from plumbline.importers.xml_tree import ModelFileError, parse_numbers
+from plumbline.model.datatypes import BALL, FREE, KINDS, Array, Float, Kind, Model, State
 from plumbline.model.kinematics import (
     mass_matrix,
     own_rates,
@@ -64,7 +64,7 @@ def load_model_file(
 
     """
     shown = str(path)
-    document = mechanism_of_model(read_neutral_model(shown, base, root), shown)
+    document = mechanism_of_model(*read_neutral_model(shown, base, root), shown)
     source = YamlSource(shown, document, value_positions=defaultdict(lambda: (1, 1)))
     scenario = build_scenario(source, path)
     if (rate := fastest_decay(scenario.model, scenario.state)) > MAX_RATE:
@@ -82,14 +82,26 @@ def fastest_decay(model: Model, state: State) -> float:
 
     """
     dampers = np.zeros(rate_count(model))
-    for k, (kind, own) in enumerate(zip(model.kinds, own_rates(model), strict=True)):
+    for k, (kind, own) in enumerate(zip(model.tree.kinds, own_rates(model), strict=True)):
         if not kind.has_attitude:
             dampers[own] = model.damping[k, : len(kind.motions)]
     decays = np.linalg.solve(mass_matrix(model, state), np.diag(dampers))
     return float(np.max(np.abs(np.linalg.eigvals(decays)), initial=0.0))
 
 
-def read_neutral_model(shown: str, base: BaseChoice = "auto", root: Path | None = None) -> NeutralModel:
+@dataclass(frozen=True, eq=False)
+class Connection:
+    """An equality that holds a point of one body at one of another, as it is at the reference pose."""
+
+    body: str
+    other: str  # "" for the world
+    anchor: Float[Array, "3"]  # m, in the frame of `body`
+    source: Source
+
+
+def read_neutral_model(
+    shown: str, base: BaseChoice = "auto", root: Path | None = None
+) -> tuple[NeutralModel, list[Connection]]:
     """Read what a model file says, without geometry that is not needed for it.
 
     Args:
@@ -103,8 +115,15 @@ def read_neutral_model(shown: str, base: BaseChoice = "auto", root: Path | None 
     """
     with ScratchFolder("plumbline-model-") as scratch:
         prepared = prepare_file(shown, scratch, root, base, strip=True)
+        connections = [
+            Connection(e.attributes["body1"], e.attributes.get("body2", ""), np.array(anchor), e.source)
+            for equality in prepared.tree.find_all("equality")
+            for e in equality.find_all("connect")
+            if "body1" in e.attributes and e.attributes.get("active") != "false"
+            if len(anchor := parse_numbers(e, "anchor", 3, [])) == 3
+        ]
         reading, failure = _mujoco_reading(prepared) if prepared.file.format == "mjcf" else (None, "")
-        return prepared.neutral_model(reading, failure)
+        return prepared.neutral_model(reading, failure), connections
 
 
 def _mujoco_reading(prepared: PreparedFile) -> tuple[Reading | None, str]:
@@ -136,10 +155,11 @@ def feature_words(features: Sequence[Feature], shown: str) -> str:
     )
 
 
-def mechanism_of_model(model: NeutralModel, shown: str) -> dict[str, Any]:
-    """Describe a model as a scenario file does, moving from its reference pose.
+def mechanism_of_model(model: NeutralModel, connections: Sequence[Connection], shown: str) -> dict[str, Any]:
+    """Describe a model as a scenario file does, moving from its reference pose; with loops, from rest there.
 
     Args:
+        connections: become ball joints that close loops.
         shown: the model file, after which the scenario is named.
 
     Returns:
@@ -166,18 +186,52 @@ def mechanism_of_model(model: NeutralModel, shown: str) -> dict[str, Any]:
     if problems:
         raise ModelFileError(problems)
     writer = _Writer(lumped, np.random.default_rng(derive_seed("model file", name)))
-    left_out = feature_words((*model.not_compared, *writer.left_out), shown)
+    closes, closing = _closing_joints(model, connections, writer)
+    not_compared = [f for f in model.not_compared if f.source not in closing]
+    left_out = feature_words((*not_compared, *writer.left_out), shown)
     left_open = feature_words(model.ambiguous, shown)
     purpose = f"Shows whether engines simulate {Path(shown).name} alike. Left out: {left_out or CONTACTS}."
     if left_out:
         purpose = f"{purpose[:-1]}; always {CONTACTS}."
+    purpose += f" {len(closes)} of its equalities are rigid ball joints." if closes else ""
     purpose += f" Left open by the file: {left_open}." if left_open else ""
     return {
         "schema_version": 1, "name": name, "family": "model file",
         "title": shorten(f"{Path(shown).name}: {len(writer.bodies)} bodies", 200),
         "purpose": shorten(purpose, MAX_LISTED), "duration": DURATION, "sample": SAMPLE,
         "gravity": model.gravity.tolist(), "bodies": writer.bodies,
-    }  # fmt: skip
+    } | ({"closes": closes} if closes else {})  # fmt: skip
+
+
+def _closing_joints(
+    model: NeutralModel, connections: Sequence[Connection], writer: _Writer
+) -> tuple[list[dict[str, Any]], set[Source]]:
+    """The joints that close loops, and the places of their equalities in the file; then nothing moves."""
+    world: _Place = (np.eye(3), np.zeros(3), ("world", np.zeros(3)))
+    places = dict.fromkeys(["", *(body.name for body in model.bodies)], world)
+    for carrier, parts in fixed_parts(model).items():
+        A, origin, holder = writer.places[carrier]
+        places |= {part.name: (A @ R, origin + A @ at, holder) for part, at, R in parts}
+    joints, sources = [], set[Source]()
+    for one in connections:
+        A, origin, near = places.get(one.body, world)
+        far, point = places.get(one.other, world)[2], origin + A @ one.anchor
+        if near[0] == far[0] or near[0] == "world":
+            continue  # of a point that moves with the other body, or of one of the world
+        joints.append({
+            "body": near[0], "parent": far[0], "joint": {"kind": BALL},
+            "anchor": (point - far[1]).tolist(), "proximal": (point - near[1]).tolist(),
+        })  # fmt: skip
+        sources.add(one.source)
+    for body in writer.bodies if joints else ():  # random rates would open the loops
+        body.pop("angular_velocity", None)
+        for name in ("rates", "velocity"):
+            body["joint"].pop(name, None)
+    return joints, sources
+
+
+# axes and origin at the reference pose, in the world; the body that it moves with, and its centre of mass
+_Place = tuple[Array, Array, tuple[str, Array]]
 
 
 class _Writer:
@@ -187,6 +241,7 @@ class _Writer:
         self.rng = rng
         self.bodies: list[dict[str, Any]] = []
         self.left_out: list[Feature] = []  # what a mechanism does not have
+        self.places: dict[str, _Place] = {}  # by body
         poses: list[tuple[Array, Array]] = []  # rotation matrix and origin at the reference pose
         carriers: list[tuple[str, Array]] = []  # name and centre of mass of a body's last part
         for body in model.bodies:
@@ -195,6 +250,7 @@ class _Writer:
             poses.append((A, origin))
             carrier = ("world", np.zeros(3)) if body.parent < 0 else carriers[body.parent]
             carriers.append(self._add(body, A, origin, carrier))
+            self.places[body.name] = (A, origin, carriers[-1])
 
     def _add(
         self, body: NeutralBody, A: Array, origin: Array, carrier: tuple[str, Array]

@@ -107,7 +107,7 @@ def test_random_robots_accelerate_as_their_mechanisms(tmp_path, seed, monkeypatc
     rng = np.random.default_rng(seed)
     make, suffix = ((random_urdf, ".urdf"), (random_mjcf, ".xml"))[seed % 2]
     model = without_free_damping(lump_fixed_bodies(read(tmp_path, make(rng, 4), suffix)))
-    scenario = scenario_from_dict(mechanism_of_model(model, f"robot{suffix}"), "robot")
+    scenario = scenario_from_dict(mechanism_of_model(model, (), f"robot{suffix}"), "robot")
     has_parts = scenario.model.n > len(model.bodies)
     for at in model_states(model, 2, seed):
         for own, lifted in zip(*accelerations(model, scenario, at), strict=True):
@@ -141,7 +141,7 @@ def one_body(*joints, mass=2.0, inertia=(1.0, 1.5, 2.0)):
 def test_joints_of_one_body_are_one_joint_where_a_kind_has_their_motions(joints, kinds):
     elements = [replace(j, damping=0.3, stiffness=2.0, armature=0.1, reference=0.0) for j in joints]
     model = one_body(*elements)
-    content = mechanism_of_model(model, "m.xml")
+    content = mechanism_of_model(model, (), "m.xml")
     scenario = scenario_from_dict(content, "m")
     assert list(scenario.model.kind) == kinds
     assert ("part between joints" in content["purpose"]) == (len(kinds) > 1)
@@ -154,7 +154,7 @@ def test_joints_of_one_body_are_one_joint_where_a_kind_has_their_motions(joints,
 
 def test_what_a_mechanism_does_not_have_is_listed():
     model = one_body(joint("f", "free", [0, 0, 0], damping=1.0), inertia=(1.0, 1.0, 4.0))
-    content = mechanism_of_model(model, "m.xml")
+    content = mechanism_of_model(model, (), "m.xml")
     assert "damping of a free joint" in content["purpose"]
     assert "inertia of no distribution of mass" in content["purpose"]
     moments = np.linalg.eigvalsh(scenario_from_dict(content, "m").model.inertia[0])
@@ -164,9 +164,9 @@ def test_what_a_mechanism_does_not_have_is_listed():
 def test_a_moving_body_without_mass_is_a_bad_file_and_so_is_one_where_nothing_moves():
     hinge = joint("j", "hinge", [0, 1, 0])
     with pytest.raises(ModelFileError, match="body 'b' moves and has no mass"):
-        mechanism_of_model(one_body(hinge, mass=0.0), "m.urdf")
+        mechanism_of_model(one_body(hinge, mass=0.0), (), "m.urdf")
     with pytest.raises(ModelFileError, match=r"nothing in it moves.*--base free"):
-        mechanism_of_model(one_body(), "m.urdf")
+        mechanism_of_model(one_body(), (), "m.urdf")
 
 
 ROBOT = """<robot name="arm">
@@ -238,16 +238,32 @@ def test_a_robot_whose_dampers_no_step_follows_is_compared_at_states(robot):
 
 CLOSED = """<mujoco><worldbody>
 <body name="crank"><joint axis="0 1 0"/><inertial pos="0 0 -1" mass="1" diaginertia="1 1 1"/>
-<body name="rod" pos="0 0 -2"><joint axis="0 1 0"/><inertial pos="0 0 -1" mass="1" diaginertia="1 1 1"/>
-</body></body></worldbody><equality><connect name="loop" body1="rod" anchor="0 0 -2"/></equality></mujoco>"""
+<body name="rod" pos="0 0 -2" euler="0 50 0"><joint axis="0 1 0"/>
+<inertial pos="0 0 -1" mass="1" diaginertia="1 1 1"/>
+<body name="tip" pos="0 0 -2"><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body></body></body>
+</worldbody><equality><connect name="loop" body1="tip" anchor="0 0 -1"/>
+<joint name="gear" joint1="j"/><connect name="off" active="false" body1="rod" anchor="0 0 0"/></equality>
+</mujoco>"""
 
 
-def test_an_equality_is_listed_and_sixty_bodies_are_a_mechanism(tmp_path):
-    closed, long = tmp_path / "closed.xml", tmp_path / "long.urdf"
-    closed.write_text(CLOSED)
-    scenario, _ = load_model_file(closed)
-    assert scenario.model.kind == ("hinge", "hinge")
-    assert "1 × equality (loop, line 4)" in scenario.purpose
+def test_a_loop_of_an_equality_is_closed_by_a_ball_and_the_other_equalities_are_listed(tmp_path):
+    path = tmp_path / "closed.xml"
+    path.write_text(CLOSED.replace('<joint axis="0 1 0"/>', '<joint name="j" axis="0 1 0"/>', 1))
+    scenario, document = load_model_file(path)
+    assert scenario.model.kind == ("hinge", "hinge", "ball")
+    assert scenario.model.body[2].tolist() == [-1, 1]
+    angle = np.radians(50)
+    end = np.array([-3 * np.sin(angle), 0, -2 - 3 * np.cos(angle)])  # of the rod with its tip, in the world
+    assert document["closes"][0]["anchor"] == pytest.approx(end, abs=1e-15)
+    assert "2 × equality (gear, line 7" in scenario.purpose
+    assert "1 of its equalities are rigid ball joints" in scenario.purpose
+    out = tmp_path / "out"
+    found = plumbline("run", path, "--level", "state", "--engine", "pinocchio", "--jobs", 1, "--out", out)
+    assert found.exit_code == 0 and "agree" in found.stdout, found.output
+
+
+def test_sixty_bodies_are_a_mechanism(tmp_path):
+    long = tmp_path / "long.urdf"
     long.write_text(random_urdf(np.random.default_rng(3), 60))
     assert load_model_file(long)[0].model.n == 60
 
