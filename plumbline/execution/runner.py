@@ -374,10 +374,13 @@ def exit_code(result: RunResult, seen: Collection[str] = ()) -> ExitCode:
         As `exit_code_of_rows`.
 
     """
-    own = result.own_scenarios
-    left_out = {row.key for found in result.findings if found.name in seen for row in found.rows}
-    left_out -= {row.key for found in result.findings if found.name not in seen for row in found.rows}
-    left_out -= {row.key for row in result.rows if row.verdict in (Verdict.FAILED, Verdict.HARNESS_FAILED)}
+    own, left_out = result.own_scenarios, set[str]()
+    if seen:
+        left_out = {row.key for found in result.findings if found.name in seen for row in found.rows}
+        left_out -= {row.key for found in result.findings if found.name not in seen for row in found.rows}
+        left_out -= {
+            row.key for row in result.rows if row.verdict in (Verdict.FAILED, Verdict.HARNESS_FAILED)
+        }
     counted = [
         row
         for row in result.rows

@@ -21,6 +21,7 @@ from plumbline.cli.main import COMMANDS, main
 from plumbline.cli.terminal_output import count_noun
 from plumbline.cli.verdict_matrix import engine_heading
 from plumbline.execution.runner import exit_code, summarize_verdicts
+from plumbline.judging.findings import find_findings
 from plumbline.judging.rows import RowContext, Verdict
 from plumbline.storage.results_store import SCHEMA_VERSION
 
@@ -180,6 +181,19 @@ def test_the_summary_counts_one_and_several():
     assert all(part in summarize_verdicts(one) for part in words)
     words = "2 agree", "2 disagree (engine, scenario: q)", "2 known entries no longer occur (k, k)"
     assert all(part in summarize_verdicts(several) for part in words)
+
+
+def test_findings_of_the_last_night_do_not_count_but_new_ones_and_failures_do():
+    old, new = row("disagrees"), row("disagrees", quantity="new")
+    found = result_of([row("agrees"), old])
+    found.findings = find_findings(found.rows, {})
+    (name,) = (finding.name for finding in found.findings)
+    assert (exit_code(found), exit_code(found, {name}), exit_code(found, {"other"})) == (1, 0, 1)
+    for rows, code in (([old, new], 1), ([old, row("failed")], 3), ([old, row("harness failed")], 5)):
+        found = result_of([row("agrees"), *rows])
+        found.findings = find_findings(found.rows, {})
+        seen = {one.name for one in found.findings if one.quantities != ["new"]}
+        assert exit_code(found, seen) == code
 
 
 def test_information_is_counted_apart_and_changes_no_exit_code():
