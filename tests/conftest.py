@@ -32,13 +32,13 @@ ALLOWED_SKIPS = {  # pattern of the skip's reason: why continuous integration ca
 }
 
 LONGEST_FIRST = (  # begun last, one of these would keep one process busy while the others have no work;
-    # isolation, dask_cluster and worker_pool mostly wait, so one begins when another ends
-    "isolation", "planted_defects", "report_browser", "adapter_contract", "exit_codes", "dask_cluster",
+    # dask_cluster and worker_pool mostly wait, so one begins when another ends
+    "report_browser", "dask_cluster", "diagnose", "planted_defects", "adapter_contract", "exit_codes",
     "step_level", "tree_motions", "scripts", "worker_pool", "engines_on_loops", "command_line",
     "engines_on_trees", "relations", "nightly", "smallest_detectable_mistake", "planted_branches",
     "tree_motion", "sweep", "certificate_proof", "planted_joints", "integrator_search", "importer_cause",
     "trajectory_truth", "tree_relations", "selftest", "environments", "model_command", "reference_pages",
-    "resume", "diagnose", "collocation", "docs", "rounding_bound", "long_runs", "report",
+    "resume", "collocation", "docs", "rounding_bound", "long_runs", "report",
     "predictability_horizon", "storage_faults",
 )  # fmt: skip
 LAST = ("matrix",)  # scenario by scenario it fills what is left
