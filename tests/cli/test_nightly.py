@@ -88,9 +88,9 @@ def test_a_random_scenario_is_a_file_like_any_other(tmp_path):
 
 
 def test_random_mechanisms_cover_every_joint_element_and_topology():
-    drawn = list(RandomScenarios(1, 0, mechanism_count=120))
-    assert [s.digest for s in drawn[:3]] == [random_mechanism(1, k).digest for k in range(3)]
-    assert RandomScenarios(1, 2, 1, 3).named("random-mechanism-1-2").digest == drawn[2].digest
+    drawn = list(RandomScenarios(5, 0, mechanism_count=120))
+    assert [s.digest for s in drawn[:3]] == [random_mechanism(5, k).digest for k in range(3)]
+    assert RandomScenarios(5, 2, 1, 3).named("random-mechanism-5-2").digest == drawn[2].digest
     trees, loops, mixed = drawn[::4], drawn[1::4], [*drawn[2::4], *drawn[3::4]]
     assert not any(s.model.has_loops for s in trees) and all(s.model.has_loops for s in loops)
     assert {len(s.model.kind) - s.model.n for s in loops} == {1, 2}
