@@ -149,6 +149,17 @@ class _Linkage:
                 self._add_turned_body(k)
             else:
                 self._add_jointed_body(k, own)
+        self.start = self._coordinates_at_start()
+
+    def _coordinates_at_start(self) -> Array:
+        """Where the links' coordinates of 0 are, as `Trajectory` counts them."""
+        x = [
+            [0.0] * (2 * kind.holds_distance)
+            + ([*self.state.r[k]] if kind.holds_nothing else [])
+            + ([0.0] * 3 if kind.has_attitude else [*self.state.x[k, : len(kind.motions)]])
+            for k, kind in enumerate(self.model.kinds)
+        ]
+        return np.concatenate(x)
 
     def _go_to_far_body(self, k: int) -> None:
         """Continue from the link that joint k is attached to."""
@@ -369,10 +380,11 @@ class _KinematicTree:
         moved = [turned[link] if link >= 0 else np.array([1.0, 0.0, 0.0, 0.0]) for link in links]
         return np.stack([quaternion_product(q, p) for q, p in zip(moved, self.state.p, strict=True)], 1)
 
-    def read_sample(self) -> tuple[Array, Array, Array, Array]:
-        """Return the angles, and r, v and ω′ of all bodies."""
+    def read_sample(self) -> tuple[Array, ...]:
+        """Return the angles and their rates, and r, v and ω′ of all bodies."""
         return (
             np.array(self.mbs.systemData.GetODE2Coordinates()),
+            np.array(self.mbs.systemData.GetODE2Coordinates_t()),
             self.read_sensors(Output.Position),
             self.read_sensors(Output.Velocity),
             self.read_sensors(Output.AngularVelocityLocal),
@@ -457,10 +469,11 @@ class ExudynTree(ExudynAdapter):
             samples = run_solver(
                 solver, tree.mbs, settings, times, resolution, tree.read_sample, tree.check_singularity
             )
-        angles, r, v, omega = (np.array(column) for column in zip(*samples, strict=True))
+        angles, rates, r, v, omega = (np.array(column) for column in zip(*samples, strict=True))
         p = tree.quaternions_at(angles)
-        steps = round(float(times[-1] / resolution))
-        return Trajectory(times.copy(), r, p, v, quaternion_rate(p, omega), steps)
+        steps, own = round(float(times[-1] / resolution)), {"velocities": rates}
+        own["coordinates"] = angles + tree.linkage.start
+        return Trajectory(times.copy(), r, p, v, quaternion_rate(p, omega), steps, **own)
 
     def _step(self, model: Model, state: State, times: Array, integrator: Integrator, step: float) -> StepRun:
         groups = _Linkage(model, state).revolute_groups

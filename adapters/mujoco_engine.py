@@ -225,15 +225,19 @@ class Mujoco(MetamorphicHooks):
         chain.m.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.name.upper()}")
         chain.set_state(state)
         counts = np.round(times / resolution).astype(int)
-        t, rows = [0.0], [chain.sample()]
+        t, rows = [0.0], [(*chain.sample(), *chain.joint_sample())]
         with _raise_on_warnings(chain.d):
             for done in np.diff(counts):
                 mujoco.mj_step(chain.m, chain.d, nstep=int(done))
                 t.append(chain.d.time)  # the engine's own clock: the contract's checks notice a reset
-                rows.append(chain.sample())
-        r, p, v, omega = (np.array(column) for column in zip(*rows, strict=True))
+                rows.append((*chain.sample(), *chain.joint_sample()))
+        r, p, v, omega, joint_q, joint_v = (np.array(column) for column in zip(*rows, strict=True))
         pdot = kinematics.quaternion_rate(p, omega)
-        return Trajectory(t=np.array(t), r=r, p=p, v=v, pdot=pdot, steps=int(counts[-1]))
+        steps, own = int(counts[-1]), {"coordinates": joint_q, "velocities": joint_v}
+        return Trajectory(t=np.array(t), r=r, p=p, v=v, pdot=pdot, steps=steps, **own)
+
+
+HALF_TURN = np.array([0.0, 1.0, 0.0, 0.0])  # about x
 
 
 @dataclass(frozen=True)
@@ -468,6 +472,19 @@ class _MujocoChain:
         p = probe.xquat[self.link_ids]
         omega = _to_body_frame(probe.xmat[self.link_ids], velocity[:, :3])
         return probe.xpos[self.link_ids], p, velocity[:, 3:], omega
+
+    def joint_sample(self) -> tuple[Array, Array]:
+        """Return qpos and qvel as `Trajectory` orders them: rods point along z there, along −z here."""
+        q, v, m = self.d.qpos.copy(), self.d.qvel.copy(), self.m
+        for kind, b in zip(self.model.kinds, self.link_ids, strict=True):
+            at, dof = m.jnt_qposadr[m.body_jntadr[b]], m.body_dofadr[b]
+            if kind.holds_nothing:
+                q[at : at + 7] = np.roll(q[at : at + 7], 4)
+            if kind.holds_distance:  # its rod is the body before
+                q[at : at + 4] = kinematics.quaternion_product(-HALF_TURN, q[at : at + 4])
+                q[at - 4 : at] = kinematics.quaternion_product(q[at - 4 : at], HALF_TURN)
+                v[dof - 2 : dof] *= -1
+        return q, v
 
     def _spatial_motion(self, mujoco_function: Callable[..., None], data: Any) -> Array:
         """Return mj_objectVelocity or mj_objectAcceleration of the links (N, 6), rotation first, world."""

@@ -560,7 +560,24 @@ class PinocchioChain:
             ],
             1,
         )
-        return Trajectory(t=times, r=r, p=p, v=rdot, pdot=quaternion_rate(p, omega), steps=steps)
+        own = {"coordinates": self._joint_coordinates(q), "velocities": v}
+        return Trajectory(t=times, r=r, p=p, v=rdot, pdot=quaternion_rate(p, omega), steps=steps, **own)
+
+    def _joint_coordinates(self, q: Array) -> Array:
+        """Return q (T, nq) as `Trajectory` orders it: quaternions scalar first, in the bodies' axes."""
+        found, model = q.copy(), self.source_model
+        for k, (kind, row) in enumerate(zip(model.kinds, self.body_rows, strict=True)):
+            if not kind.has_attitude:
+                continue
+            rows = [self.parent_rows[row]] * kind.holds_distance + [row]
+            first, *_ = places = [slice(x.idx_q, x.idx_q + x.nq) for x in (self.joints[j] for j in rows)]
+            for at in places:
+                found[:, at] = q[:, at][:, [6, 3, 4, 5, 0, 1, 2] if kind.holds_nothing else [3, 0, 1, 2]]
+            if (far := int(model.body[k, 0])) >= 0:
+                far_joint = self._frame_in_joint(far, np.array([1.0, 0.0, 0.0, 0.0]))
+                turned = quaternion_product(quaternion_conjugate(far_joint), found[:, first])
+                found[:, first] = turned
+        return found
 
 
 def _joint_turns(model: Model, k: int, x: Array) -> Array:

@@ -53,9 +53,9 @@ new_only_option = click.option(
     "--level",
     type=click.Choice(["state", "step", "trajectory", "all"]),
     default="all",
-    help="state: accelerations, reactions and energies at 51 states. step: single steps against the "
-    "declared formula of each integrator. trajectory: observed orders, limits and invariants. all: all of "
-    "them, and the metamorphic relations.",
+    help="state: accelerations, reactions and energies at 51 states. step: single steps, and every step of "
+    "a run, against the declared formula of each integrator. trajectory: observed orders, limits and "
+    "invariants. all: all of them, and the metamorphic relations.",
 )
 @options.jobs_option
 @options.scheduler_option

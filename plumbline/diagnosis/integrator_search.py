@@ -18,9 +18,9 @@ import numpy as np
 
 from plumbline.diagnosis.cause import Cause, Diagnosis, significant
 from plumbline.diagnosis.digit_loss import MIN_SCATTER, measure_step_scatter, scatter_cause
-from plumbline.engines.engine_calls import StepEvaluation
+from plumbline.engines.engine_calls import StepAttempt, StepEvaluation
 from plumbline.engines.registry import load_adapter
-from plumbline.model.datatypes import Array, Model, State, StepRun
+from plumbline.model.datatypes import Array, Model, State, StepRun, Trajectory
 from plumbline.model.kinematics import angular_velocity, quaternion_rate, rotation_matrix
 from plumbline.model.step_methods import (
     ConstrainedMethod,
@@ -33,12 +33,15 @@ from plumbline.truth.step_comparison import (
     RESIDUAL_STEPS,
     FormulaSteps,
     Runs,
+    RunSteps,
     compare_parts,
     quadrature_residuals,
 )
 
 MIN_DIAGNOSABLE_RATIO = 8.0  # in bounds: a smaller difference may be explained by chance
 SCREENING_RATIO = 4.0  # of first steps, in bounds of the declared formula
+STEPS_OF_A_RUN = 4  # that are explained, the worst
+RUN_STEP_QUANTITIES = ("run_position", "run_attitude", "run_velocity", "run_rate")
 FIT_ITERATIONS = 15
 FIT_STEP = 1e-6
 SIMPLE_VALUES = (0.0, 0.25, 0.5, 1.0, 2.0, -1.0, 1 / 3, 1 / 6)
@@ -76,7 +79,12 @@ def explain_disagreeing_steps(
     adapter = load_adapter(engine)
     method = adapter.integrator(integrator).method
     assert method is not None
-    causes = () if is_known else explain_steps(model, states, method, answer)
+    causes = explain_steps(model, states, method, answer) if answer.attempts and not is_known else ()
+    if answer.run is not None and answer.run.run is not None and (causes == (CLOSE,) or not answer.attempts):
+        if isinstance(method, ConstrainedMethod):
+            return Diagnosis(causes)
+        states, answer = _worst_steps(model, states[0], method, answer.run.run, answer.run.step)
+        causes = () if is_known else explain_steps(model, states, method, answer)
     if isinstance(method, ConstrainedMethod) or causes not in ((), (UNEXPLAINED,)):
         return Diagnosis(causes)
     runs = [(a.state, a.step, a.run) for a in answer.attempts if a.run is not None]
@@ -93,6 +101,21 @@ def explain_disagreeing_steps(
     if scatter is None or (causes and scatter < MIN_SCATTER):
         return Diagnosis(causes)
     return Diagnosis((scatter_cause(["steps"], scatter),), scatter=scatter)
+
+
+def _worst_steps(
+    model: Model, state: State, method: JointSpaceMethod, run: StepRun, h: float
+) -> tuple[list[State], StepEvaluation]:
+    """The steps of a run that are furthest off, each as one from a state of its own."""
+    steps = RunSteps(method, model, state, h, run)
+    ratios = np.max([np.max(steps.compare()[name].ratios, axis=1) for name in RUN_STEP_QUANTITIES], axis=0)
+    worst = np.sort(np.argsort(ratios)[-STEPS_OF_A_RUN:])
+    motion, attempts = run.trajectory, list[StepAttempt]()
+    for index, n in enumerate(worst.tolist()):
+        two = {name: getattr(motion, name)[n : n + 2] for name in ("r", "p", "v", "pdot")}
+        piece = Trajectory(t=np.array([0.0, h]), steps=1, **two)
+        attempts.append(StepAttempt(index, h, replace(run, trajectory=piece)))
+    return [steps.states[n] for n in worst], StepEvaluation(attempts, 0.0)
 
 
 def explain_steps(

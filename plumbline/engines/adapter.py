@@ -219,7 +219,7 @@ class Adapter(ABC):
                 f"{self.name}._simulate, {integrator}: steps is {trajectory.steps!r}, but {count} steps of "
                 f"{resolution:g} s lead to t = {times[-1]:g} s"
             )
-        return replace(trajectory, initial_x=state.x)
+        return replace(trajectory, initial_x=state.x, coordinates=None, velocities=None)  # steps need them
 
     def step(self, model: Model, state: State, integrator: str, step: float, count: int) -> StepRun:
         """Take a few steps from a state and sample after each; errors are those of `evaluate`.
@@ -361,11 +361,13 @@ def check_samples(model: Model, times: Float[Array, "samples"], run: Trajectory,
         if len(wrong):
             text += f"; sample {first} is at t = {run.t[first]:.9g} s, asked for t = {times[first]:.9g} s"
         raise EngineFailure(text)
-    for name in ("r", "p", "v", "pdot"):
+    for name in ("r", "p", "v", "pdot", "coordinates", "velocities"):
         array = getattr(run, name)
+        if array is None:
+            continue
         if len(array) != len(times):
             raise EngineFailure(f"{label}: {name} has {len(array)} samples, expected {len(times)}")
-        finite = np.all(np.isfinite(array), axis=(1, 2))
+        finite = np.all(np.isfinite(array.reshape(len(times), -1)), axis=1)
         if not np.all(finite):
             raise EngineFailure(f"{label}: {name} is not finite from t = {times[np.argmin(finite)]} s")
 

@@ -40,6 +40,8 @@ FIELDS: Mapping[type, Mapping[str, tuple[str, bool]]] = {
         "pdot": ("A N 4", False),
         "steps": (COUNT, False),
         "limit_error": ("4", True),
+        "coordinates": ("A Q", True),
+        "velocities": ("A V", True),
     },
     StepRun: {
         "coordinate_acceleration": ("T N 7", True),

@@ -82,6 +82,7 @@ class StepEvaluation:
 
     attempts: list[StepAttempt]
     cpu_time: float  # CPU s
+    run: StepAttempt | None = None  # many steps from the first state
 
 
 def describe_engine(engine: str) -> EngineInfo:

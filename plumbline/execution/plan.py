@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Literal
@@ -135,14 +135,12 @@ def task_keys(
     engines: Mapping[str, EngineInfo],
     level: LevelSelection | Literal["random"],
     has_long_runs: bool = False,
-    left_out: Collection[TaskKind] = (),
 ) -> Iterator[TaskKey]:
     """List the tasks of a scenario that are known beforehand.
 
     Args:
         engines: descriptions of the engines; those that are missing get no task.
         level: which levels to compare at; "random" is state and step level.
-        left_out: kinds that are not compared of the scenario.
 
     Yields:
         The truths, then the cells engine by engine.
@@ -150,7 +148,7 @@ def task_keys(
     """
     has_states, has_runs = level in ("state", "random", "all"), level in ("trajectory", "all")
     wanted = [TaskKind.STATE_TRUTH] * has_states + [TaskKind.MOTION_TRUTH] * has_runs
-    yield from (TaskKey(kind, scenario) for kind in wanted if kind not in left_out)
+    yield from (TaskKey(kind, scenario) for kind in wanted)
     for name, info in engines.items():
         if info.missing is not None:
             continue
@@ -161,4 +159,4 @@ def task_keys(
         keys += [TaskKey(TaskKind.RELATIONS, scenario, name)] * (level == "all")
         runs = [TaskKind.TRAJECTORY] * has_runs + [TaskKind.LONG_RUN] * (has_runs and has_long_runs)
         keys += [TaskKey(kind, scenario, name, one.name) for kind in runs for one in info.integrators]
-        yield from (key for key in keys if key.kind not in left_out)
+        yield from keys

@@ -30,7 +30,7 @@ from plumbline.execution.plan import (
     task_keys,
 )
 from plumbline.execution.random_batch import RandomBatch
-from plumbline.execution.scenario_verdicts import ScenarioRun, uncompared_kinds
+from plumbline.execution.scenario_verdicts import ScenarioRun
 from plumbline.judging import known_issues
 from plumbline.judging.findings import Finding, find_findings
 from plumbline.judging.identity import RUN_SCENARIO, IdentityCheck
@@ -208,10 +208,8 @@ class _Run:
         self.observer.on_start(self.engines)
         has_long_runs = plan.long_run_seconds > 0
         total = sum(
-            sum(
-                1 for _ in task_keys("", self.engines, scenario_level(s, plan.level), has_long_runs, left_out)
-            )
-            for s, left_out in ((s, uncompared_kinds(s.model)) for s in plan.scenarios)
+            sum(1 for _ in task_keys("", self.engines, scenario_level(s, plan.level), has_long_runs))
+            for s in plan.scenarios
         )
         runs = min(plan.random_trajectory_count, len(plan.random_scenarios))
         total += runs * sum(1 for _ in task_keys("", self.engines, plan.level))

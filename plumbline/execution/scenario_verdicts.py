@@ -34,8 +34,8 @@ from plumbline.measurements import relations
 from plumbline.measurements.long_run_study import plan_long_run, run_long_run_study
 from plumbline.measurements.order_and_limit import refinement_resolutions
 from plumbline.measurements.refinement_study import run_refinement_study
-from plumbline.measurements.single_steps import MAX_STEP_BODIES, STEP_STATES, run_step_study
-from plumbline.model.datatypes import Integrator, Model, State
+from plumbline.measurements.single_steps import STEP_STATES, run_step_study
+from plumbline.model.datatypes import Integrator, State
 from plumbline.model.invariants import inertia_ratio
 from plumbline.model.loops import MIN_MOTION_SINGULAR_VALUE, is_singular, smallest_singular_value
 from plumbline.model.sampling import compared_states
@@ -76,18 +76,6 @@ def _family(engine: str) -> str:
     return environments.declared_attribute(base, "package") or base
 
 
-def uncompared_kinds(model: Model) -> dict[TaskKind, str]:
-    """List what is not compared of a mechanism on any engine.
-
-    Returns:
-        By kind of task why it is left out.
-
-    """
-    if model.n > MAX_STEP_BODIES and not model.has_loops:
-        return {TaskKind.STEP: f"single steps are compared of at most {MAX_STEP_BODIES} bodies"}
-    return {}
-
-
 class ScenarioRun:
     """The cells of one scenario, from tasks to rows.
 
@@ -124,7 +112,7 @@ class ScenarioRun:
         if scenario.model.has_loops:
             arguments = scenario.model, scenario.state
             self._singular_value = self._kept("singular value", smallest_singular_value, *arguments).load()
-        self._left_out = uncompared_kinds(scenario.model)
+        self._left_out = dict[TaskKind, str]()
         if self._singular_value < MIN_MOTION_SINGULAR_VALUE:
             singular = (
                 f"singular: at the initial pose the smallest singular value is {self._singular_value:.2g}"

@@ -52,7 +52,7 @@ from plumbline.scenario.schema import invalid_value_error
 from plumbline.scenario.validation_messages import problems_from_validation
 from plumbline.scenario.yaml_reader import read_yaml
 from plumbline.scenario.yaml_source import PathKey, YamlSource, dotted_path
-from plumbline.truth.step_comparison import CONSTRAINED_UNITS, STEP_UNITS
+from plumbline.truth.step_comparison import CONSTRAINED_UNITS, RUN_UNITS, STEP_UNITS
 
 RowKind = tuple[str, str, str, str, str]  # of a row: engine, its version, level, integrator, quantity
 KNOWN_ISSUES_FILE = Path(__file__).with_name("known_issues.yaml")
@@ -508,7 +508,7 @@ def _quantities() -> set[str]:
     own = (*REDESCRIPTIONS, WELDED_HALVES, REVERSED_IN_TIME, REPEATABILITY)
     relations = (*(r.name for r in STATE_RELATIONS), *own)
     others = *(f"as {name}" for name in ENGINES), *(f"by {text}" for text in declared_texts())
-    steps = (*STEP_UNITS, *CONSTRAINED_UNITS)
+    steps = (*STEP_UNITS, *CONSTRAINED_UNITS, *RUN_UNITS)
     return {
         "all",
         *STATE_UNITS,

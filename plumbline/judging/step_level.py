@@ -1,35 +1,45 @@
-"""Step level: one step and ten of the declared method, against its formula in extended precision.
+"""Step level: the declared method's steps, against its formula in extended precision.
 
+One step and ten from several states; and every step of a run, each from the engine's sample before.
 `plumbline.truth.step_comparison` has the differences and their bounds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 
 from plumbline.engines.engine_calls import StepEvaluation
 from plumbline.judging.rows import JudgingResult, Row, RowContext, Verdict
-from plumbline.model.datatypes import Integrator, Model, State
+from plumbline.model.datatypes import EngineFailure, Integrator, Model, State, StepRun
 from plumbline.model.loops import keeps_dependent_rows
 from plumbline.model.step_methods import ConstrainedMethod, JointSpaceMethod
 from plumbline.truth.step_comparison import (
     CONSTRAINED_UNITS,
+    RUN_UNITS,
     STEP_UNITS,
     Comparisons,
     FormulaSteps,
+    RunSteps,
+    StepDeviations,
     compare_parts,
+    constrained_deviations,
+    joined,
     step_counts,
 )
-from plumbline.truth.step_formulas import (
-    HAS_EXTENDED_PRECISION,
-)
+from plumbline.truth.step_formulas import HAS_EXTENDED_PRECISION
 
 OPEN_ROWS = (
     "not compared: rows of the loops depend on others in closed poses only; where a step has opened the "
     "loops, the accelerations are those of the solver's iterations"
 )
+NO_EXTENDED_PRECISION = "the formulas need an extended precision that this machine does not have"
+NO_COORDINATES = (
+    "not compared: the adapter returns no coordinates with the samples, from which the next step could start"
+)
+TOTALS = ("run_energy", "run_momentum", "run_equations")  # of the whole mechanism
 MAX_STEP_BOUND = 1e-6  # of the accelerations' effect; a looser bound could hide a mistake
 
 
@@ -47,6 +57,17 @@ def judge_steps(
         One row per quantity.
 
     """
+    rows = list[Row]()
+    if answer.attempts:
+        rows = _single_step_rows(context, integrator, model, states, answer)
+        if any(row.quantity == "all" for row in rows):  # why nothing is compared
+            return JudgingResult(rows)
+    return JudgingResult([*rows, *_run_rows(context, integrator, model, states[0], answer)])
+
+
+def _single_step_rows(
+    context: RowContext, integrator: Integrator, model: Model, states: Sequence[State], answer: StepEvaluation
+) -> list[Row]:
     method, verdict, reason, gap = integrator.method, Verdict.UNSUPPORTED, "", ""
     attempts = [attempt for attempt in answer.attempts if attempt.run is not None]
     runs = [(attempt.state, attempt.step, attempt.run) for attempt in attempts if attempt.run is not None]
@@ -59,18 +80,17 @@ def judge_steps(
     elif not runs:
         reason, gap = next((attempt.refusal, attempt.gap) for attempt in answer.attempts)
     elif not HAS_EXTENDED_PRECISION:
-        reason = "the formulas need an extended precision that this machine does not have"
+        reason = NO_EXTENDED_PRECISION
     elif isinstance(method, JointSpaceMethod) and not keeps_dependent_rows(model, states[0]):
         verdict, reason = Verdict.INFORMATION, OPEN_ROWS
     if reason:
-        return JudgingResult([context.make_row("step", integrator.name, "all", verdict, reason, gap=gap)])
+        return [context.make_row("step", integrator.name, "all", verdict, reason, gap=gap)]
     if isinstance(method, JointSpaceMethod):
         starts = [(index, h, run.angle_axes) for index, h, run in runs]
         steps = FormulaSteps(method, model, states, starts)
         for i, attempt in enumerate(attempts):
             if attempt.failure and steps.is_stable(i):
-                row = context.make_row("step", integrator.name, "all", Verdict.FAILED, attempt.failure)
-                return JudgingResult([row])
+                return [context.make_row("step", integrator.name, "all", Verdict.FAILED, attempt.failure)]
         found, units = steps.compare([run for *_, run in runs]), STEP_UNITS
     else:
         assert isinstance(method, ConstrainedMethod)
@@ -78,12 +98,10 @@ def judge_steps(
     alias = None if model.has_drag else integrator.alias_of  # with drag the two methods differ
     complete = sum(not (attempt.refusal or attempt.failure) for attempt in answer.attempts)
     note = f"{complete} runs of {max(step_counts(method))} steps"
-    return JudgingResult(
-        [
-            _row(context, integrator, quantity, units[quantity], comparisons, note, alias, answer.cpu_time)
-            for quantity, comparisons in found.items()
-        ]
-    )
+    return [
+        _row(context, integrator, quantity, units[quantity], comparisons, note, alias, answer.cpu_time)
+        for quantity, comparisons in found.items()
+    ]
 
 
 def _row(
@@ -121,4 +139,102 @@ def _row(
         extra={"comparisons": float(len(error)), "bound_relative": float(np.max(looseness)),
                "state": float(found.places[at].state), "step": found.places[at].step,
                "steps": float(found.places[at].count)},
+    )  # fmt: skip
+
+
+def _run_rows(
+    context: RowContext, integrator: Integrator, model: Model, state: State, answer: StepEvaluation
+) -> list[Row]:
+    """The rows of every step of a run; one where it is not compared."""
+    method, attempt = integrator.method, answer.run
+    if attempt is None:
+        return []
+
+    def one(verdict: Verdict, reason: str, gap: str = "") -> list[Row]:
+        return [context.make_row("step", integrator.name, "run", verdict, reason, gap=gap)]
+
+    run, h = attempt.run, attempt.step
+    if attempt.failure:
+        return one(Verdict.FAILED, f"in a run of {h:g} s per step: {attempt.failure}")
+    if run is None:
+        return one(Verdict.UNSUPPORTED, attempt.refusal, attempt.gap)
+    if not HAS_EXTENDED_PRECISION:
+        return one(Verdict.UNSUPPORTED, NO_EXTENDED_PRECISION)
+    condition: Callable[[int, int], str] = partial(_time, run)
+    if isinstance(method, ConstrainedMethod):
+        parts = constrained_deviations(method, model, run, h)
+        found = {f"run_{name}": joined(some) for name, some in parts.items()}
+    elif not keeps_dependent_rows(model, state):
+        return one(Verdict.INFORMATION, OPEN_ROWS)
+    elif run.trajectory.coordinates is None:
+        return one(Verdict.INFORMATION, NO_COORDINATES)
+    else:
+        assert method is not None
+        try:
+            steps = RunSteps(method, model, state, h, run)
+        except EngineFailure as error:
+            return one(Verdict.FAILED, str(error))
+        found, condition = steps.compare(), steps.condition
+    alias = None if model.has_drag else integrator.alias_of
+    return [
+        _run_row(context, integrator, quantity, deviations, h, condition, alias, answer.cpu_time)
+        for quantity, deviations in found.items()
+    ]
+
+
+def _time(run: StepRun, index: int, _: int) -> str:
+    return f"t = {run.trajectory.t[index]:.6g} s"
+
+
+def _run_row(
+    context: RowContext, integrator: Integrator, quantity: str, found: StepDeviations, h: float,
+    condition: Callable[[int, int], str], alias: str | None, cpu_time: float,
+) -> Row:  # fmt: skip
+    """The row of one quantity at every step: the worst step decides, the first wrong one is named."""
+    name, unit, ratios = quantity.removeprefix("run_"), RUN_UNITS[quantity], found.ratios
+    ratios = np.where(np.isnan(ratios), np.inf, ratios)
+    worst, column = (int(x) for x in np.unravel_index(np.argmax(ratios), ratios.shape))
+    ratio, wrong = float(ratios[worst, column]), np.flatnonzero(np.any(ratios > 1, axis=1))
+    has_bodies, count = quantity not in TOTALS, len(ratios)
+    body = column if has_bodies else 0
+    sharp = found.bounds <= MAX_STEP_BOUND * found.effects
+    extra = {"step": h, "worst_step": worst + 1.0, "comparisons": float(ratios.size)}
+    what = f"{name} of {count} steps of {h:.4g} s"
+    if ratio > 1:
+        first = int(wrong[0])
+        at = int(np.argmax(ratios[first])) if has_bodies else 0
+        verdict = Verdict.DISAGREES
+        reason = (
+            f"{context.title} does not take the declared step of {integrator.name}: {what} is off first at "
+            f"step {first + 1} ({condition(first, at)}), and at {len(wrong)} in all; at most by "
+            f"{found.errors[worst, column]:.3g} {unit} at step {worst + 1}, {ratio:.3g} times the rounding "
+            "bound"
+        )
+        if quantity != "run_mean":
+            extra |= {"first_step": first + 1.0, "wrong_steps": float(len(wrong))}
+        else:
+            reason = (
+                f"{context.title} does not take the declared step of {integrator.name}: over a run of steps "
+                f"of {h:.4g} s the rates of body {body + 1} are off in one direction by "
+                f"{found.errors[worst, column]:.3g} rounding bounds of a step, {ratio:.3g} times what "
+                "rounding explains"
+            )
+    elif np.mean(sharp) < 0.5:
+        verdict = Verdict.UNRESOLVED
+        reason = (
+            f"inconclusive: at {np.mean(~sharp):.0%} of the comparisons the rounding bound is above "
+            f"{MAX_STEP_BOUND:g} of the accelerations' effect, too loose to detect an error"
+        )
+    else:
+        verdict = Verdict.AGREES
+        reason = f"{what} within {ratio:.2g} of the rounding bound, each from the sample before"
+        if quantity == "run_mean":
+            reason = f"no direction in the deviations of the steps: {ratio:.2g} of what rounding explains"
+    return context.make_row(
+        "step", integrator.name, quantity, verdict, reason, unit,
+        value=float(found.errors[worst, column]), tolerance=float(found.bounds[worst, column]), ratio=ratio,
+        alias_of=alias, cpu_time=cpu_time, extra=extra,
+        derivation=f"{found.bounds[worst, column]:.2g} {unit} at step {worst + 1}"
+        + f", body {body + 1}" * has_bodies + "; truth: the declared formula in extended precision, from the "
+        "engine's own sample before (docs/integrators.md)",
     )  # fmt: skip

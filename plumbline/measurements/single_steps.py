@@ -21,7 +21,10 @@ MAX_STEP_RATE = 10.0  # rad/s; in faster motions the steps are smaller: explicit
 # rad/s, of loops: at the larger step gaps close by half as fast as h a = 1, where Euler's method rings
 LOOP_RATE = 2 * STABILISATION * MAX_STEP_RATE * STEP_SIZES[-1]
 STEP_STATES = 5  # the initial state and random ones
-MAX_STEP_BODIES = 10
+MAX_STEP_BODIES = 10  # of single steps
+RUN_STEP_SHARE = 0.79  # of the smaller one: the step of a run, no power of two
+RUN_STEPS, MIN_RUN_STEPS = 600, 18
+RUN_WORK = 25_000  # steps × bodies²: the bounds' time grows so
 
 
 def run_step_study(
@@ -37,7 +40,23 @@ def run_step_study(
     sizes = _remembered_step_sizes(
         isinstance(integrator.method, ConstrainedMethod), Pickled.of((model, states))
     )
-    return run_steps(engine, integrator.name, model, states, sizes, step_counts(integrator.method))
+    h, counts = RUN_STEP_SHARE * sizes[0][0], run_counts(model.n)
+    run = run_steps(engine, integrator.name, model, states[:1], [[h]], counts)
+    if model.n > MAX_STEP_BODIES and not model.has_loops:
+        return StepEvaluation([], run.cpu_time, run.attempts[0])
+    single = run_steps(engine, integrator.name, model, states, sizes, step_counts(integrator.method))
+    return StepEvaluation(single.attempts, single.cpu_time + run.cpu_time, run.attempts[0])
+
+
+def run_counts(bodies: int) -> tuple[int, ...]:
+    """Choose of how many steps a run is that is judged step by step.
+
+    Returns:
+        Counts, ascending: the largest, and those for runs that end earlier, as at an angle's singularity.
+
+    """
+    count = min(RUN_STEPS, max(MIN_RUN_STEPS, RUN_WORK // bodies**2))
+    return count // 9, count // 3, count
 
 
 @lru_cache(maxsize=4)

@@ -135,6 +135,9 @@ class Trajectory:
     # m, rad, m/s, rad/s: uncertainty of positions, attitudes, ṙ and ω′, where the run is the limit of
     # softer ones
     limit_error: Float[Array, "4"] | None = None
+    # the engine's own configuration and velocity, joint by joint as `JointSpaceMethod` orders them
+    coordinates: Float[Array, "samples entries"] | None = None
+    velocities: Float[Array, "samples rates"] | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -583,7 +583,7 @@ def joint_coordinates(
         return state.u, state.udot, state.x, state.xdot
     closing = coordinates_of_joints(model, state, range(model.n, len(model.kind)))
     given = state.u, state.udot, state.x, state.xdot
-    u, udot, x, xdot = (np.concatenate(pair) for pair in zip(given, closing, strict=True))
+    u, udot, x, xdot = (np.concatenate(pair, -2) for pair in zip(given, closing, strict=True))
     return u, udot, x, xdot
 
 

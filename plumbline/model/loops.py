@@ -79,16 +79,17 @@ class CutMechanism:
         """Describe a state of the mechanism as one of the tree.
 
         Args:
-            state: of the mechanism, its loops closed.
+            state: of the mechanism, its loops closed; or many, of arrays with leading axes.
 
         Returns:
             The tree's state; the parts go by the closing joints' own coordinates.
 
         """
-        fields = {name: value[self.source.body[:, 1]] for name, value in vars(state).items()}
+        fields = {name: value[..., self.source.body[:, 1], :] for name, value in vars(state).items()}
         fields |= zip(("u", "udot", "x", "xdot"), joint_coordinates(self.source, state), strict=True)
         order = np.argsort(self.place)
-        return complete_state(self.model, State(**{name: value[order] for name, value in fields.items()}))
+        ordered = {name: value[..., order, :] for name, value in fields.items()}
+        return complete_state(self.model, State(**ordered))
 
     def source_state(self, state: State) -> State:
         """Describe a state of the tree as one of the mechanism.
@@ -151,18 +152,19 @@ class CutMechanism:
             found.append(np.concatenate([state.r[b] - state.r[c], -skew]))
         return np.concatenate(found)
 
-    def jacobian(self, state: State) -> Float[Array, "loop_rows nu"]:
+    def jacobian(self, state: State) -> Float[Array, "... loop_rows nu"]:
         """Return J.
 
         Args:
-            state: of the tree.
+            state: of the tree; or many, of arrays with leading axes.
 
         Returns:
             For the rates ν of `velocity_jacobian`.
 
         """
-        w = velocity_jacobian(self.model, state).reshape(self.model.n, 6, -1)
-        return np.concatenate([w[b] - w[c] for b, c in self.ends])
+        w = velocity_jacobian(self.model, state)
+        w = w.reshape(*w.shape[:-2], self.model.n, 6, -1)
+        return np.concatenate([w[..., b, :, :] - w[..., c, :, :] for b, c in self.ends], -2)
 
 
 @lru_cache(maxsize=64)  # mechanisms are never changed

@@ -25,6 +25,12 @@ class JointSpaceMethod:
     revolute joints; q ⊕ t = q + t and dexp⁻¹ is the identity.  Coordinates of hinges, slides and their like
     are numbers in both.
 
+    `Trajectory.coordinates` and ``velocities`` have them joint by joint: of a rod its turn, a quaternion
+    (scalar first) that takes z to its direction, or its two angles; then of its body, or of a ball, the turn
+    against the rod or the far body, in the bodies' axes, a quaternion or three angles; of other joints x.  A
+    free body has its quaternion, then r, in "joint angles" r, then the angles; its velocity is ṙ, or that in
+    body axes of a "rigid motion", then that of the turn.
+
     The fields from ``new_velocity_share`` on are for formulas that an engine may take in place of its own.
     """
 

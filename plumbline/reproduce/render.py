@@ -40,7 +40,7 @@ from plumbline.reproduce.measure import (
     StepEvidence,
 )
 from plumbline.reproduce.shrink import ReproductionCase
-from plumbline.truth.step_comparison import CONSTRAINED_UNITS
+from plumbline.truth.step_comparison import CONSTRAINED_UNITS, RUN_UNITS
 
 TEMPLATES = Path(__file__).parent / "templates"
 LONG_RUN_SUFFIXES = ("_long", "_long_growth")  # of the quantities that long runs judge
@@ -124,6 +124,8 @@ def no_script_reason(engine: str, row: dict[str, Any]) -> str:
             return f"engine {name} has no template of scripts"
     if row["level"] == "step" and row["quantity"] in CONSTRAINED_UNITS:
         return "rows of single steps with constraints have no script"
+    if row["level"] == "step" and row["quantity"] in RUN_UNITS:
+        return "rows on every step of a run have no script: what single steps show has one"
     if relation.endswith(LONG_RUN_SUFFIXES):
         return "rows of long runs have no script"
     if row["level"] != "relations":

@@ -49,8 +49,9 @@ from plumbline.model.kinematics import (
     rotation_matrix,
     rotation_vector,
     spring_vectors,
+    stack_states,
 )
-from plumbline.model.loops import cut_open, regular_rank, smallest_singular_value, wrench_length
+from plumbline.model.loops import cut_open, regular_rank, wrench_length
 from plumbline.model.welding import BodyParts, part_offsets, undivided_bodies
 from plumbline.processes.worker_pool import Pickled
 
@@ -80,6 +81,7 @@ class RoundingBound:
     mass_matrix: float  # kg m², of each entry
     scale: dict[str, Array | float]
     rod_torque: Array  # (N,) N m, of the torques at both ends of the rod that body k hangs by; 0 for a ball
+    joint_terms: float  # N m about the origin, of the terms of all joints
 
     def tolerance(self, quantity: str) -> Array | float:
         """Look up a tolerance by the name of its quantity.
@@ -180,18 +182,20 @@ def rounding_bounds(
 
 
 def _of_tree(terms: _Terms) -> list[RoundingBound]:
-    total, scale, sums, rods = terms.bounds()
-    return [_bound(total[s], _at(scale, s), _at(sums, s), rods[s]) for s in range(len(total))]
+    total, scale, sums, rods, moments = terms.bounds()
+    return [_bound(total[s], _at(scale, s), _at(sums, s), rods[s], moments[s]) for s in range(len(total))]
 
 
 def _of_loops(model: Model, states: Sequence[State]) -> list[RoundingBound]:
     """Bounds of a mechanism with loops, cut open."""
     cut, found = cut_open(model), list[RoundingBound]()
-    terms = _Terms(cut.model, [cut.state(state) for state in states], None, cut.ends, cut.row_scale)
-    totals, scales, sums, _ = terms.bounds()
+    there = cut.state(stack_states(states))
+    terms = _Terms(cut.model, there, None, cut.ends, cut.row_scale)
+    totals, scales, sums, _, moments = terms.bounds()
     of_welds, rank = terms.weld_errors(), regular_rank(model, states[0])
-    for s, state in enumerate(states):
-        spread = 1 + 1 / smallest_singular_value(model, state, rank)
+    scaled = cut.jacobian(there) * cut.row_scale[:, None]
+    spreads = 1 + 1 / np.linalg.svd(scaled, compute_uv=False)[:, rank - 1]  # as `smallest_singular_value`
+    for s, spread in enumerate(spreads.tolist()):
         # what one body or joint has is found together with what all others of the loop have
         largest = {name: float(np.max(value)) for name, value in _at(scales, s).items()}
         reaction = wrench_length(model) * largest["joint_reaction"]
@@ -203,7 +207,7 @@ def _of_loops(model: Model, states: Sequence[State]) -> list[RoundingBound]:
             for name, value in largest.items()
         }
         spread_sums = {name: size * spread for name, size in _at(sums, s).items()}
-        found.append(_bound(total[cut.place], scale, spread_sums, np.zeros(model.n)))
+        found.append(_bound(total[cut.place], scale, spread_sums, np.zeros(model.n), spread * moments[s]))
     return found
 
 
@@ -211,7 +215,9 @@ def _at(values: dict[str, Array], s: int) -> dict[str, Array]:
     return {name: value[s] for name, value in values.items()}
 
 
-def _bound(total: Array, scale: dict[str, Array], sums: dict[str, Array], rods: Array) -> RoundingBound:
+def _bound(
+    total: Array, scale: dict[str, Array], sums: dict[str, Array], rods: Array, moments: float
+) -> RoundingBound:
     """Tolerances by the sums of all sizes: (J, 4) of joints, of which the first hold the bodies."""
     total, sizes = ROUNDING_FACTOR * EPS * total, {name: float(size) for name, size in sums.items()}
     return RoundingBound(
@@ -221,6 +227,7 @@ def _bound(total: Array, scale: dict[str, Array], sums: dict[str, Array], rods: 
         joint_moment=total[:, 3],
         scale=scale | sizes,
         rod_torque=ROUNDING_FACTOR * EPS * rods,
+        joint_terms=float(ROUNDING_FACTOR * EPS * moments),
         **{name: SUM_ROUNDING_FACTOR * EPS * size for name, size in sizes.items()},
     )
 
@@ -235,7 +242,7 @@ class _Terms:
     def __init__(
         self,
         model: Model,
-        states: Sequence[State],
+        states: Sequence[State] | State,
         parts: BodyParts | None = None,
         ends: Sequence[tuple[int, int]] = (),
         row_scale: Array | None = None,
@@ -252,7 +259,7 @@ class _Terms:
         self.d = joint_vectors(model, state.r, state.p)
         self.springs = spring_terms(model, state)
         self.elements = joint_elements(model, state, norm(found.velocity_terms(), axis=-1))
-        self.element_size = np.zeros((len(states), model.n, 2))  # of each joint's slides and turns
+        self.element_size = np.zeros((len(state.p), model.n, 2))  # of each joint's slides and turns
         for element in self.elements:
             self.element_size[:, element.k, int(not element.is_slide)] += element.size
         self.g, self.m, self.J = float(norm(model.gravity)), model.mass, norm(model.inertia, axis=(1, 2))
@@ -347,13 +354,13 @@ class _Terms:
             first = last
         return np.asarray(np.sqrt(found))
 
-    def bounds(self) -> tuple[Array, dict[str, Array], dict[str, Array], Array]:
+    def bounds(self) -> tuple[Array, dict[str, Array], dict[str, Array], Array, Array]:
         """Sum the sizes of all roundings.
 
         Returns:
             tB + tS + tJ + d (S, N, 4) of r̈ [m/s²], α [rad/s²], F [N] and M [N m]; the scales of vectors; the
             sums (S,) behind the energies [J], the angular momentum and the mass matrix; torques of rods
-            (S, N) [N m].
+            (S, N) [N m]; moments (S,) of all joints [N m].
 
         """
         t, model, state, joints = self, self.model, self.state, _JointSpace(self)
@@ -404,10 +411,12 @@ class _Terms:
                 [t.moment, t.arm * t.F, t.J * t.alpha, np.sum(t.element_size, -1), (lever @ (t.m * t.g))], 0
             ),
         }
-        rods = np.zeros(t.a.shape)
+        rods, moments = np.zeros(t.a.shape), np.zeros(len(total))
         for at, (what, k) in enumerate(joints.pairs):
-            rods[:, k] += joints.load[:, at] * (what in ("upper", "lower"))
-        return total, scale, sums, rods
+            load = joints.load[:, at]
+            rods[:, k] += load * (what in ("upper", "lower"))
+            moments += load * (np.linalg.norm(tip[:, k], axis=-1) if what == "slide" else 1.0)
+        return total, scale, sums, rods, moments
 
 
 def _norms(responses: Array) -> Array:

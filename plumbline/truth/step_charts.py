@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from plumbline.equations.arithmetic import floats
 from plumbline.equations.tree import Solution, Tree
-from plumbline.model.datatypes import KINDS, Model, State
+from plumbline.model.datatypes import KINDS, EngineFailure, Model, State
 from plumbline.model.kinematics import (
     cross,
     cross_matrix,
@@ -63,6 +63,12 @@ class BodyStates:
     udot: Array  # (..., N, 3) 1/s
     x: Array  # (..., N, 2) rad or m, coordinates of the other joints
     xdot: Array  # (..., N, 2)
+    energy: Array  # (...,) J, kinetic and potential
+    momentum: Array  # (..., 3) kg m²/s, angular, about the origin
+
+    def rounded(self) -> State:
+        """Round the motion to doubles."""
+        return State(*(np.asarray(getattr(self, one.name), float) for one in fields(State)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,6 +177,30 @@ class StepCharts:
 
         """
         return [chart.q for chart in self.charts], _joined([chart.v for chart in self.charts])
+
+    def divided(self, coordinates: Array, velocities: Array) -> tuple[list[Array], Array]:
+        """Divide an engine's own coordinates among the charts, as `start` returns those of the states.
+
+        Args:
+            coordinates: (..., Σ ·) of `Trajectory`.
+            velocities: (..., nv).
+
+        Raises:
+            EngineFailure: they are not as many as the mechanism has.
+
+        """
+        ends = np.cumsum([chart.q.shape[-1] for chart in self.charts])
+        for name, array, size in (
+            ("coordinates", coordinates, ends[-1]),
+            ("velocities", velocities, self.nv),
+        ):
+            if array.shape[-1] != size:
+                raise EngineFailure(f"{name} has {array.shape[-1]} entries per sample, expected {size}")
+        q = np.split(coordinates.astype(LongDouble), ends[:-1], axis=-1)
+        for at, chart in zip(q, self.charts, strict=True):
+            if chart.is_group:
+                at[..., :4] = _unit(at[..., :4])
+        return q, velocities.astype(LongDouble)
 
     def move(self, q: list[Array], displacement: Array) -> list[Array]:
         """Displace the coordinates.
@@ -319,23 +349,28 @@ class StepCharts:
     def _mass_matrix(self, q: list[Array]) -> Array:
         """M (B, nv, nv), by the velocities that each rate alone gives the bodies; rotors included."""
         tree, model = _MovingTree(self, q, np.eye(self.nv, dtype=LongDouble)[:, None]), self.model
-        M = np.zeros((len(q[0]), self.nv, self.nv), LongDouble)
+        lead, left, right = (self.nv, len(q[0])), list[Array](), list[Array]()
+
+        def add(rate: Array, momentum: Array) -> None:
+            for found, x in ((left, rate), (right, momentum)):
+                found.append(np.broadcast_to(x, (*lead, *x.shape[-2:]))[..., 0])
+
         for k in range(model.n):
-            v, w = (np.broadcast_to(x, (self.nv, *M.shape[:1], 3, 1)) for x in (tree.v[k], tree.w[k]))
-            spin = tree.num.mul(tree.A[k].mT, w)
-            parts = [(v, v * LongDouble(model.mass[k])), (spin, tree.num.mul(tree.inertia(k), spin))]
+            spin = tree.num.mul(tree.A[k].mT, tree.w[k])
+            add(tree.v[k], tree.v[k] * LongDouble(model.mass[k]))
+            add(spin, tree.num.mul(tree.inertia(k), spin))
             if k in self.of_rod:
                 about = tree.rod_spin(k)
-                parts.append((about, about * self.axial_inertia(k)))
-            for x, y in parts:
-                a, b = (np.moveaxis(z[..., 0], 0, 1) for z in (x, y))
-                M += a @ b.mT
+                add(about, about * self.axial_inertia(k))
+        rates, momenta = (np.ascontiguousarray(np.swapaxes(_joined(x), 0, 1)) for x in (left, right))
+        M = rates @ np.ascontiguousarray(momenta.mT)
+        for k in range(model.n):
             if np.any(model.armature[k]):
                 places = range(*self.own[self.of_body[k]].indices(self.nv))
                 of_all = KINDS[model.kind[k]].has_attitude
                 for i, place in enumerate(places):
                     M[..., place, place] += LongDouble(model.armature[k, 0 if of_all else i])
-        return M
+        return np.asarray(M)
 
     def axial_inertia(self, k: int) -> Any:
         """Return the inertia of rod k about itself, of which only relative rotations take account."""
@@ -413,11 +448,14 @@ class StepCharts:
                 u[..., k, :], udot[..., k, :] = (part[..., 0] for part in tree.rod_direction(k))
             if count := len(KINDS[name].motions):
                 x[..., k, :count], xdot[..., k, :count] = q[chart], v[..., self.own[chart]]
-        found = BodyStates(r, np.stack(tree.p, -2), velocity, omega_, u, udot, x, xdot)
-        if not self.cut:
-            return found
-        place = self.cut.place[: self.cut.source.n]
-        return BodyStates(*(getattr(found, one.name)[..., place, :] for one in fields(found)))
+        kinetic, potential, momentum = tree.totals()
+        energy = np.broadcast_to((kinetic + potential)[..., 0, 0], lead)
+        of_bodies = [r, np.stack(tree.p, -2), velocity, omega_, u, udot, x, xdot]
+        if self.cut:
+            place = self.cut.place[: self.cut.source.n]
+            of_bodies = [one[..., place, :] for one in of_bodies]
+        momentum = np.broadcast_to(momentum[..., 0], (*lead, 3))
+        return BodyStates(*of_bodies, energy=energy, momentum=momentum)
 
     def body_accelerations(self) -> tuple[Array, Array]:
         """Return r̈ (B, N, 3), world axes, and ω̇′ (B, N, 3), body axes, at the states.

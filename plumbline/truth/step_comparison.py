@@ -24,23 +24,31 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from plumbline.model.datatypes import KINDS, Array, Kind, Model, State, StepRun
+from plumbline.model.datatypes import KINDS, Array, Kind, Model, State, StepRun, Trajectory
 from plumbline.model.kinematics import (
     angular_velocity,
     complete_state,
     mass_matrix,
+    stack_states,
     stretched_length,
     velocity_jacobian,
 )
 from plumbline.model.loops import RANK_TOLERANCE, cut_open
 from plumbline.model.sampling import derive_seed
 from plumbline.model.step_methods import ConstrainedMethod, JointSpaceMethod, StepMethod
-from plumbline.truth.rounding_bound import EPS, RoundingBound, remembered_rounding_bound
-from plumbline.truth.step_charts import BodyStates
+from plumbline.truth.rounding_bound import (
+    EPS,
+    SUM_ROUNDING_FACTOR,
+    RoundingBound,
+    remembered_rounding_bound,
+    rounding_bounds,
+)
+from plumbline.truth.step_charts import BodyStates, StepCharts
 from plumbline.truth.step_formulas import (
     constrained_quadrature,
     constrained_residual,
@@ -48,11 +56,17 @@ from plumbline.truth.step_formulas import (
     first_acceleration_bound,
     first_coordinate_acceleration,
     joint_space_steps,
+    steps_in_charts,
 )
 
 STEP_ROUNDINGS = 32
 ACCELERATION_FACTOR = 3.0
+ACCELERATIONS = ("angular_acceleration", "acceleration", "rod_torque")  # whose bounds a step's depends on
 DISTURBANCE = 1e-9  # of rates, to measure the growth of perturbations
+SAMPLE_FACTOR = 4.0  # on what a step's bound has without accelerations: velocities add up along chains
+MEAN_SHARE, MEAN_SPREAD = 1 / 32, 1.0  # of the bounds: what constants are off, rounded once; chance
+MOMENTUM_SHARE = 1 / 16  # of the bounds of all rates, in the change of momentum
+CLOCK_ROUNDINGS = 2  # of a time that is a sum of steps
 RESIDUAL_STEPS = 2  # after one, Euler does not show the axial inertia of rods
 MAX_GROWTH = 1e4  # of perturbations; beyond it the method itself is unstable, and nothing is compared
 STEP_UNITS = {"step_position": "m", "step_attitude": "rad", "step_velocity": "m/s", "step_rate": "rad/s"}
@@ -61,6 +75,12 @@ CONSTRAINED_UNITS = {
     "step_equations": "N",
     "step_first_acceleration": "m/s²",
 }
+# of every step of a run; "1" are multiples of what rounding explains
+RUN_UNITS = {
+    "run_position": "m", "run_attitude": "rad", "run_velocity": "m/s", "run_rate": "rad/s",
+    "run_energy": "J", "run_momentum": "kg m²/s", "run_mean": "1", "run_samples": "1",
+    "run_quadrature": "1", "run_equations": "N",
+}  # fmt: skip
 
 Runs = Sequence[tuple[int, float, StepRun]]  # index of the state, step [s], steps
 
@@ -144,7 +164,8 @@ class FormulaSteps:
         self.starts, sizes = [states[index] for index, *_ in starts], [h for _, h, _ in starts]
         axes = [angle_axes for *_, angle_axes in starts]
         used = dict.fromkeys(index for index, *_ in starts)
-        self.bounds = {index: self._acceleration_bound(states[index]) for index in used}
+        bounds = acceleration_bounds(method, model, [states[index] for index in used])
+        self.bounds = dict(zip(used, bounds, strict=True))
         nearby = {index: _disturbed(model, states[index], self.bounds[index]) for index in used}
         disturbed = [nearby[index] for index, *_ in starts]
         self.counts = tuple(counts) or step_counts(method)
@@ -224,29 +245,17 @@ class FormulaSteps:
         for i, run in enumerate(runs):
             count = min(RESIDUAL_STEPS, len(run.trajectory.t) - 1)
             _, bound = self._bounds_after(i, count)
-            for name, difference in _differences(_pick(motions[count], i), run, count).items():
+            for name, difference in _differences(_pick(motions[count], i), run.trajectory, count).items():
                 found.append((difference / (count * bound[name][:, None])).ravel())
         return np.concatenate(found)
 
     def _bounds_after(self, i: int, count: int) -> _EndBounds:
         """Rounding bounds at both ends of a run's first steps, and those of the steps; computed once."""
         if (i, count) not in self._end_bounds:
-            (index, h), end = self.places[i], _rounded(self.true[i][count])
-            ends = self.bounds[index], self._acceleration_bound(end)
+            (index, h), end = self.places[i], self.true[i][count].rounded()
+            ends = self.bounds[index], acceleration_bounds(self.method, self.model, [end])[0]
             self._end_bounds[i, count] = ends, self.step_bound((self.starts[i], end), ends, h, count)
         return self._end_bounds[i, count]
-
-    def _acceleration_bound(self, state: State) -> RoundingBound:
-        """The state level's bound, and what the correction of gaps adds to its accelerations."""
-        bound, rate = remembered_rounding_bound(self.model, state), self.method.gap_correction
-        if not (self.model.has_loops and rate):
-            return bound
-        moving, turning = _correction_roundings(self.model, state, rate)
-        return replace(
-            bound,
-            acceleration=bound.acceleration + moving,
-            angular_acceleration=bound.angular_acceleration + turning,
-        )
 
     def step_bound(
         self, ends: tuple[State, ...], bounds: tuple[RoundingBound, ...], h: float, count: int
@@ -262,62 +271,101 @@ class FormulaSteps:
             By quantity the bounds (N,), in its unit of `STEP_UNITS`.
 
         """
-        norm, model = np.linalg.norm, self.model
-        kinds, far = model.kind[: model.n], model.body[: model.n, 0]  # of the joints of the tree
-        path, slides = _paths(far), np.array([_slides(kind) for kind in kinds])
-        rate = np.max([np.maximum(norm(s.omega, axis=1), norm(s.udot, axis=1)) for s in ends], axis=0)
-        speed = np.max([norm(s.v, axis=1) for s in ends], axis=0)
-        W, V = (np.max(np.where(path, x, 0.0), axis=1) for x in (rate, speed))
-        arm = path @ stretched_length(model)
-        if np.any(slides):
-            arm = arm + np.max([np.max(np.where(path, norm(s.r, axis=1), 0.0), axis=1) for s in ends], axis=0)
-        links = [max(1, len(KINDS[kind].motions)) + KINDS[kind].holds_distance for kind in kinds]
-        rounding = STEP_ROUNDINGS * EPS * (path @ np.array(links))
-        turning, acceleration, torque = (
-            np.max([getattr(b, name) for b in bounds], axis=0)
-            for name in ("angular_acceleration", "acceleration", "rod_torque")
-        )
-        # Rates are kept relative to the link before: what rounding does to one link, and to the spin of a
-        # rod, reaches those beyond it once they have turned against it.
-        above, shifted = (
-            np.where(far >= 0, x[far], 0.0) for x in (turning, acceleration * (slides @ path > 0))
-        )
-        if self.method.coordinates == "joint rotations":
-            axial = self.method.rod_axial_inertia * np.trace(model.inertia, axis1=1, axis2=2)
-            # bodies on rods have inertia; of others there is no torque here
-            above = above + np.divide(torque, axial, out=np.zeros_like(axial), where=torque > 0)
-        leaked, passed = (count * np.minimum(1.0, h * W) * (path @ x) for x in (above, shifted))
-        omega = ACCELERATION_FACTOR * h * (turning + leaked) + rounding * W
-        velocity = ACCELERATION_FACTOR * h * (acceleration + leaked * arm + passed)
-        velocity += rounding * np.maximum(V, W * arm)
-        if self.method.free_coordinates == "rigid motion" and self.method.formula == "Runge-Kutta":
-            # closed forms of dexp⁻¹ of a rigid motion divide differences by the square of the turn
-            free = np.array([KINDS[kind].holds_nothing for kind in kinds])
-            turn = np.clip(h * rate, 1e-4, 1.0)  # rad
-            velocity += path @ np.where(free, STEP_ROUNDINGS * EPS * speed / turn**2, 0.0)
-        return {
-            "step_rate": omega,
-            "step_velocity": velocity,
-            "step_attitude": count * h * omega + rounding,
-            "step_position": count * h * velocity + rounding * arm,
-        }
+        sizes = _sizes(stack_states(ends), bounds)
+        largest = {name: np.max(size, axis=0) for name, size in sizes.items()}
+        return step_bound(self.method, self.model, largest, h, count)
 
 
-def _correction_roundings(model: Model, state: State, rate: float) -> Array:
-    """(2, N) r̈ and ω̇′ by the roundings of gaps that a method corrects with a rate a [1/s]."""
+def acceleration_bounds(
+    method: JointSpaceMethod, model: Model, states: Sequence[State]
+) -> list[RoundingBound]:
+    """Compute the state level's bounds, and what the correction of gaps adds to its accelerations."""
+    bounds, rate = rounding_bounds(model, states), method.gap_correction
+    if not (model.has_loops and rate):
+        return bounds
+    added = _correction_roundings(model, stack_states(states), rate)
+    return [
+        replace(b, acceleration=b.acceleration + a, angular_acceleration=b.angular_acceleration + alpha)
+        for b, (a, alpha) in zip(bounds, added, strict=True)
+    ]
+
+
+def _sizes(states: State, bounds: Sequence[RoundingBound]) -> dict[str, Array]:
+    """What a step's bound depends on (S, N), at S states and in units of their bounds."""
+    norm = np.linalg.norm
+    found = {name: np.array([getattr(b, name) for b in bounds]) for name in ACCELERATIONS}
+    return found | {
+        "rate": np.maximum(norm(states.omega, axis=-1), norm(states.udot, axis=-1)),
+        "speed": norm(states.v, axis=-1),
+        "place": norm(states.r, axis=-1),
+    }
+
+
+def step_bound(
+    method: JointSpaceMethod, model: Model, sizes: dict[str, Array], h: float, count: int
+) -> dict[str, Array]:
+    """Compute the bounds of one of several steps.
+
+    Args:
+        sizes: of `_sizes`, (..., N): the largest at the ends of the steps.
+        h: step [s].
+
+    Returns:
+        By quantity the bounds (..., N), in its unit of `STEP_UNITS`.
+
+    """
+    rate, speed, turning, acceleration, torque = (
+        sizes[name] for name in ("rate", "speed", "angular_acceleration", "acceleration", "rod_torque")
+    )
+    kinds, far = model.kind[: model.n], model.body[: model.n, 0]  # of the joints of the tree
+    path, slides = _paths(far), np.array([_slides(kind) for kind in kinds])
+    W, V, place = (np.max(np.where(path, x[..., None, :], 0.0), -1) for x in (rate, speed, sizes["place"]))
+    arm = path @ stretched_length(model) + place * bool(np.any(slides))
+    links = [max(1, len(KINDS[kind].motions)) + KINDS[kind].holds_distance for kind in kinds]
+    rounding = STEP_ROUNDINGS * EPS * (path @ np.array(links))
+    # Rates are kept relative to the link before: what rounding does to one link, and to the spin of a
+    # rod, reaches those beyond it once they have turned against it.
+    above, shifted = (
+        np.where(far >= 0, x[..., far], 0.0) for x in (turning, acceleration * (slides @ path > 0))
+    )
+    if method.coordinates == "joint rotations":
+        axial = method.rod_axial_inertia * np.trace(model.inertia, axis1=1, axis2=2)
+        # bodies on rods have inertia; of others there is no torque here
+        above = above + np.divide(torque, axial, out=np.zeros_like(torque), where=torque > 0)
+    leaked, passed = (count * np.minimum(1.0, h * W) * (x @ path.T) for x in (above, shifted))
+    omega = ACCELERATION_FACTOR * h * (turning + leaked) + rounding * W
+    velocity = ACCELERATION_FACTOR * h * (acceleration + leaked * arm + passed)
+    velocity += rounding * np.maximum(V, W * arm)
+    if method.free_coordinates == "rigid motion" and method.formula == "Runge-Kutta" and count:
+        # closed forms of dexp⁻¹ of a rigid motion divide differences by the square of the turn
+        free = np.array([KINDS[kind].holds_nothing for kind in kinds])
+        turn = np.clip(h * rate, 1e-4, 1.0)  # rad
+        velocity += np.where(free, STEP_ROUNDINGS * EPS * speed / turn**2, 0.0) @ path.T
+    return {
+        "step_rate": omega,
+        "step_velocity": velocity,
+        "step_attitude": count * h * omega + rounding,
+        "step_position": count * h * velocity + rounding * arm,
+    }
+
+
+def _correction_roundings(model: Model, states: State, rate: float) -> Array:
+    """(S, 2, N) r̈ and ω̇′ by the roundings of gaps that a method corrects with a rate a [1/s]."""
     cut = cut_open(model)
-    there, scale, norm = cut.state(state), cut.row_scale, np.linalg.norm
-    of_bodies = velocity_jacobian(cut.model, there).reshape(cut.model.n, 6, -1)
-    J = np.concatenate([of_bodies[b] - of_bodies[c] for b, c in cut.ends]) * scale[:, None]
+    there, scale, norm = cut.state(states), cut.row_scale, np.linalg.norm
+    of_bodies = velocity_jacobian(cut.model, there)
+    J = cut.jacobian(there) * scale[:, None]
     # a rod has no rate along itself, and M no inverse
-    pushed = np.linalg.pinv(mass_matrix(cut.model, there), hermitian=True) @ J.T
+    pushed = np.linalg.pinv(mass_matrix(cut.model, there), hermitian=True) @ J.mT
     response = pushed @ np.linalg.pinv(J @ pushed, rcond=RANK_TOLERANCE, hermitian=True) * scale
-    size = np.max(norm(state.r, axis=1)) + np.max(norm(model.point, axis=2))
-    turning = np.max(norm(state.omega, axis=1))
-    moving = np.max(norm(state.v, axis=1)) + turning * size
-    rows = STEP_ROUNDINGS * EPS * (rate**2 * np.array([size, 1.0]) + 2 * rate * np.array([moving, turning]))
-    found = np.abs(of_bodies @ response) @ np.tile(np.repeat(rows, 3), len(cut.ends))
-    return np.asarray(norm(found.reshape(-1, 2, 3), axis=2)[cut.place[: model.n]].T)
+    size = np.max(norm(states.r, axis=-1), -1) + np.max(norm(model.point, axis=2))
+    turning = np.max(norm(states.omega, axis=-1), -1)
+    moving = np.max(norm(states.v, axis=-1), -1) + turning * size
+    pairs = (size, moving), (np.ones_like(size), turning)
+    rows = [STEP_ROUNDINGS * EPS * (rate**2 * gap + 2 * rate * gap_rate) for gap, gap_rate in pairs]
+    each = np.tile(np.repeat(np.stack(rows, -1), 3, axis=-1), len(cut.ends))
+    found = (np.abs(of_bodies @ response) @ each[..., None]).reshape(len(size), -1, 2, 3)
+    return np.moveaxis(norm(found, axis=3)[:, cut.place[: model.n]], 2, 1)
 
 
 def _paths(far: NDArray[np.intp]) -> NDArray[np.bool_]:
@@ -358,17 +406,11 @@ def _separation(links: BodyStates, i: int, count: int, weights: dict[str, Array]
     return float(np.max(found))
 
 
-def _rounded(links: BodyStates) -> State:
-    names = ("p", "omega", "u", "udot", "r", "v", "x", "xdot")
-    return State(*(np.asarray(getattr(links, name), float) for name in names))
-
-
-def _differences(true: BodyStates, run: StepRun, count: int) -> dict[str, Array]:
-    """Differences (N, ·) per body; of attitudes twice those of quaternions as they are, not normalised."""
-    t = run.trajectory
-    p = t.p[count].astype(np.longdouble)
+def _differences(true: BodyStates | State, t: Trajectory, count: int | slice) -> dict[str, Array]:
+    """Differences (..., N, ·) of bodies; of attitudes twice those of quaternions as they are."""
+    p: Any = t.p[count].astype(np.longdouble)
     sign = np.where(np.sum(p * true.p, axis=-1, keepdims=True) < 0, -1, 1)
-    pairs = {
+    pairs: dict[str, tuple[Any, Any]] = {
         "step_position": (t.r[count], true.r),
         "step_velocity": (t.v[count], true.v),
         "step_rate": (angular_velocity(p, t.pdot[count]), true.omega),
@@ -379,7 +421,7 @@ def _differences(true: BodyStates, run: StepRun, count: int) -> dict[str, Array]
 
 def _errors(true: BodyStates, run: StepRun, count: int) -> dict[str, Array]:
     """Sizes (N,) of the differences."""
-    found = _differences(true, run, count)
+    found = _differences(true, run.trajectory, count)
     return {name: np.linalg.norm(difference, axis=-1) for name, difference in found.items()}
 
 
@@ -395,6 +437,154 @@ def _effects(bounds: tuple[RoundingBound, RoundingBound], h: float, count: int) 
         "step_attitude": h * turning,
         "step_position": h * acceleration,
     }
+
+
+# -- every step of a run -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class StepDeviations:
+    """One quantity at every step of a run: how far the engine's step is off the declared one."""
+
+    errors: Array  # (steps, K)
+    bounds: Array  # (steps, K) what rounding explains
+    effects: Array  # (steps, K) of the accelerations on the quantity; 0 where they have none
+
+    @property
+    def ratios(self) -> Array:
+        """Errors over their bounds (steps, K)."""
+        return np.asarray(self.errors / np.maximum(self.bounds, np.finfo(float).tiny))
+
+
+def joined(parts: Sequence[StepDeviations]) -> StepDeviations:
+    """Put the worst of several deviations in place of all, body by body."""
+    worst = np.argmax([part.ratios for part in parts], axis=0)[None]
+    columns = ([getattr(part, name) for part in parts] for name in ("errors", "bounds", "effects"))
+    return StepDeviations(*(np.take_along_axis(np.array(x), worst, 0)[0] for x in columns))
+
+
+class RunSteps:
+    """Every step of a run: each of the engine's samples against the declared step from the one before.
+
+    The step starts from the engine's own coordinates.  That they are those of the samples that it reports,
+    that the first one is the state that it was given, and the times are compared as well.
+    """
+
+    def __init__(
+        self, method: JointSpaceMethod, model: Model, state: State, h: float, run: StepRun
+    ) -> None:  # fmt: skip
+        """Take the declared step from every sample but the last.
+
+        Args:
+            state: that the engine was given.
+            h: step [s].
+            run: with coordinates.
+
+        Raises:
+            EngineFailure: there are other coordinates than the mechanism has.
+
+        """
+        motion = run.trajectory
+        assert motion.coordinates is not None and motion.velocities is not None
+        self.method, self.model, self.state, self.h, self.motion = method, model, state, h, motion
+        self.charts = StepCharts(model, method, [state], [run.angle_axes])
+        q, v = self.charts.divided(motion.coordinates, motion.velocities)
+        self.here = self.charts.bodies(q, v)
+        self.after = steps_in_charts(self.charts, [at[:-1] for at in q], v[:-1], [h], 1)[1]
+        rounded = self.here.rounded()
+        self.states = [State(**{name: x[i] for name, x in vars(rounded).items()}) for i in range(len(v))]
+        self.bounds = acceleration_bounds(method, model, self.states)
+        sizes = _sizes(rounded, self.bounds)
+        at_rest = step_bound(method, model, sizes, 0.0, 0)
+        self.of_samples = {name: SAMPLE_FACTOR * x for name, x in at_rest.items()}
+        between = {name: np.maximum(x[:-1], x[1:]) for name, x in sizes.items()}
+        self.of_step = step_bound(method, model, between, h, 1)
+
+    def compare(self) -> dict[str, StepDeviations]:
+        """Compare every step.
+
+        Returns:
+            By quantity of `RUN_UNITS`.
+
+        """
+        found, bounds = dict[str, StepDeviations](), self.bounds
+        scale = {
+            name: np.array([b.scale[name] for b in bounds])
+            for name in ("angular_acceleration", "acceleration")
+        }
+        turning, pushing = (self.h * np.maximum(x[:-1], x[1:]) for x in scale.values())
+        effects = {"rate": turning, "velocity": pushing}
+        effects |= {"attitude": self.h * turning, "position": self.h * pushing}
+        off = _differences(self.after, self.motion, slice(1, None))
+        for quantity, difference in off.items():
+            name = quantity.removeprefix("step_")
+            found[f"run_{name}"] = StepDeviations(
+                np.linalg.norm(difference, axis=-1), self.of_step[quantity], effects[name]
+            )
+        kinetic, potential, momentum, moment = (
+            np.array([getattr(b, name) for b in bounds])
+            for name in ("kinetic_energy", "potential_energy", "angular_momentum", "joint_terms")
+        )
+        # momenta of bodies are not what joint-space engines compute: errors of rates add up in them
+        model, reach = self.model, np.linalg.norm(np.asarray(self.here.r[1:], float), axis=-1)
+        passed = (model.mass * reach * self.of_step["step_velocity"]).sum(-1)
+        passed += self.of_step["step_rate"] @ np.linalg.norm(model.inertia, axis=(1, 2))
+        energy, momentum = kinetic + potential, momentum + self.h * moment
+        for name, lost, size in (
+            ("energy", self.here.energy[1:] - self.after.energy, energy),
+            ("momentum", self.here.momentum[1:] - self.after.momentum, momentum),
+        ):
+            error = np.abs(lost) if lost.ndim == 1 else np.linalg.norm(np.asarray(lost, float), axis=-1)
+            largest = np.maximum(size[:-1], size[1:])[:, None]
+            largest = largest + (name == "momentum") * MOMENTUM_SHARE * passed[:, None]
+            found[f"run_{name}"] = StepDeviations(
+                np.asarray(error, float)[:, None], largest, size[1:, None] / (EPS * SUM_ROUNDING_FACTOR)
+            )
+        found["run_mean"] = self._mean(off, found)
+        found["run_samples"] = self._samples()
+        return found
+
+    def _mean(self, off: dict[str, Array], found: dict[str, StepDeviations]) -> StepDeviations:
+        """Mean over the run of the deviations of rates along what the step changes, in units of the bounds.
+
+        A mistake that is smaller than the rounding of one step has one direction in all of them.
+        """
+        before, means = self.here, list[Array]()
+        for name, field_name in (("rate", "omega"), ("velocity", "v")):
+            change = np.asarray(getattr(self.after, field_name) - getattr(before, field_name)[:-1], float)
+            size = np.linalg.norm(change, axis=-1)
+            along = np.sum(off[f"step_{name}"] * change, -1) / np.where(size > 0, size, 1.0)
+            means.append(np.abs(np.mean(along / found[f"run_{name}"].bounds, axis=0)))
+        bound = np.full((1, self.model.n), MEAN_SHARE + MEAN_SPREAD / np.sqrt(len(off["step_rate"])))
+        return StepDeviations(np.max(means, axis=0)[None], bound, np.full_like(bound, np.inf))
+
+    def _samples(self) -> StepDeviations:
+        """Samples against the coordinates, the first against the given state, and the times."""
+        motion, given = self.motion, self.state
+        count = np.arange(len(motion.t))
+        off = _differences(self.here, motion, slice(None))
+        ratios = [np.linalg.norm(x, axis=-1) / self.of_samples[name] for name, x in off.items()]
+        at_start = _differences(given, motion, 0)
+        for name, x in at_start.items():
+            ratios.append(np.zeros_like(ratios[0]))
+            ratios[-1][0] = np.linalg.norm(x, axis=-1) / self.of_samples[name][0]
+        late = np.abs(motion.t - count * self.h)
+        clock = late / (CLOCK_ROUNDINGS * EPS * self.h * (1 + count) ** 2)
+        clock[-1] = np.inf if motion.steps != count[-1] else clock[-1]
+        worst = np.maximum(np.max(ratios, axis=0), clock[:, None])
+        return StepDeviations(worst, np.ones_like(worst), np.full_like(worst, np.inf))
+
+    def condition(self, index: int, body: int) -> str:
+        """Describe a sample: its time, how fast a body turns, and where its joint is."""
+        here, motions = self.here, self.model.kinds[body].motions
+        spin = float(np.linalg.norm(here.omega[index, body]))
+        words = f"t = {self.motion.t[index]:.6g} s, body {body + 1} turns at {spin:.3g} rad/s"
+        if motions:
+            x = ", ".join(f"{float(x):.4g}" for x in here.x[index, body, : len(motions)])
+            return f"{words}, its joint at {x} (rad or m)"
+        cosine = abs(float(np.sum(here.p[index, body] * here.p[0, body])))
+        turned = 2 * np.arccos(min(1.0, cosine))
+        return f"{words}, {turned:.3g} rad from its attitude at the start"
 
 
 # -- constraints and an iterative solver -------------------------------------------------------------
@@ -419,23 +609,13 @@ def compare_parts(
     first: dict[int, tuple[Array, Array]] = {}  # by state: first accelerations and their bounds
     for index, h, run in runs:
         place = Place(index, h, len(run.trajectory.t) - 1)
-        for difference, bound, effect in _quadrature_differences(method, run, h, model.has_loops):
-            error = np.max(np.abs(difference), axis=-1)  # (T − 1, N)
-            worst = np.argmax(error / np.maximum(bound, np.finfo(float).tiny), axis=0)
-            body = np.arange(model.n)
-            found["step_quadrature"].add(error[worst, body], bound[worst, body], effect[worst, body], place)
+        for name, parts in constrained_deviations(method, model, run, h).items():
+            for part in parts:
+                worst, body = np.argmax(part.ratios, axis=0), np.arange(part.errors.shape[1])
+                errors, bounds, effects = (x[worst, body] for x in (part.errors, part.bounds, part.effects))
+                found[f"step_{name}"].add(errors, bounds, effects, place)
         if not model.has_chain_joints:  # the rows of its other joints off |p| = 1 are not written here
             continue
-        residual = constrained_residual(model, method, run)
-        allowed = (
-            np.maximum(method.solver_atol, method.solver_rtol * residual.size)
-            + STEP_ROUNDINGS * EPS * residual.size
-        )
-        worst_step = int(np.argmax(residual.residual / allowed))
-        found["step_equations"].add(
-            residual.residual[worst_step : worst_step + 1], allowed[worst_step : worst_step + 1],
-            residual.size[worst_step : worst_step + 1], place,
-        )  # fmt: skip
         if index not in first:
             solved = remembered_rounding_bound(model, states[index])
             allowed = first_acceleration_bound(model, method, states[index]) + np.maximum(
@@ -446,6 +626,30 @@ def compare_parts(
         error = np.asarray(np.max(np.abs(true - engine_coordinates(run)[2][0]), axis=-1), float)
         found["step_first_acceleration"].add(error, allowed, np.zeros(model.n), place)
     return {quantity: one for quantity, one in found.items() if one.errors}
+
+
+def constrained_deviations(
+    method: ConstrainedMethod, model: Model, run: StepRun, h: float
+) -> dict[str, list[StepDeviations]]:
+    """Compare every step in parts that need no iteration.
+
+    Returns:
+        Quadrature of q and of q̇, and the equations where they are written here.
+
+    """
+    found = {
+        "quadrature": [
+            StepDeviations(np.max(np.abs(difference), axis=-1), bound, effect)
+            for difference, bound, effect in _quadrature_differences(method, run, h, model.has_loops)
+        ]
+    }
+    if not model.has_chain_joints:  # the rows of its other joints off |p| = 1 are not written here
+        return found
+    residual = constrained_residual(model, method, run)
+    allowed = np.maximum(method.solver_atol, method.solver_rtol * residual.size)
+    allowed = allowed + STEP_ROUNDINGS * EPS * residual.size
+    columns = (x[:, None] for x in (residual.residual, allowed, residual.size))
+    return found | {"equations": [StepDeviations(*columns)]}
 
 
 def quadrature_residuals(method: ConstrainedMethod, runs: Runs, has_loops: bool) -> Array:

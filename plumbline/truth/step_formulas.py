@@ -36,19 +36,32 @@ def joint_space_steps(
     count: int,
     angle_axes: Sequence[Array | None],
 ) -> list[BodyStates]:
-    """Take steps of a declared method from each state.
+    """Take steps of a declared method from each state, as `steps_in_charts`.
 
     Args:
         steps: the step [s] from each.
         angle_axes: for "joint angles", the axes (angles, 3) of the revolute joints at each state.
+
+    """
+    charts = (_ReusingCharts if method.reuses_acceleration else StepCharts)(model, method, states, angle_axes)
+    return steps_in_charts(charts, *charts.start(), steps, count)
+
+
+def steps_in_charts(
+    tree: StepCharts, q: Coordinates, v: Array, steps: Sequence[float], count: int
+) -> list[BodyStates]:
+    """Take steps of the declared method from coordinates.
+
+    Args:
+        v: (B, nv).
+        steps: B steps [s], or one.
 
     Returns:
         The motion (B, N, ·) after 0, 1, 2, …, ``count`` steps; not finite where a step leads into a
         singularity.
 
     """
-    tree = (_ReusingCharts if method.reuses_acceleration else StepCharts)(model, method, states, angle_axes)
-    q, v = tree.start()
+    method = tree.method
     h = np.array(steps, LongDouble)[:, None] * LongDouble(method.step_factor) / method.substeps
     found = [tree.bodies(q, v)]
     with np.errstate(all="ignore"):

@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from plumbline.engines.registry import load_adapter
-from plumbline.execution.plan import TaskKind
-from plumbline.execution.scenario_verdicts import uncompared_kinds
 from plumbline.scenario.loader import Scenario
 
 MOTIONS = {  # scenario: what it adds to those above it, of the cheapest ones
@@ -38,16 +36,15 @@ STATES = STEPS | {
     "slider-crank": "a loop with a slide",
 }
 LOADS = ("force", "moment", "drag_force", "drag_moment")
-KINDS = {"step": TaskKind.STEP, "trajectory": TaskKind.TRAJECTORY}
 
 
 def levels(engine: str, scenario: Scenario) -> list[str]:
     """Levels at which an engine is compared on a scenario."""
     if scenario.level == "state":
         return ["state"]
-    integrators, left_out = load_adapter(engine).integrators, uncompared_kinds(scenario.model)
+    integrators = load_adapter(engine).integrators
     has = {"step": any(one.method is not None for one in integrators), "trajectory": bool(integrators)}
-    return ["state", *(level for level, kind in KINDS.items() if has[level] and kind not in left_out)]
+    return ["state", *(level for level, is_there in has.items() if is_there)]
 
 
 def is_fast(scenario: Scenario, level: str) -> bool:

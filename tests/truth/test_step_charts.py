@@ -60,8 +60,8 @@ def check_steps(name):
         with patch.object(step_formulas, "StepCharts", ClosedTree):
             before = step_formulas.joint_space_steps(*arguments)
         for old, new in zip(before, after, strict=True):
-            for quantity, value in vars(new).items():
-                true = getattr(old, quantity)
+            for quantity, true in vars(old).items():
+                value = getattr(new, quantity)
                 scale = max(1.0, np.max(np.abs(true), initial=0.0))
                 error = np.max(np.abs(value - true), initial=0.0)
                 assert error < 1e-14 * scale, (method, quantity, float(error / scale))

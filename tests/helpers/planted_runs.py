@@ -1,0 +1,307 @@
+"""Mistakes that real engines make inside runs only: in some steps, in some conditions, or on some run.
+
+Each is a relative mistake of 1e-9 in a number of the engine's model, in its state or in what it reports; in
+every other step the engine is as it is.  Steps count from 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+from unittest.mock import patch
+
+import mujoco
+import numpy as np
+import pinocchio as pin
+
+from adapters import mujoco_engine, pinocchio_engine
+from plumbline.model.datatypes import Array, Integrator, Model, State, Trajectory
+from tests.helpers.planting import Defect, Patch
+
+SIZE = 1e-9
+When = Callable[[int, Array, Array], bool]  # number of the step, q and v before it
+
+
+@dataclass(frozen=True)
+class RunMistake:
+    """A mistake, the step at which it shows first, and the words of its condition."""
+
+    defect: Defect
+    first_step: int | None = None  # None: where the motion meets the condition
+    quantities: tuple[str, ...] = ()  # of which one must report it; none: any of every step
+
+    @property
+    def name(self) -> str:
+        return self.defect.name
+
+
+def _scaled_masses(m: Any, d: Any) -> Callable[[], None]:
+    """Mass and inertia of the last body: all masses together change no motion under gravity alone."""
+    kept = m.body_mass.copy(), m.body_inertia.copy()
+    m.body_mass[-1] *= 1 + SIZE
+    m.body_inertia[-1] *= 1 + SIZE
+
+    def back() -> None:
+        m.body_mass[:], m.body_inertia[:] = kept
+
+    return back
+
+
+def _scaled_gravity(m: Any, d: Any) -> Callable[[], None]:
+    kept = m.opt.gravity.copy()
+    m.opt.gravity *= 1 + SIZE
+
+    def back() -> None:
+        m.opt.gravity = kept
+
+    return back
+
+
+def _scaled_step(m: Any, d: Any) -> Callable[[], None]:
+    kept = m.opt.timestep
+    m.opt.timestep *= 1 + SIZE
+
+    def back() -> None:
+        m.opt.timestep = kept
+
+    return back
+
+
+def _scaled_rates(m: Any, d: Any) -> Callable[[], None]:
+    """The velocity after the step."""
+
+    def back() -> None:
+        d.qvel *= 1 + SIZE
+
+    return back
+
+
+def mujoco_mistake(when: When, change: Callable[[Any, Any], Callable[[], None]], run: int = 0) -> Patch:
+    """A change during some steps of MuJoCo; only on the given run of the adapter, from 1, or on every one."""
+
+    @contextmanager
+    def patched() -> Iterator[None]:
+        real, started = mujoco.mj_step, list[int]()
+
+        def step(m: Any, d: Any, nstep: int = 1) -> None:
+            for _ in range(nstep):
+                number = round(d.time / m.opt.timestep) + 1
+                if number == 1:
+                    started.append(1)
+                is_meant = not run or len(started) == run
+                back = change(m, d) if is_meant and when(number, d.qpos, d.qvel) else lambda: None
+                real(m, d)
+                back()
+
+        with patch.object(mujoco_engine.mujoco, "mj_step", step):
+            yield
+
+    return patched
+
+
+def pinocchio_mistake(when: When, integrator: str, masses: bool = False) -> Patch:
+    """Accelerations, or the mass of the last body, during some steps of Pinocchio."""
+
+    @contextmanager
+    def patched() -> Iterator[None]:
+        real, counts = pinocchio_engine.FIXED_STEPS[integrator], dict[int, int]()
+
+        def step(chain: Any, q: Array, v: Array, h: float) -> tuple[Array, Array]:
+            number = counts[id(chain)] = counts.get(id(chain), 0) + 1
+            if not when(number, q, v):
+                return real(chain, q, v, h)
+            if masses:
+                kept = [pin.Inertia(x) for x in chain.pin_model.inertias]
+                for j in range(len(kept) - 1, len(kept)):
+                    chain.pin_model.inertias[j] = pin.Inertia(
+                        kept[j].mass * (1 + SIZE), kept[j].lever, kept[j].inertia * (1 + SIZE)
+                    )
+                found = real(chain, q, v, h)
+                for j, x in enumerate(kept):
+                    chain.pin_model.inertias[j] = x
+                return found
+            right = chain.acceleration
+            with patch.object(chain, "acceleration", lambda q, v: right(q, v) * (1 + SIZE)):
+                return real(chain, q, v, h)
+
+        with patch.dict(pinocchio_engine.FIXED_STEPS, {integrator: step}):
+            yield
+
+    return patched
+
+
+def wrong_samples(name: str, rows: Callable[[int], slice]) -> Callable[..., Trajectory]:
+    """A field of some samples of a run."""
+
+    def run(simulate: Any, model: Model, state: State, times: Array, i: Integrator, h: float) -> Trajectory:
+        found = simulate(model, state, times, i, h)
+        values = getattr(found, name).copy()
+        values[rows(len(times))] *= 1 + SIZE
+        return Trajectory(**vars(found) | {name: values})
+
+    return run
+
+
+def from_step(n: int) -> When:
+    return lambda number, q, v: number >= n
+
+
+def steps(first: int, last: int) -> When:
+    return lambda number, q, v: first <= number <= last
+
+
+def every(n: int) -> When:
+    return lambda number, q, v: number % n == 0
+
+
+def beyond_angle(at: int, angle: float) -> When:
+    return lambda number, q, v: bool(abs(q[at]) > angle)
+
+
+def beyond_turn(at: int, angle: float) -> When:
+    """A quaternion, scalar at ``at``, further from the identity than an angle."""
+    return lambda number, q, v: bool(2 * np.arccos(min(1.0, abs(q[at]))) > angle)
+
+
+def faster_than(rate: float) -> When:
+    return lambda number, q, v: bool(np.max(np.abs(v)) > rate)
+
+
+def slower_than(rate: float) -> When:
+    return lambda number, q, v: bool(number > 10 and np.max(np.abs(v)) < rate)
+
+
+def _mistake(
+    name: str, mechanism: str, integrator: str, patch_: Patch | None, first: int | None = None,
+    engine: str = "mujoco", run: Any = None, quantities: tuple[str, ...] = (),
+) -> RunMistake:  # fmt: skip
+    defect = Defect(name, engine=engine, mechanism=mechanism, integrator=integrator, patch=patch_, run=run)
+    return RunMistake(defect, first, quantities)
+
+
+_masses, _gravity, _step, _rates = _scaled_masses, _scaled_gravity, _scaled_step, _scaled_rates
+_RODS, _BALLS, _SKEW, _TREE = (
+    "double-tumbling-rods", "double-tumbling-balls", "double-hinge-skew", "loaded-tree",
+)  # fmt: skip
+RUN_MISTAKES = (
+    _mistake("masses from step 500 on", _BALLS, "RK4", mujoco_mistake(from_step(500), _masses), 500),
+    _mistake("masses in four steps", _RODS, "RK4", mujoco_mistake(steps(300, 303), _masses), 300),
+    _mistake("masses every hundredth step", _SKEW, "Euler", mujoco_mistake(every(100), _masses), 100),
+    _mistake(
+        "accelerations in one step",
+        _BALLS,
+        "rkmk4",
+        pinocchio_mistake(steps(411, 411), "rkmk4"),
+        411,
+        "pinocchio",
+    ),
+    _mistake(
+        "positions of samples from 500 on",
+        _BALLS,
+        "RK4",
+        None,
+        500,
+        run=wrong_samples("r", lambda n: slice(500, n)),
+    ),
+    _mistake("masses beyond half a turn", _SKEW, "RK4", mujoco_mistake(beyond_angle(1, np.pi), _masses)),
+    _mistake(
+        "masses in the second run",
+        _BALLS,
+        "RK4",
+        mujoco_mistake(from_step(1), _masses, run=2),
+        quantities=("step_rate", "step_velocity"),
+    ),
+    _mistake("gravity from step 500 on", _RODS, "Euler", mujoco_mistake(from_step(500), _gravity), 500),
+    _mistake("gravity in four steps", _BALLS, "implicit", mujoco_mistake(steps(520, 523), _gravity), 520),
+    _mistake("gravity every hundredth step", _SKEW, "RK4", mujoco_mistake(every(100), _gravity), 100),
+    _mistake(
+        "gravity beyond a quarter turn", _SKEW, "Euler", mujoco_mistake(beyond_angle(1, np.pi / 2), _gravity)
+    ),
+    _mistake("time step from step 500 on", _BALLS, "Euler", mujoco_mistake(from_step(500), _step), 500),
+    _mistake("time step in one step", _RODS, "RK4", mujoco_mistake(steps(77, 77), _step), 77),
+    _mistake("time step every fiftieth step", _TREE, "RK4", mujoco_mistake(every(50), _step), 50),
+    _mistake("velocities after step 250", _BALLS, "RK4", mujoco_mistake(steps(250, 250), _rates), 250),
+    _mistake("velocities every hundredth step", _RODS, "implicit", mujoco_mistake(every(100), _rates), 100),
+    _mistake("velocities at high rates", _BALLS, "Euler", mujoco_mistake(faster_than(6.0), _rates)),
+    _mistake("masses at high rates", _SKEW, "implicit", mujoco_mistake(faster_than(5.0), _masses)),
+    _mistake("masses at low rates", _SKEW, "RK4", mujoco_mistake(slower_than(1.5), _masses)),
+    _mistake("masses in the last step", _BALLS, "Euler", mujoco_mistake(from_step(600), _masses), 600),
+    _mistake("masses in the first step", _RODS, "RK4", mujoco_mistake(steps(1, 1), _masses), 1),
+    _mistake("masses beyond two radians", _BALLS, "RK4", mujoco_mistake(beyond_turn(0, 2.0), _masses)),
+    _mistake(
+        "accelerations from step 500 on",
+        _BALLS,
+        "semi-implicit-euler",
+        pinocchio_mistake(from_step(500), "semi-implicit-euler"),
+        500,
+        "pinocchio",
+    ),
+    _mistake(
+        "accelerations in four steps",
+        _RODS,
+        "rkmk4",
+        pinocchio_mistake(steps(300, 303), "rkmk4"),
+        300,
+        "pinocchio",
+    ),
+    _mistake(
+        "accelerations every hundredth step",
+        _SKEW,
+        "rkmk4",
+        pinocchio_mistake(every(100), "rkmk4"),
+        100,
+        "pinocchio",
+    ),
+    _mistake(
+        "masses of Pinocchio from step 500 on",
+        _SKEW,
+        "rkmk4",
+        pinocchio_mistake(from_step(500), "rkmk4", True),
+        500,
+        "pinocchio",
+    ),
+    _mistake(
+        "accelerations in a loop from step 500 on",
+        "four-bar",
+        "rkmk4",
+        pinocchio_mistake(from_step(500), "rkmk4"),
+        500,
+        "pinocchio",
+    ),
+    _mistake(
+        "accelerations in a loop in four steps",
+        "four-bar",
+        "semi-implicit-euler",
+        pinocchio_mistake(steps(410, 413), "semi-implicit-euler"),
+        410,
+        "pinocchio",
+    ),
+    _mistake(
+        "velocities of samples every hundredth",
+        _SKEW,
+        "RK44",
+        None,
+        100,
+        "exudyn-tree",
+        wrong_samples("v", lambda n: slice(100, n, 100)),
+    ),
+    _mistake(
+        "rates of samples from 500 on",
+        _BALLS,
+        "RK4",
+        None,
+        500,
+        run=wrong_samples("pdot", lambda n: slice(500, n)),
+    ),
+    _mistake(
+        "velocities of Exudyn from 500 on",
+        _BALLS,
+        "generalized-alpha",
+        None,
+        500,
+        "exudyn",
+        wrong_samples("v", lambda n: slice(500, n)),
+    ),
+)
