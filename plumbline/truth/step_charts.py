@@ -202,6 +202,19 @@ class StepCharts:
                 at[..., :4] = _unit(at[..., :4])
         return q, velocities.astype(LongDouble)
 
+    def turned(self, q: list[Array]) -> Array:
+        """Sum the sizes (..., N) of the angles of each body's joint that are numbers."""
+        found = np.zeros((*q[0].shape[:-1], self.model.n))
+        for k, kind in enumerate(self.model.kinds):
+            for at in (self.of_rod.get(k), self.of_body[k]):
+                if at is None or self.charts[at].is_group:
+                    continue
+                angles = q[at][..., 3 * self.charts[at].is_point :]
+                if not self.charts[at].axes:
+                    angles = angles[..., [i for i, (what, _) in enumerate(kind.motions) if what == "turn"]]
+                found[..., k] += np.asarray(np.sum(np.abs(angles), axis=-1), float)
+        return found[..., self.cut.place[: self.cut.source.n]] if self.cut else found
+
     def move(self, q: list[Array], displacement: Array) -> list[Array]:
         """Displace the coordinates.
 
@@ -450,12 +463,11 @@ class StepCharts:
                 x[..., k, :count], xdot[..., k, :count] = q[chart], v[..., self.own[chart]]
         kinetic, potential, momentum = tree.totals()
         energy = np.broadcast_to((kinetic + potential)[..., 0, 0], lead)
-        of_bodies = [r, np.stack(tree.p, -2), velocity, omega_, u, udot, x, xdot]
-        if self.cut:
-            place = self.cut.place[: self.cut.source.n]
-            of_bodies = [one[..., place, :] for one in of_bodies]
+        values = r, np.stack(tree.p, -2), velocity, omega_, u, udot, x, xdot
+        place = self.cut.place[: self.cut.source.n] if self.cut else slice(None)
+        of_bodies = dict(zip(BodyStates.__match_args__, (one[..., place, :] for one in values), strict=False))
         momentum = np.broadcast_to(momentum[..., 0], (*lead, 3))
-        return BodyStates(*of_bodies, energy=energy, momentum=momentum)
+        return BodyStates(**of_bodies, energy=energy, momentum=momentum)
 
     def body_accelerations(self) -> tuple[Array, Array]:
         """Return r̈ (B, N, 3), world axes, and ω̇′ (B, N, 3), body axes, at the states.

@@ -53,6 +53,7 @@ from plumbline.truth.step_formulas import (
     constrained_quadrature,
     constrained_residual,
     engine_coordinates,
+    fastest_rates,
     first_acceleration_bound,
     first_coordinate_acceleration,
     joint_space_steps,
@@ -63,11 +64,14 @@ STEP_ROUNDINGS = 32
 ACCELERATION_FACTOR = 3.0
 ACCELERATIONS = ("angular_acceleration", "acceleration", "rod_torque")  # whose bounds a step's depends on
 DISTURBANCE = 1e-9  # of rates, to measure the growth of perturbations
+ANGLE_ROUNDINGS = 4
+MAX_TURN = 1.0  # rad, step × fastest rate: beyond it explicit methods become unstable, and bounds do not hold
 SAMPLE_FACTOR = 4.0  # on what a step's bound has without accelerations: velocities add up along chains
-MEAN_SHARE, MEAN_SPREAD = 1 / 32, 1.0  # of the bounds: what constants are off, rounded once; chance
-MOMENTUM_SHARE = 1 / 16  # of the bounds of all rates, in the change of momentum
+MEAN_SHARE, MEAN_SPREAD = 1 / 4, 1.0  # of the bounds: what constants are off, rounded once; chance
+MOMENTUM_SHARE = 1 / 4  # of the bounds of all rates, in the change of momentum
 CLOCK_ROUNDINGS = 2  # of a time that is a sum of steps
 RESIDUAL_STEPS = 2  # after one, Euler does not show the axial inertia of rods
+TINY = float(np.finfo(float).tiny)
 MAX_GROWTH = 1e4  # of perturbations; beyond it the method itself is unstable, and nothing is compared
 STEP_UNITS = {"step_position": "m", "step_attitude": "rad", "step_velocity": "m/s", "step_rate": "rad/s"}
 CONSTRAINED_UNITS = {
@@ -319,6 +323,9 @@ def step_bound(
     )
     kinds, far = model.kind[: model.n], model.body[: model.n, 0]  # of the joints of the tree
     path, slides = _paths(far), np.array([_slides(kind) for kind in kinds])
+    turned = 0.0  # an angle of x rad is rounded to ε |x|
+    if "turned" in sizes:
+        turned = ANGLE_ROUNDINGS * EPS * (sizes["turned"] @ path.T)
     W, V, place = (np.max(np.where(path, x[..., None, :], 0.0), -1) for x in (rate, speed, sizes["place"]))
     arm = path @ stretched_length(model) + place * bool(np.any(slides))
     links = [max(1, len(KINDS[kind].motions)) + KINDS[kind].holds_distance for kind in kinds]
@@ -336,16 +343,18 @@ def step_bound(
     omega = ACCELERATION_FACTOR * h * (turning + leaked) + rounding * W
     velocity = ACCELERATION_FACTOR * h * (acceleration + leaked * arm + passed)
     velocity += rounding * np.maximum(V, W * arm)
+    free = np.array([KINDS[kind].holds_nothing for kind in kinds])
+    if method.free_coordinates == "rigid motion":  # ṙ is kept in the body's axes, which turn
+        velocity += np.where(free, count * h * omega * speed, 0.0) @ path.T
     if method.free_coordinates == "rigid motion" and method.formula == "Runge-Kutta" and count:
         # closed forms of dexp⁻¹ of a rigid motion divide differences by the square of the turn
-        free = np.array([KINDS[kind].holds_nothing for kind in kinds])
         turn = np.clip(h * rate, 1e-4, 1.0)  # rad
         velocity += np.where(free, STEP_ROUNDINGS * EPS * speed / turn**2, 0.0) @ path.T
     return {
         "step_rate": omega,
         "step_velocity": velocity,
-        "step_attitude": count * h * omega + rounding,
-        "step_position": count * h * velocity + rounding * arm,
+        "step_attitude": count * h * omega + rounding + turned,
+        "step_position": count * h * velocity + (rounding + turned) * arm,
     }
 
 
@@ -453,7 +462,7 @@ class StepDeviations:
     @property
     def ratios(self) -> Array:
         """Errors over their bounds (steps, K)."""
-        return np.asarray(self.errors / np.maximum(self.bounds, np.finfo(float).tiny))
+        return np.asarray(self.errors / np.maximum(self.bounds, TINY))
 
 
 def joined(parts: Sequence[StepDeviations]) -> StepDeviations:
@@ -494,9 +503,9 @@ class RunSteps:
         rounded = self.here.rounded()
         self.states = [State(**{name: x[i] for name, x in vars(rounded).items()}) for i in range(len(v))]
         self.bounds = acceleration_bounds(method, model, self.states)
-        sizes = _sizes(rounded, self.bounds)
+        sizes = _sizes(rounded, self.bounds) | {"turned": self.charts.turned(q)}
         at_rest = step_bound(method, model, sizes, 0.0, 0)
-        self.of_samples = {name: SAMPLE_FACTOR * x for name, x in at_rest.items()}
+        self.of_samples = {name: SAMPLE_FACTOR * np.maximum(x, TINY) for name, x in at_rest.items()}
         between = {name: np.maximum(x[:-1], x[1:]) for name, x in sizes.items()}
         self.of_step = step_bound(method, model, between, h, 1)
 
@@ -540,9 +549,22 @@ class RunSteps:
             found[f"run_{name}"] = StepDeviations(
                 np.asarray(error, float)[:, None], largest, size[1:, None] / (EPS * SUM_ROUNDING_FACTOR)
             )
+        self._leave_out_coarse_steps(found)
         found["run_mean"] = self._mean(off, found)
         found["run_samples"] = self._samples()
         return found
+
+    def _leave_out_coarse_steps(self, found: dict[str, StepDeviations]) -> None:
+        """Give no bound to steps that disagree where the step does not resolve the motion."""
+        wrong = np.any([np.any(~(x.ratios <= 1), axis=1) for x in found.values()], axis=0)
+        steps = np.flatnonzero(wrong)
+        if not len(steps):
+            return
+        ends = [self.states[n] for i in (0, 1) for n in steps + i]
+        with np.errstate(all="ignore"):
+            rates = np.max(fastest_rates(self.model, ends).reshape(2, -1), axis=0)
+        for x in found.values():
+            x.bounds[steps[self.h * rates > MAX_TURN]] = np.inf
 
     def _mean(self, off: dict[str, Array], found: dict[str, StepDeviations]) -> StepDeviations:
         """Mean over the run of the deviations of rates along what the step changes, in units of the bounds.
@@ -554,7 +576,7 @@ class RunSteps:
             change = np.asarray(getattr(self.after, field_name) - getattr(before, field_name)[:-1], float)
             size = np.linalg.norm(change, axis=-1)
             along = np.sum(off[f"step_{name}"] * change, -1) / np.where(size > 0, size, 1.0)
-            means.append(np.abs(np.mean(along / found[f"run_{name}"].bounds, axis=0)))
+            means.append(np.abs(np.mean(along / np.maximum(found[f"run_{name}"].bounds, TINY), axis=0)))
         bound = np.full((1, self.model.n), MEAN_SHARE + MEAN_SPREAD / np.sqrt(len(off["step_rate"])))
         return StepDeviations(np.max(means, axis=0)[None], bound, np.full_like(bound, np.inf))
 
