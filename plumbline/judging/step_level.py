@@ -215,9 +215,8 @@ def _run_row(
         else:
             reason = (
                 f"{context.title} does not take the declared step of {integrator.name}: over a run of steps "
-                f"of {h:.4g} s the rates of body {body + 1} are off in one direction by "
-                f"{found.errors[worst, column]:.3g} rounding bounds of a step, {ratio:.3g} times what "
-                "rounding explains"
+                f"of {h:.4g} s the rates of body {body + 1} are off in one direction, by {ratio:.3g} times "
+                "what rounding explains in the mean"
             )
     elif np.mean(sharp) < 0.5:
         verdict = Verdict.INFORMATION  # single steps are larger, and decide

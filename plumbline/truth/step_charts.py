@@ -202,18 +202,34 @@ class StepCharts:
                 at[..., :4] = _unit(at[..., :4])
         return q, velocities.astype(LongDouble)
 
-    def turned(self, q: list[Array]) -> Array:
-        """Sum the sizes (..., N) of the angles of each body's joint that are numbers."""
-        found = np.zeros((*q[0].shape[:-1], self.model.n))
+    def coordinate_sizes(self, coordinates: Array) -> dict[str, Array]:
+        """Measure what roundings of an engine's coordinates depend on.
+
+        Args:
+            coordinates: (..., Σ ·) of `Trajectory`.
+
+        Returns:
+            By joint of each body (..., N): the sum of its angles that are numbers, and by how much its
+            quaternions are not of length 1.
+
+        """
+        ends = np.cumsum([chart.q.shape[-1] for chart in self.charts])
+        q, shape = np.split(coordinates.astype(LongDouble), ends[:-1], axis=-1), coordinates.shape[:-1]
+        turned, stretched = np.zeros((2, *shape, self.model.n))
         for k, kind in enumerate(self.model.kinds):
             for at in (self.of_rod.get(k), self.of_body[k]):
-                if at is None or self.charts[at].is_group:
+                if at is None:
                     continue
-                angles = q[at][..., 3 * self.charts[at].is_point :]
-                if not self.charts[at].axes:
-                    angles = angles[..., [i for i, (what, _) in enumerate(kind.motions) if what == "turn"]]
-                found[..., k] += np.asarray(np.sum(np.abs(angles), axis=-1), float)
-        return found[..., self.cut.place[: self.cut.source.n]] if self.cut else found
+                chart, own = self.charts[at], q[at]
+                if chart.is_group:
+                    length = np.sqrt(np.sum(own[..., :4] ** 2, axis=-1))
+                    stretched[..., k] += np.asarray(np.abs(length - 1), float)
+                    continue
+                turns = [i for i, (what, _) in enumerate(kind.motions) if what == "turn"]
+                angles = own[..., 3 * chart.is_point :] if chart.axes else own[..., turns]
+                turned[..., k] += np.asarray(np.sum(np.abs(angles), axis=-1), float)
+        place = self.cut.place[: self.cut.source.n] if self.cut else slice(None)
+        return {"turned": turned[..., place], "stretched": stretched[..., place]}
 
     def move(self, q: list[Array], displacement: Array) -> list[Array]:
         """Displace the coordinates.

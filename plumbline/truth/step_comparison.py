@@ -65,9 +65,11 @@ ACCELERATION_FACTOR = 3.0
 ACCELERATIONS = ("angular_acceleration", "acceleration", "rod_torque")  # whose bounds a step's depends on
 DISTURBANCE = 1e-9  # of rates, to measure the growth of perturbations
 ANGLE_ROUNDINGS = 4
+MAX_STRETCH = 2e-15  # of a joint's quaternions
 MAX_TURN = 1.0  # rad, step × fastest rate: beyond it explicit methods become unstable, and bounds do not hold
 SAMPLE_FACTOR = 4.0  # on what a step's bound has without accelerations: velocities add up along chains
-MEAN_SHARE, MEAN_SPREAD = 1 / 4, 1.0  # of the bounds: what constants are off, rounded once; chance
+# Of the bounds, in the mean of many steps: what is rounded alike in all of them, and chance.
+MEAN_ROUNDING, MEAN_ACCELERATION, MEAN_SPREAD = 1 / 2, 1 / 16, 1.0
 MOMENTUM_SHARE = 1 / 4  # of the bounds of all rates, in the change of momentum
 CLOCK_ROUNDINGS = 2  # of a time that is a sum of steps
 RESIDUAL_STEPS = 2  # after one, Euler does not show the axial inertia of rods
@@ -323,13 +325,14 @@ def step_bound(
     )
     kinds, far = model.kind[: model.n], model.body[: model.n, 0]  # of the joints of the tree
     path, slides = _paths(far), np.array([_slides(kind) for kind in kinds])
-    turned = 0.0  # an angle of x rad is rounded to ε |x|
-    if "turned" in sizes:
-        turned = ANGLE_ROUNDINGS * EPS * (sizes["turned"] @ path.T)
+    # an angle of x rad is rounded to ε |x|
+    turned = ANGLE_ROUNDINGS * EPS * (sizes.get("turned", np.zeros(model.n)) @ path.T)
     W, V, place = (np.max(np.where(path, x[..., None, :], 0.0), -1) for x in (rate, speed, sizes["place"]))
     arm = path @ stretched_length(model) + place * bool(np.any(slides))
     links = [max(1, len(KINDS[kind].motions)) + KINDS[kind].holds_distance for kind in kinds]
-    rounding = STEP_ROUNDINGS * EPS * (path @ np.array(links))
+    # Some engines normalise quaternions only beyond 1e-15; rotations have their lengths squared.
+    stretched = np.minimum(sizes.get("stretched", np.zeros(model.n)), MAX_STRETCH)
+    rounding = STEP_ROUNDINGS * EPS * (path @ np.array(links)) + 4 * (stretched @ path.T)
     # Rates are kept relative to the link before: what rounding does to one link, and to the spin of a
     # rod, reaches those beyond it once they have turned against it.
     above, shifted = (
@@ -503,7 +506,7 @@ class RunSteps:
         rounded = self.here.rounded()
         self.states = [State(**{name: x[i] for name, x in vars(rounded).items()}) for i in range(len(v))]
         self.bounds = acceleration_bounds(method, model, self.states)
-        sizes = _sizes(rounded, self.bounds) | {"turned": self.charts.turned(q)}
+        sizes = _sizes(rounded, self.bounds) | self.charts.coordinate_sizes(motion.coordinates)
         at_rest = step_bound(method, model, sizes, 0.0, 0)
         self.of_samples = {name: SAMPLE_FACTOR * np.maximum(x, TINY) for name, x in at_rest.items()}
         between = {name: np.maximum(x[:-1], x[1:]) for name, x in sizes.items()}
@@ -567,7 +570,7 @@ class RunSteps:
             x.bounds[steps[self.h * rates > MAX_TURN]] = np.inf
 
     def _mean(self, off: dict[str, Array], found: dict[str, StepDeviations]) -> StepDeviations:
-        """Mean over the run of the deviations of rates along what the step changes, in units of the bounds.
+        """Mean over the run of the deviations of rates along what the step changes, over what explains it.
 
         A mistake that is smaller than the rounding of one step has one direction in all of them.
         """
@@ -576,9 +579,13 @@ class RunSteps:
             change = np.asarray(getattr(self.after, field_name) - getattr(before, field_name)[:-1], float)
             size = np.linalg.norm(change, axis=-1)
             along = np.sum(off[f"step_{name}"] * change, -1) / np.where(size > 0, size, 1.0)
-            means.append(np.abs(np.mean(along / np.maximum(found[f"run_{name}"].bounds, TINY), axis=0)))
-        bound = np.full((1, self.model.n), MEAN_SHARE + MEAN_SPREAD / np.sqrt(len(off["step_rate"])))
-        return StepDeviations(np.max(means, axis=0)[None], bound, np.full_like(bound, np.inf))
+            of_step, rounding = found[f"run_{name}"].bounds, self.of_samples[f"step_{name}"][:-1]
+            rounding = np.minimum(rounding / SAMPLE_FACTOR, of_step)
+            allowed = MEAN_ROUNDING * rounding + MEAN_ACCELERATION * (of_step - rounding)
+            allowed = np.mean(allowed + MEAN_SPREAD * of_step / np.sqrt(len(of_step)), axis=0)
+            means.append(np.abs(np.mean(along, axis=0)) / np.maximum(allowed, TINY))
+        mean = np.max(means, axis=0)[None]
+        return StepDeviations(mean, np.ones_like(mean), np.full_like(mean, np.inf))
 
     def _samples(self) -> StepDeviations:
         """Samples against the coordinates, the first against the given state, and the times."""
