@@ -202,6 +202,14 @@ class StepCharts:
                 at[..., :4] = _unit(at[..., :4])
         return q, velocities.astype(LongDouble)
 
+    def middle_cosine(self, q: list[Array]) -> Array:
+        """Return the smallest cosine (...,) of the second of a turn's angles; 1 where turns have none."""
+        found = np.ones(q[0].shape[:-1])
+        for at, chart in zip(q, self.charts, strict=True):
+            if chart.axes:
+                found = np.minimum(found, np.abs(np.cos(at[..., 1 - len(chart.axes)])).astype(float))
+        return found
+
     def coordinate_sizes(self, coordinates: Array) -> dict[str, Array]:
         """Measure what roundings of an engine's coordinates depend on.
 

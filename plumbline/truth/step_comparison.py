@@ -66,6 +66,8 @@ ACCELERATIONS = ("angular_acceleration", "acceleration", "rod_torque")  # whose 
 DISTURBANCE = 1e-9  # of rates, to measure the growth of perturbations
 ANGLE_ROUNDINGS = 4
 MAX_STRETCH = 2e-15  # of a joint's quaternions
+MAX_DISTANCE = 10.0  # of bodies from the origin, over the mechanism's size
+MIN_MIDDLE_COSINE = 0.5  # of the second of two or three angles: at 0 two of their axes are one
 MAX_TURN = 1.0  # rad, step × fastest rate: beyond it explicit methods become unstable, and bounds do not hold
 SAMPLE_FACTOR = 4.0  # on what a step's bound has without accelerations: velocities add up along chains
 # Of the bounds, in the mean of many steps: what is rounded alike in all of them, and chance.
@@ -506,6 +508,7 @@ class RunSteps:
         rounded = self.here.rounded()
         self.states = [State(**{name: x[i] for name, x in vars(rounded).items()}) for i in range(len(v))]
         self.bounds = acceleration_bounds(method, model, self.states)
+        self.states_r, self.middle_cosine = rounded.r, self.charts.middle_cosine(q)
         sizes = _sizes(rounded, self.bounds) | self.charts.coordinate_sizes(motion.coordinates)
         at_rest = step_bound(method, model, sizes, 0.0, 0)
         self.of_samples = {name: SAMPLE_FACTOR * np.maximum(x, TINY) for name, x in at_rest.items()}
@@ -558,7 +561,11 @@ class RunSteps:
         return found
 
     def _leave_out_coarse_steps(self, found: dict[str, StepDeviations]) -> None:
-        """Give no bound to steps that disagree where the step does not resolve the motion."""
+        """Give no bound to steps that disagree where it does not hold.
+
+        The step does not resolve the motion there, or bodies are far away against the mechanism's size, whose
+        positions are rounded, or angles are near the pose in which two of their axes are one.
+        """
         wrong = np.any([np.any(~(x.ratios <= 1), axis=1) for x in found.values()], axis=0)
         steps = np.flatnonzero(wrong)
         if not len(steps):
@@ -566,8 +573,12 @@ class RunSteps:
         ends = [self.states[n] for i in (0, 1) for n in steps + i]
         with np.errstate(all="ignore"):
             rates = np.max(fastest_rates(self.model, ends).reshape(2, -1), axis=0)
+        size = np.sum(stretched_length(self.model)) + np.max(np.linalg.norm(self.model.point, axis=2))
+        far = np.max(np.linalg.norm(self.states_r, axis=-1), axis=-1) > MAX_DISTANCE * size
+        without = far | (self.middle_cosine < MIN_MIDDLE_COSINE)
+        left_out = (self.h * rates > MAX_TURN) | without[steps] | without[steps + 1]
         for x in found.values():
-            x.bounds[steps[self.h * rates > MAX_TURN]] = np.inf
+            x.bounds[steps[left_out]] = np.inf
 
     def _mean(self, off: dict[str, Array], found: dict[str, StepDeviations]) -> StepDeviations:
         """Mean over the run of the deviations of rates along what the step changes, over what explains it.

@@ -44,8 +44,11 @@ def subject(name):
 
 @pytest.mark.parametrize(
     ("engine", "name"),
-    [("mujoco", "double-tumbling-rods"), pytest.param("pinocchio", "four-bar", marks=SLOW), ("exudyn-tree", "loaded-ball"),
-     ("exudyn", "tumbling-rod"), pytest.param("mujoco", "chain-30-balls", marks=SLOW)],
+    [
+        ("mujoco", "double-tumbling-rods"), ("exudyn-tree", "loaded-ball"), ("exudyn", "tumbling-rod"),
+        pytest.param("pinocchio", "four-bar", marks=SLOW),
+        pytest.param("mujoco", "chain-30-balls", marks=SLOW),
+    ],
 )  # fmt: skip
 def test_every_step_of_honest_engines_agrees(engine, name):
     model, states = subject(name)
