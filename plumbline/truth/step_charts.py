@@ -489,9 +489,8 @@ class StepCharts:
         energy = np.broadcast_to((kinetic + potential)[..., 0, 0], lead)
         values = r, np.stack(tree.p, -2), velocity, omega_, u, udot, x, xdot
         place = self.cut.place[: self.cut.source.n] if self.cut else slice(None)
-        of_bodies = dict(zip(BodyStates.__match_args__, (one[..., place, :] for one in values), strict=False))
         momentum = np.broadcast_to(momentum[..., 0], (*lead, 3))
-        return BodyStates(**of_bodies, energy=energy, momentum=momentum)
+        return BodyStates(*(one[..., place, :] for one in values), *(energy, momentum))
 
     def body_accelerations(self) -> tuple[Array, Array]:
         """Return r̈ (B, N, 3), world axes, and ω̇′ (B, N, 3), body axes, at the states.
