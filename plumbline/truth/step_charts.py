@@ -487,10 +487,11 @@ class StepCharts:
                 x[..., k, :count], xdot[..., k, :count] = q[chart], v[..., self.own[chart]]
         kinetic, potential, momentum = tree.totals()
         energy = np.broadcast_to((kinetic + potential)[..., 0, 0], lead)
-        values = r, np.stack(tree.p, -2), velocity, omega_, u, udot, x, xdot
+        every = r, np.stack(tree.p, -2), velocity, omega_, u, udot, x, xdot
         place = self.cut.place[: self.cut.source.n] if self.cut else slice(None)
         momentum = np.broadcast_to(momentum[..., 0], (*lead, 3))
-        return BodyStates(*(one[..., place, :] for one in values), *(energy, momentum))
+        r, p, velocity, omega_, u, udot, x, xdot = (one[..., place, :] for one in every)
+        return BodyStates(r, p, velocity, omega_, u, udot, x, xdot, energy, momentum)
 
     def body_accelerations(self) -> tuple[Array, Array]:
         """Return r̈ (B, N, 3), world axes, and ω̇′ (B, N, 3), body axes, at the states.
