@@ -69,7 +69,7 @@ MAX_STRETCH = 2e-15  # of a joint's quaternions
 MAX_DISTANCE = 10.0  # of bodies from the origin, over the mechanism's size
 MIN_MIDDLE_COSINE = 0.5  # of the second of two or three angles: at 0 two of their axes are one
 MAX_TURN = 1.0  # rad, step × fastest rate: beyond it explicit methods become unstable, and bounds do not hold
-SAMPLE_FACTOR = 4.0  # on what a step's bound has without accelerations: velocities add up along chains
+SAMPLE_FACTOR = 8.0  # on what a step's bound has without accelerations: velocities add up along chains
 # Of the bounds, in the mean of many steps: what is rounded alike in all of them, and chance.
 MEAN_ROUNDING, MEAN_ACCELERATION, MEAN_SPREAD = 1 / 2, 1 / 16, 1.0
 MOMENTUM_SHARE = 1 / 4  # of the bounds of all rates, in the change of momentum
