@@ -60,7 +60,7 @@ def _needs_simbody() -> str:
     return _needs("g++", packages)() or (f"there is no {absent[0]}; {packages}" if absent else "")
 
 
-_RAPIER = ("cargo", "build", "--release", "--locked", "--manifest-path", SERVERS / "rapier" / "Cargo.toml",
+_RAPIER = ("cargo", "build", "--release", "--manifest-path", SERVERS / "rapier" / "Cargo.toml",
            "--target-dir", BUILT / "rapier")  # fmt: skip
 _MAKE = ("make", "-C", ROOT, ".importers/.done")
 ENGINE_SERVERS = (
@@ -68,7 +68,7 @@ ENGINE_SERVERS = (
            (IMPORTERS_PYTHON, SERVERS / "drake_server.py"), _needs("make", "it makes .importers"), (_MAKE,)),
     Server("dart", "DART", "BSD-2-Clause", "240 MB, with Drake's", "the package index",
            (IMPORTERS_PYTHON, SERVERS / "dart_server.py"), _needs("make", "it makes .importers"), (_MAKE,)),
-    Server("rapier", "Rapier, double precision", "Apache-2.0", "30 MB, 300 MB while it is built", "crates.io",
+    Server("rapier", "Rapier, double precision", "Apache-2.0", "30 MB, 300 MB while it is built", "Rust's packages",
            (BUILT / "rapier" / "release" / "rapier_server",),
            _needs("cargo", "https://rustup.rs has it"), (_RAPIER,)),
     Server("simbody", "Simbody", "Apache-2.0", "64 MB", "the system's packages",

@@ -12,8 +12,8 @@ use std::io::{stdin, stdout, BufRead, Write};
 const STEP: f64 = 1e-16;
 
 fn hello() -> Value {
-    let lock = include_str!("../Cargo.lock");
-    let after = lock.split("name = \"rapier3d-f64\"\nversion = \"").nth(1).unwrap_or("?\"");
+    let manifest = include_str!("../Cargo.toml");
+    let after = manifest.split("rapier3d-f64 = \"=").nth(1).unwrap_or("?\"");
     json!({
         "protocol": 1, "name": "rapier", "title": "Rapier", "version": after.split('"').next(),
         "joints": ["ball", "hinge", "slide", "weld", "free"], "has": ["trees", "loads"],
