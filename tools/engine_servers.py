@@ -68,7 +68,7 @@ ENGINE_SERVERS = (
            (IMPORTERS_PYTHON, SERVERS / "drake_server.py"), _needs("make", "it makes .importers"), (_MAKE,)),
     Server("dart", "DART", "BSD-2-Clause", "240 MB, with Drake's", "the package index",
            (IMPORTERS_PYTHON, SERVERS / "dart_server.py"), _needs("make", "it makes .importers"), (_MAKE,)),
-    Server("rapier", "Rapier, double precision", "Apache-2.0", "30 MB, 300 MB while it is built", "Rust's packages",
+    Server("rapier", "Rapier, double precision", "Apache-2.0", "30 MB, 300 MB while it is built", "crates",
            (BUILT / "rapier" / "release" / "rapier_server",),
            _needs("cargo", "https://rustup.rs has it"), (_RAPIER,)),
     Server("simbody", "Simbody", "Apache-2.0", "64 MB", "the system's packages",

@@ -35,6 +35,7 @@ def split_by_chain(solution, forest):
                 joint=solution.joint[mine] - forest.first_body[index],
                 tension=solution.tension[body],
                 joint_reaction=solution.joint_reaction[body],
+                joint_moment=solution.joint_moment[body],
             )
         )
         assert len(out[-1].pddot) == one.n
