@@ -255,15 +255,20 @@ def _tuple_decoder(arguments: tuple[Any, ...]) -> _Decoder:
 
 
 def _dataclass_decoder(record: Any) -> _Decoder:
-    hints = get_type_hints(record)
-    items = [_decoder(hints[field.name]) for field in fields(record)]
     name = record.__name__
 
     def decode(value: Any, contents: memoryview) -> Any:
         _require(isinstance(value, list) and value[:1] == [name], value, name)
+        items = _field_decoders(record)  # made here, since a record may hold others of its class
         return record(*[item(one, contents) for item, one in zip(items, value[1:], strict=True)])
 
     return decode
+
+
+@cache
+def _field_decoders(record: Any) -> list[_Decoder]:
+    hints = get_type_hints(record)
+    return [_decoder(hints[field.name]) for field in fields(record)]
 
 
 def _decode_any(value: Any, contents: memoryview) -> Any:

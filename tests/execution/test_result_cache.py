@@ -12,6 +12,7 @@ import pytest
 from click.testing import CliRunner
 
 from plumbline.cli.main import main
+from plumbline.diagnosis.cause import Cause, Diagnosis
 from plumbline.engines.environments import EnvironmentUnavailable, ensure_interpreter
 from plumbline.execution import environment_fingerprint
 from plumbline.execution.environment_fingerprint import installed_files
@@ -19,7 +20,7 @@ from plumbline.execution.plan import Plan
 from plumbline.execution.result_cache import DiskResultCache, task_hash
 from plumbline.execution.runner import run_plan
 from plumbline.judging.rows import JudgingResult, RowContext
-from plumbline.processes.record_encoding import encode_record
+from plumbline.processes.record_encoding import decode_record, encode_record
 from plumbline.processes.user_cache import CheckedFiles, recall, remember
 from plumbline.processes.worker_environment import hashed_environment
 from plumbline.processes.worker_pool import Task, WorkerPool
@@ -325,3 +326,11 @@ def test_a_full_disk_is_reported_for_what_it_is(tmp_path):
     assert done.returncode == 4, done.stderr
     assert done.stderr.count("the result cache cannot be written, the run goes on without it") == 1
     assert done.stderr.rstrip().endswith("Finished cells were not saved; the same command begins again.")
+
+
+def test_a_cause_that_holds_causes_is_kept():
+    def cause(term, *equal):
+        return Cause("number", term, "body 1", "twice", equal=equal)
+
+    whole = Diagnosis((cause("mass", cause("inertia"), cause("length")), cause("gravity")))
+    assert decode_record(encode_record(whole), Diagnosis) == whole
