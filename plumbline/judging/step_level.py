@@ -227,6 +227,14 @@ def _run_row(
     else:
         verdict = Verdict.AGREES
         reason = f"{what} within {ratio:.2g} of the rounding bound, each from the sample before"
+        if left_out := int(np.count_nonzero(np.any(np.isinf(found.bounds), axis=1))):
+            size = float(np.max(found.errors[np.isinf(found.bounds)]))
+            extra["left_out_steps"] = float(left_out)
+            reason += (
+                f"; {left_out} of them are not compared, since something differs there (this quantity by up "
+                f"to {size:.3g} {unit}) and the step does not resolve the motion, a body is far away, or "
+                "angles are near their singular pose"
+            )
         if quantity == "run_mean":
             reason = f"no direction in the deviations of the steps: {ratio:.2g} of what rounding explains"
     return context.make_row(

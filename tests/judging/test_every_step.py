@@ -119,6 +119,22 @@ def test_a_bias_below_the_rounding_of_one_step_is_seen_in_their_mean():
     assert wrong == {"run_mean"}, {row.quantity: row.ratio for row in rows}
 
 
+def test_steps_that_differ_and_have_no_bound_are_counted():
+    """Where no step counts as resolved, all wrong ones are left out, which the row says."""
+    from plumbline.truth import step_comparison
+    from tests.helpers import planted_runs
+
+    model, states = subject("tumbling-ball")
+    late = planted_runs.mujoco_mistake(planted_runs.from_step(500), planted_runs._scaled_gravity)
+    with patch.object(step_comparison, "MAX_TURN", 0.0), late():
+        adapter = load_adapter("mujoco")
+        rows = rows_of(adapter, adapter.integrator("Euler"), model, states)
+    (row,) = [row for row in rows if row.quantity == "run_velocity"]
+    steps = max(run_counts(model.n))
+    assert row.extra["left_out_steps"] == steps - 499
+    assert f"{steps - 499} of them are not compared" in row.reason
+
+
 def test_an_adapter_without_coordinates_says_so():
     model, states = subject("tumbling-ball")
     adapter = load_adapter("mujoco")
