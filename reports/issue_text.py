@@ -55,7 +55,9 @@ def issue_text(results: Results, finding: Record) -> str:
             f"```python\n{results.scripts[scripted['key']].rstrip()}\n```",
         ]
     else:
-        parts.append(f"`python -m plumbline run {first['scenario']} --engine {first['engine']}`")
+        is_own = results.scenarios[first["scenario"]].get("own", False)
+        catalogue = f"python -m plumbline run {first['scenario']} --engine {first['engine']}"
+        parts.append(f"`{results.run['command'] if is_own else catalogue}`")
     parts += [
         f"## {where}",
         f"Wrong in {wrong}{right}. Python {results.run['python']}, {results.run['platform']}.",

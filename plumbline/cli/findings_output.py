@@ -41,7 +41,7 @@ def describe_run(
         yield "[dim]plumbline explain NAME prints everything that is known about one[/]"
     for finding in findings:
         if not finding.needs_attention:
-            yield recorded_line(finding, width)
+            yield from recorded_lines(finding, width)
     yield from family_lines(rows, width, verdict_count)
 
 
@@ -60,12 +60,13 @@ def finding_lines(finding: Finding, width: int) -> list[str]:
     ]
 
 
-def recorded_line(finding: Finding, width: int) -> str:
-    """Describe a recorded finding in one line."""
+def recorded_lines(finding: Finding, width: int) -> list[str]:
+    """Describe a recorded finding in one line, or two where the size would be cut."""
     shown = shown_verdict(finding.verdict, finding.known_issue)
     size = "" if finding.largest_ratio is None else f", up to {finding.largest_ratio:.2g} tolerances"
-    text = f"{finding.name}: {len(finding.rows)} rows of {len(finding.scenarios)} scenarios{size}"
-    return f"[dim]{SHOWN_STYLES[shown].glyph} {escape(shorten(text, width - 2))}[/]"
+    text = f"{finding.name}: {coverage(finding)}{size}"
+    head, *more = wrap(text, width - 2, "")
+    return [f"[dim]{SHOWN_STYLES[shown].glyph} {escape(head)}[/]", *(f"[dim]  {escape(x)}[/]" for x in more)]
 
 
 def coverage(finding: Finding) -> str:
@@ -100,9 +101,14 @@ def legend(found: Iterable[Row]) -> list[str]:
 
 
 def explain(
-    finding: Finding, issue: KnownIssue | None, scripts: Mapping[str, str], width: int
+    finding: Finding, issue: KnownIssue | None, scripts: Mapping[str, str], width: int, own_command: str
 ) -> Iterator[str]:
-    """Describe everything that is known about a finding, in plain text."""
+    """Describe everything that is known about a finding, in plain text.
+
+    Args:
+        own_command: that made the results, where the smallest scenario is of a user's file; else empty.
+
+    """
     yield finding.name
     yield from wrap(f"{finding.engine} {finding.version_range}: {finding.title}", width, "  ")
     yield from wrap(finding.sentence, width, "  ")
@@ -130,7 +136,8 @@ def explain(
         yield from wrap(smallest.diagnosis, width, "")
     yield ""
     level = f" --level {smallest.level}" if smallest.level in ("state", "step", "trajectory") else ""
-    yield f"again:  plumbline run {smallest.scenario} --engine {smallest.engine}{level}"
+    catalogue = f"plumbline run {smallest.scenario} --engine {smallest.engine}{level}"
+    yield f"again:  {own_command or catalogue}"
     script = next((scripts[row.key] for row in finding.rows if row.key in scripts), None)
     if script:
         yield f"script: {script}"

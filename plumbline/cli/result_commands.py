@@ -229,7 +229,9 @@ def explain(name: str | None, folder: Path) -> None:
         raise click.UsageError(f"{name!r}: {several}" + (f"; {hint}" if hint else ""))
     issues = {issue.name: issue for issue in project_known_issues()}
     issue, width = issues.get(chosen[0].known_issue or ""), line_width(make_console(sys.stdout))
-    for line in output.explain(chosen[0], issue, scripts, width):
+    is_own = document["scenarios"].get(chosen[0].rows[0].scenario, {}).get("own", False)
+    command = str(document["run"]["command"]) if is_own else ""
+    for line in output.explain(chosen[0], issue, scripts, width, command):
         click.echo(line)
 
 

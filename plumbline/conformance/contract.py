@@ -65,7 +65,7 @@ def _words(row: Row) -> str:
 
 
 def _specification(adapter: type[Adapter]) -> str:
-    """How workers load the class: by its module, or by its file where that is of no package."""
+    """MODULE:CLASS, by which workers load it; FILE:CLASS where its module is in no package."""
     if "." in adapter.__module__:
         return f"{adapter.__module__}:{adapter.__qualname__}"
     return f"{inspect.getfile(adapter)}:{adapter.__qualname__}"

@@ -290,7 +290,7 @@ class _Writer:
         values, axes = np.linalg.eigh(np.trace(body.inertia) / 2 * np.eye(3) - body.inertia)
         if values[0] >= -FRAME_ROUNDING * abs(values[2]):
             return body.inertia
-        what = "inertia of no distribution of mass, made physical"
+        what = "inertia that no distribution of mass has, made physical"
         self.left_out.append(Feature(what, body.name, body.fields.get("inertia", body.source)))
         second: Array = axes @ np.diag(np.maximum(values, 0.0)) @ axes.T
         physical: Array = np.trace(second) * np.eye(3) - second
