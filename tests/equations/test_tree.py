@@ -1,4 +1,4 @@
-"""One set of equations in balls and in floating-point numbers, against what they replaced."""
+"""One set of equations in balls and in floating-point numbers: certified, and to their digits."""
 
 from dataclasses import replace
 
@@ -13,13 +13,10 @@ from plumbline.model.datatypes import KINDS, State
 from plumbline.model.loops import motion_without_inertia
 from plumbline.model.random_mechanisms import ELEMENTS, random_tree
 from plumbline.model.sampling import compared_states, random_states
-from plumbline.scenario.generator import random_mechanism, random_scenario
-from plumbline.truth.certified_state import MAX_RELATIVE_RADIUS, certify_state, enclose_quantities
+from plumbline.scenario.generator import random_mechanism
+from plumbline.truth.certified_state import certify_state, enclose_quantities
 from plumbline.truth.rounding_bound import state_rounding_bound
 from tests.helpers.catalogue import catalogue_scenarios
-from tests.helpers.former_equations.chain import enclose_chain
-from tests.helpers.former_equations.loop import enclose_loop
-from tests.helpers.former_equations.tree import enclose_tree
 from tests.helpers.nightly_tests import slow
 
 BITS = 400
@@ -28,56 +25,16 @@ SAMPLE = (
     "double-loaded-rods", "chain-5-mixed", "chain-10-balls", "light-cart-pole", "loaded-tree",
     "tree-of-seven-sprung", "sprung-without-rotors", "free-body-with-rotors", "point-mass-arm",
 )  # fmt: skip
-LOOPS = ("slider-crank", "flyball-governor", "bricard")
 TREES = [name for name, scenario in catalogue_scenarios().items() if not scenario.model.has_loops]
-OTHERS = sorted(catalogue_scenarios().keys() - set(SAMPLE) - set(LOOPS))
 
 
 def states_of(scenario, count=2):
     return compared_states(scenario.model, scenario.state, scenario.seed, count)
 
 
-def former_enclosure(model, state):
-    with flint.ctx.workprec(BITS):
-        if model.has_loops:
-            return enclose_loop(flint, model, state)
-        return (enclose_chain if model.is_chain else enclose_tree)(flint, model, state, True)
-
-
-def check_overlap(model, state):
-    before, now = former_enclosure(model, state), enclose_quantities(model, state, BITS, mass_matrix=True)
-    assert before.keys() == now.keys()
-    for name in before.keys() - {"scale"}:
-        old, new = (np.ravel(np.array(balls[name], dtype=object)) for balls in (before, now))
-        assert all(x.overlaps(y) for x, y in zip(old, new, strict=True)), name
-        limit = MAX_RELATIVE_RADIUS * (now["scale"][name] or 1.0)
-        assert all(float(x.rad()) <= limit for x in np.concatenate([old, new])), name
-
-
-@pytest.mark.parametrize("name", SAMPLE + LOOPS)
-def test_enclosures_overlap_those_of_the_former_equations(name):
-    scenario = catalogue_scenarios()[name]
-    for state in states_of(scenario):
-        check_overlap(scenario.model, state)
-
-
-@slow
-@pytest.mark.parametrize("name", OTHERS)
-def test_enclosures_overlap_those_of_the_former_equations_everywhere(name):
-    test_enclosures_overlap_those_of_the_former_equations(name)
-
-
-@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.full) for seed in range(40, 60))])
-def test_enclosures_of_random_mechanisms_overlap_those_of_the_former_equations(seed):
-    """Of a tree, of loops, of joints in random roles, and of a chain."""
-    for scenario in (*(random_mechanism(seed, index) for index in range(4)), random_scenario(seed, 1)):
-        for state in states_of(scenario):
-            check_overlap(scenario.model, state)
-
-
 @pytest.mark.parametrize("kinds", [("ball",), ("hinge", "ball"), tuple(KINDS)], ids=len)
 @pytest.mark.parametrize("seed", [1, 2, *(pytest.param(n, marks=pytest.mark.full) for n in range(3, 20))])
-def test_enclosures_of_trees_with_every_element_overlap_those_of_the_former_equations(kinds, seed):
+def test_trees_with_every_element_are_certified(kinds, seed):
     """Rotors of ball joints on moving bodies, and several springs at one body."""
     model = random_tree(np.random.default_rng(seed), 5, kinds, elements=ELEMENTS)
     ends = np.array([[0, 1], [1, 2], [2, -1]])
@@ -87,7 +44,7 @@ def test_enclosures_of_trees_with_every_element_overlap_those_of_the_former_equa
         **{f"spring_{name}": np.array([0.7, 1.1, 1.3]) for name in ("stiffness", "damping", "length")},
     )
     for state in random_states(model, 2, seed):
-        check_overlap(model, state)
+        certify_state(model, state, mass_matrix=True)
 
 
 @pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.full) for seed in range(40, 50))])
@@ -102,7 +59,7 @@ def test_a_loop_may_hold_a_body_that_could_turn_without_inertia(seed):
             inertia[scenario.model.body[scenario.model.n, 1]] = thin
             model = replace(scenario.model, inertia=inertia)
             if motion_without_inertia(model, scenario.state) is None:
-                check_overlap(model, scenario.state)
+                certify_state(model, scenario.state, mass_matrix=True)
                 regular += 1
     assert regular
 

@@ -1,1 +1,0 @@
-"""What `plumbline.equations` replaced: a comparison for nightly tests, until the replacement is complete."""
