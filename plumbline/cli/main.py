@@ -35,7 +35,7 @@ Start with:
 
 
 COMMANDS = {  # where each is, and its line in the list; imported when it is typed: all of them take a second
-    "list": ("scenario_commands:list_", "List scenarios or engines."),
+    "list": ("scenario_commands:list_", "List scenarios, engines or their surface."),
     "run": ("run_commands:run", "Compare scenarios on engines."),
     "model": ("model_commands:model", "Compare what importers make of a URDF or MJCF file."),
     "nightly": ("run_commands:nightly", "Run everything unattended and keep the history."),

@@ -27,7 +27,7 @@ from plumbline.execution.exit_codes import ExitCode
 from plumbline.execution.plan import LevelSelection, Plan, ProgressCallback, RunObserver
 from plumbline.execution.proofs import prove_changed_motions
 from plumbline.execution.result_cache import DiskResultCache, night_cells_folder
-from plumbline.execution.runner import RunResult, exit_code, run_plan, save
+from plumbline.execution.runner import RunResult, compare_surfaces, exit_code, run_plan, save
 from plumbline.execution.selftest import SelfTestResult
 from plumbline.judging.known_issues import KnownIssue, project_known_issues
 from plumbline.model.features import Feature, features
@@ -212,6 +212,9 @@ def run_nightly(
         result.metadata["sentence"] += (
             f"; random mechanisms: {found:,} triples of features, {new:,} of them new in {WEEK} nights"
         )
+    with WorkerPool(1, limits) as executor:
+        for changes in compare_surfaces(executor):
+            result.metadata["sentence"] += f"; {changes.sentence}" if changes.sentence else ""
     save(result, folder, command)
     write_atomically(folder / FEATURES_FILE, json.dumps(drawn).encode())
     if coverage is not None:

@@ -12,7 +12,8 @@ from plumbline.cli import options
 from plumbline.cli.terminal_output import count_noun, print_table
 from plumbline.engines.protocol import protocol_schema
 from plumbline.engines.registry import ENGINES
-from plumbline.execution.runner import describe_engines
+from plumbline.engines.surface import STATUSES, SURFACES, declared_surface
+from plumbline.execution.runner import compare_surfaces, describe_engines
 from plumbline.execution.scenario_verdicts import NO_REGULAR_POSE
 from plumbline.model.loops import immovable_joints, is_singular, smallest_singular_value
 from plumbline.model.sampling import compared_states
@@ -24,11 +25,19 @@ JSON_ONLY = ("purpose", "file")  # columns too long for a terminal
 
 
 @click.command("list")
-@click.argument("what", type=click.Choice(["scenarios", "engines"]))
+@click.argument("what", type=click.Choice(["scenarios", "engines", "surface"]))
+@click.argument("engine", required=False, type=click.Choice(SURFACES))
 @options.json_option
-def list_(what: str, as_json: bool) -> None:
-    """List the scenarios of the catalogue, or the engines with their versions and integrators."""
-    records = _scenario_records() if what == "scenarios" else _engine_records()
+def list_(what: str, engine: str | None, as_json: bool) -> None:
+    """List the scenarios of the catalogue, the engines with their versions and integrators, or their surface.
+
+    `list surface` counts the public names of each engine by what is compared, with those that its installed
+    version has besides; `list surface ENGINE` lists them.
+    """
+    if engine and what != "surface":
+        raise click.UsageError(f"only `list surface` takes an engine, not `list {what}`")
+    lists = {"scenarios": _scenario_records, "engines": _engine_records, "surface": _surface_records}
+    records = [vars(one) for one in declared_surface(engine).names] if engine else lists[what]()
     if as_json:
         click.echo(json.dumps(records, ensure_ascii=False, indent=1))
     else:
@@ -61,6 +70,20 @@ def _engine_records() -> list[dict[str, Any]]:
         }
         for name, info in found.items()
     ]
+
+
+def _surface_records() -> list[dict[str, Any]]:
+    with WorkerPool(1) as workers:
+        changes = {one.engine: one for one in compare_surfaces(workers)}
+    found = []
+    for name in SURFACES:
+        surface, change = declared_surface(name), changes.get(name)
+        counts: dict[str, Any] = {status: surface.counts()[status] for status in STATUSES}
+        record = {"engine": name, "version": change.version if change else "not installed", **counts}
+        if change:
+            record |= {"new": list(change.new), "vanished": list(change.vanished)}
+        found.append(record)
+    return found
 
 
 @click.command()

@@ -19,6 +19,7 @@ from plumbline.engines import engine_calls, environments
 from plumbline.engines.adapter import EngineInfo
 from plumbline.engines.importer_calls import describe_importer
 from plumbline.engines.specifications import task_engine
+from plumbline.engines.surface import SURFACES, SurfaceChanges, surface_changes
 from plumbline.execution.exit_codes import ExitCode
 from plumbline.execution.plan import (
     Plan,
@@ -135,6 +136,21 @@ def describe_engines(
             info = replace(info, title=f"{info.title} {info.version}")
         found[name] = replace(info, name=name, python=python)
     return {name: found[name] for name in engines}
+
+
+def compare_surfaces(executor: Executor) -> list[SurfaceChanges]:
+    """Compare the installed engines with their declared surfaces.
+
+    Returns:
+        The changes of those that can be imported.
+
+    """
+    tasks = [
+        Task(TaskKey(TaskKind.DESCRIPTION, engine=name), surface_changes, (name,), executor.limits)
+        for name in SURFACES
+    ]
+    found = {outcome.key.engine: outcome.value for outcome in executor.run(tasks) if outcome.value}
+    return [found[name] for name in SURFACES if name in found]
 
 
 def run_plan(plan: Plan, progress: ProgressCallback, observer: RunObserver | None = None) -> RunResult:

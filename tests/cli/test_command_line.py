@@ -244,6 +244,11 @@ def test_list_scenarios_and_engines_as_text_and_json():
     engines = {e["name"]: e for e in json.loads(invoke("list", "engines", "--json").stdout)}
     assert {"reference", "mujoco", "pinocchio", "exudyn"} <= set(engines)
     assert "RK4" in engines["mujoco"]["integrators"]
+    names = {x["name"]: x for x in json.loads(invoke("list", "surface", "mujoco", "--json").stdout)}
+    assert names["mj_fullM"] | {"place": ""} == {
+        "name": "mj_fullM", "place": "", "status": "compared", "detail": "mass_matrix"
+    }  # fmt: skip
+    assert invoke("list", "engines", "mujoco").exit_code == 2
 
 
 def test_a_run_writes_everything_and_exits_by_its_verdict(tmp_path):

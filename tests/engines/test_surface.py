@@ -1,0 +1,68 @@
+"""The inventory of the engines' public names: complete, and each declared once."""
+
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from plumbline.engines.surface import (
+    SURFACES,
+    SurfaceChanges,
+    declared_surface,
+    installed_names,
+)
+from plumbline.engines.surface_page import surface_page
+from plumbline.execution.runner import compare_surfaces
+from plumbline.model.datatypes import EngineFailure
+from plumbline.processes.worker_pool import WorkerPool
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_every_public_name_of_the_installed_engines_is_declared():
+    with WorkerPool(1) as workers:
+        found = compare_surfaces(workers)
+    assert [one.engine for one in found] == list(SURFACES)
+    for one in found:
+        assert (one.version, one.new, one.vanished) == (declared_surface(one.engine).version, (), ())
+
+
+def test_new_and_vanished_names_are_found(monkeypatch):
+    engine = ModuleType("an_engine")
+    engine._hidden = lambda: 0
+    engine.mj_new, engine.mj_old = (lambda: 0), (lambda: 0)
+    engine.Kind = type("Kind", (), {"__module__": "an_engine"})
+    engine.other = type("Other", (), {"__module__": "another_package"})
+    for function in (engine.mj_new, engine.mj_old):
+        function.__module__ = "an_engine"
+    monkeypatch.setitem(sys.modules, "an_engine", engine)
+    found = installed_names(["an_engine functions", "an_engine classes", "an_engine.vanished members"])
+    assert found == {
+        ("an_engine functions", "mj_new"), ("an_engine functions", "mj_old"), ("an_engine classes", "Kind"),
+    }  # fmt: skip
+    sentence = SurfaceChanges("mujoco", "4.1.0", ("a", "b", "c"), ("d",)).sentence
+    assert sentence == "mujoco 4.1.0 has 3 new names about motion (a, b, c) and 1 names fewer (d)"
+    assert SurfaceChanges("mujoco", "4.1.0", (), ()).sentence == ""
+
+
+@pytest.mark.parametrize(
+    ("places", "message"),
+    [
+        ("{m functions: {compared: {rows: [f]}, not yet: {reason: [f]}}}", "declares f twice"),
+        ("{m functions: {outside: {too much work: [f]}}}", "f: outside, too much work is no declaration"),
+        ("{m functions: {forgotten: {reason: [f]}}}", "f: forgotten, reason is no declaration"),
+    ],
+)
+def test_a_wrong_declaration_is_refused(places, message, tmp_path, monkeypatch):
+    folder = tmp_path / "adapters" / "surface"
+    folder.mkdir(parents=True)
+    (folder / "m.yaml").write_text(f"package: m\nversion: 1\nplaces: {places}\n")
+    monkeypatch.setattr("plumbline.engines.surface.ROOT", tmp_path)
+    with pytest.raises(EngineFailure, match=message):
+        declared_surface.__wrapped__("m")
+
+
+def test_the_page_is_up_to_date():
+    written = (ROOT / "docs" / "surface.md").read_text(encoding="utf-8")
+    assert written == surface_page(), "run: python -m plumbline.engines.surface_page > docs/surface.md"
