@@ -12,7 +12,7 @@ from plumbline.engines.surface import COMPARED, SURFACES, Surface, declared_surf
 _HEAD = """# The engines' surface
 
 For everybody who asks what of an engine is compared. The lists are those of `adapters/surface`, which a test
-compares with the installed engines: every public name of an engine that could be about rigid motion is compared
+compares with the installed engines: every public name that could be about rigid motion is compared
 by rows of a run, outside for one of five reasons (contact, rendering, input and output, memory, another
 physics), or not compared yet, with the reason. `plumbline list surface` counts the names and lists those
 that the installed version has besides, as a night does.
