@@ -254,11 +254,12 @@ def complete_state(model: Model, state: State) -> State:
         The state of the model with the same minimal coordinates.
 
     """
-    p, omega, r, v = forward_kinematics(model, *vars(state).values())
     x, xdot = state.x, state.xdot
     if (missing := model.columns - x.shape[-1]) > 0:  # of a joint that was added
         x, xdot = (np.pad(values, [(0, 0)] * (x.ndim - 1) + [(0, missing)]) for values in (x, xdot))
-    return replace(state, p=p, omega=omega, r=r, v=v, x=x, xdot=xdot)
+        state = replace(state, x=x, xdot=xdot)
+    p, omega, r, v = forward_kinematics(model, *vars(state).values())
+    return replace(state, p=p, omega=omega, r=r, v=v)
 
 
 def forward_kinematics(

@@ -371,35 +371,6 @@ def engine_of(change):
     return evaluate
 
 
-def needs_of(pattern, is_there, **has):
-    """What an acceleration needs that no cause explains, and that is wrong under a condition."""
-    model = pendulums.make_model(pattern, **has)
-    truth = state_truth(model, random_states(model, 9, seed=6))
-
-    def changed(m, s, a):
-        wrong = np.cos(7 * a.acceleration + 3 * np.sum(s.p)) * (1 + np.arange(3)) if is_there(m, s) else 0
-        return replace(a, acceleration=a.acceleration + wrong)
-
-    evaluate = engine_of(changed)
-    (cause,) = diagnose(model, evaluate(model, truth.states), truth, evaluate).causes
-    assert cause.quantities == ("acceleration",) and cause.kind == "unexplained"
-    return cause.needs
-
-
-@pytest.mark.parametrize(
-    ("is_there", "needs"),
-    [
-        (lambda m, s: True, ()),
-        (lambda m, s: np.any(m.force), ("an applied force",)),
-        (lambda m, s: np.any(m.drag_force) and np.any(s.omega), ("motion", "drag")),
-        (lambda m, s: np.any(m.gravity) and np.any(m.moment), ("gravity", "an applied moment")),
-    ],
-    ids=["nothing", "force", "drag in motion", "gravity and moment"],
-)
-def test_a_difference_needs_what_cannot_be_taken_away(is_there, needs):
-    assert needs_of("rb", is_there, loads=True, drag=True) == needs
-
-
 def test_a_trial_that_the_engine_refuses_shows_nothing_and_the_next_one_runs():
     model, reported, truth = changed("acceleration", lambda i, x, b: np.cos(9 * x) + 5)
 
