@@ -231,10 +231,8 @@ class ScenarioRun:
         """
         model, is_certified = self.scenario.model, self._is_certified
         rows = known.mark_known(found.rows, model.n, inertia_ratio(model))
-        families = {name: _family(name) for name in self._engines}
-        rows = outlier.doubt_truth(
-            rows, found.deviations, families, "" if is_certified else _family("reference")
-        )
+        defines_truth = "" if is_certified else _family("reference")
+        rows = outlier.doubt_truth(rows, found.deviations, _family, defines_truth)
         if is_certified and has_independent_truth():
             return rows
         return [

@@ -6,7 +6,7 @@ of both bounds of each other.  Where no engine agrees, the outlier may be the tr
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 
@@ -26,7 +26,7 @@ ENOUGH_FAMILIES = 3  # the same, whether they agree with each other or not
 def doubt_truth(
     rows: Sequence[Row],
     deviations: Mapping[str, Deviation],
-    families: Mapping[str, str],
+    family_of: Callable[[str], str],
     defines_truth: str = "",
 ) -> list[Row]:
     """Find the quantities in which all engines stand on one side against the truth: the harness is in doubt.
@@ -38,7 +38,7 @@ def doubt_truth(
     Args:
         rows: all rows of one scenario, known issues marked.
         deviations: of rows that disagree, by their keys.
-        families: by engine what it is a formulation or version of; those of one family may share a mistake.
+        family_of: what an engine is a formulation or version of; those of one family may share a mistake.
         defines_truth: the family whose answers are the truth where nothing is certified, which is no witness.
 
     Returns:
@@ -54,8 +54,11 @@ def doubt_truth(
                 if (row.level, row.quantity) == (level, quantity)
                 and row.verdict in (Verdict.AGREES, Verdict.DISAGREES)
                 and row.known_issue is None
-                and families[row.engine] != defines_truth
             ]
+            if all(row.verdict == Verdict.AGREES for row in decided):
+                continue
+            families = {row.engine: family_of(row.engine) for row in decided}
+            decided = [row for row in decided if families[row.engine] != defines_truth]
             against = {families[row.engine]: row for row in decided}
             if len(against) < MIN_FAMILIES or any(row.verdict == Verdict.AGREES for row in decided):
                 continue

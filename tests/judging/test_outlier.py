@@ -37,8 +37,7 @@ def doubted_rows(engines, factors, *, recorded=(), defines_truth=""):
         found = judge_states(context, right, Evaluation(answers, None, None, 0.0))
         rows += [replace(row, known_issue="entry" if name in recorded else None) for row in found.rows]
         deviations |= found.deviations
-    families = {name: name.partition("-")[0] for name in engines}
-    return doubt_truth(rows, deviations, families, defines_truth)
+    return doubt_truth(rows, deviations, lambda name: name.partition("-")[0], defines_truth)
 
 
 @cache
