@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
@@ -24,6 +25,10 @@ Columns = dict[str, np.ndarray]
 _UNPRINTABLE = re.compile(
     "[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff\ufffe\uffff]"
 )
+
+
+# Of a document as JSON text, which escapes the control characters; another escape may match too.
+_UNPRINTABLE_IN_JSON = re.compile(_UNPRINTABLE.pattern + r"|\\[bfru]")
 
 
 def replace_unprintable(value: Any) -> Any:
@@ -64,7 +69,9 @@ class Results:
             DamagedResults: the file is missing or damaged.
 
         """
-        stored = replace_unprintable(document or read_results(folder))
+        stored = document or read_results(folder)
+        if _UNPRINTABLE_IN_JSON.search(json.dumps(stored, ensure_ascii=False)):  # seldom, and far slower
+            stored = replace_unprintable(stored)
         return cls(folder, stored["run"], stored["scenarios"], stored["engines"], stored["rows"])
 
     def table(self, name: str) -> Columns:

@@ -11,6 +11,7 @@ import shlex
 import stat
 import tempfile
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -132,7 +133,7 @@ def _checksum(name: str, body: bytes) -> bytes:
 
 def make_private_folder(folder: Path) -> None:
     """Make a folder of the user's cache, in which only the user may write; raise OSError where others may."""
-    for part in _parts_in_cache(folder):
+    for part in _parts_in_cache(folder, user_cache_folder()):
         part.parent.mkdir(parents=True, exist_ok=True)
         part.mkdir(mode=0o700, exist_ok=True)
     check_ownership(folder)
@@ -143,7 +144,7 @@ def check_ownership(folder: Path) -> None:
 
     Some files of the cache are code, and all of them are answers that are believed.
     """
-    for part in _parts_in_cache(folder):
+    for part in _parts_in_cache(folder, user_cache_folder()):
         _check_owner(part, part.stat())
 
 
@@ -153,9 +154,9 @@ def describe_failure(error: OSError, folder: Path) -> str:
     return f"{place}: {error.strerror} (the variable PLUMBLINE_CACHE names another folder for the cache)"
 
 
-def _parts_in_cache(folder: Path) -> list[Path]:
-    """The cache folder and those in it that lead to ``folder``; a folder elsewhere alone."""
-    top = user_cache_folder()
+@cache
+def _parts_in_cache(folder: Path, top: Path) -> list[Path]:
+    """The cache folder ``top`` and those in it that lead to ``folder``; a folder elsewhere alone."""
     if not folder.is_relative_to(top):
         return [folder]
     return [part for part in (*reversed(folder.parents), folder) if part.is_relative_to(top)]
