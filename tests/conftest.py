@@ -10,6 +10,7 @@ import itertools
 import os
 import re
 import sys
+from unittest.mock import patch
 
 import pytest
 
@@ -21,11 +22,13 @@ from tests.helpers import array_checks  # noqa: E402 (bytecode of the tests too)
 
 array_checks.install()
 
-from plumbline.processes.user_cache import user_cache_folder  # noqa: E402 (after the checks)
+from plumbline.processes import worker_pool  # noqa: E402 (after the checks)
+from plumbline.processes.user_cache import user_cache_folder  # noqa: E402
 from tests.helpers.nightly_tests import SLOW, is_nightly, stale_entries  # noqa: E402
 
 os.environ.pop("COLUMNS", None)  # GNU readline sets it for processes of pytest-xdist; lines would wrap
 
+JUDGES = "plumbline.execution.scenario_verdicts"
 ALLOWED_SKIPS = {  # pattern of the skip's reason: why continuous integration cannot run the test
     r"root may read everything": "the test needs a user without root's permissions",
     r"`make importers` installs it": "the other importers' wheels are large and optional",
@@ -79,6 +82,14 @@ def cache_folders(tmp_path_factory):
     (user_cache_folder() / "engines").mkdir(parents=True, exist_ok=True)
     folder = tmp_path_factory.mktemp("caches")
     return (folder / str(number) for number in itertools.count())
+
+
+@pytest.fixture(scope="session", autouse=True)
+def warm_process():
+    """Workers are forked with what most of them import, whichever test starts the first one."""
+    start = worker_pool.start_warm_process
+    with patch.object(worker_pool, "start_warm_process", lambda *_: start([JUDGES])):
+        yield
 
 
 @pytest.fixture(autouse=True)

@@ -341,7 +341,6 @@ def test_a_name_stays_text_on_the_terminal_in_html_and_in_junit(tmp_path):
         (["run", "--out", ""], "the path is empty"),
         (["report", ""], "the path is empty"),
         (["history", "nowhere"], "`python -m plumbline nightly` makes one"),
-        (["run", "--family", "dubble"], "did you mean 'double'?"),
         (["run", "dubble"], "did you mean `--family double`?"),
     ],
 )

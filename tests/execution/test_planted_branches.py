@@ -21,6 +21,7 @@ from plumbline.scenario.generator import RandomScenarios
 from plumbline.truth import step_formulas
 from plumbline.truth.ground_truth import state_truth
 from tests.helpers.catalogue import catalogue_scenarios
+from tests.helpers.nightly_tests import some_fast
 from tests.helpers.planted_branches import BRANCH_DEFECTS, BRANCH_STEPS
 from tests.helpers.planting import plant, planted
 from tests.helpers.shared_answers import sharing
@@ -81,7 +82,7 @@ def is_reported(defect, model, state):
     return any(row.verdict == "disagrees" for row in rows)
 
 
-@pytest.mark.parametrize("defect", BRANCH_DEFECTS, ids=[d.name for d in BRANCH_DEFECTS])
+@pytest.mark.parametrize("defect", some_fast(BRANCH_DEFECTS, 3))
 def test_a_defect_in_a_rare_branch_is_reported(defect):
     reported = (
         is_reported(defect, s.model, state)

@@ -122,7 +122,7 @@ def shared_steps():
 
 
 @pytest.mark.usefixtures("shared_steps")
-@pytest.mark.parametrize("defect", some_fast(STEP_DEFECTS, 2))
+@pytest.mark.parametrize("defect", some_fast(STEP_DEFECTS, 4))
 def test_every_other_integrator_is_reported(defect):
     rows = defect_report(defect)
     assert any(row.verdict == Verdict.DISAGREES for row in rows), [row.reason for row in rows]
@@ -314,7 +314,7 @@ WRONG_METHODS = {
 
 
 @pytest.mark.usefixtures("shared_steps")
-@pytest.mark.parametrize("name", some_fast(list(WRONG_METHODS), 2))
+@pytest.mark.parametrize("name", some_fast(list(WRONG_METHODS), 4))
 def test_every_other_step_of_a_tree_is_reported(name):
     """The same as an engine that takes the other step where the right one is declared."""
     engine, integrator, change = WRONG_METHODS[name]

@@ -127,7 +127,10 @@ def test_loops_are_refused():
 
 @pytest.mark.parametrize(
     "turn, time, failure, reason",
-    [(3.0, 0.1, EngineFailure, "heyoka stopped"), (3.1405, 1e-5, "Rejected", r"\(8\): near half a turn")],
+    [
+        pytest.param(3.0, 0.1, EngineFailure, "heyoka stopped", marks=SLOW),
+        (3.1405, 1e-5, "Rejected", r"\(8\): near half a turn"),
+    ],
 )
 def test_a_spring_that_comes_to_half_a_turn_is_refused(turn, time, failure, reason):
     """Its moment jumps there, and φ/sin φ has a pole; 3.1405² is between 9.86 and π²."""
