@@ -20,10 +20,6 @@ from reference_impl.arrays import Shaped as Shaped
 from reference_impl.joint_kinds import BALL, KINDS, ROD, JointKind, Kind, column_count
 
 ZERO_INERTIA = 1e-14  # a principal moment that is this part of the largest is the rounding of 0
-CHAIN_FIELDS = (
-    "mass", "inertia", "proximal", "distal", "length",
-    "gravity", "force", "moment", "drag_force", "drag_moment",
-)  # fmt: skip
 JOINT_ELEMENTS = ("armature", "damping", "stiffness", "rest", "effort")
 SPRING_FIELDS = ("spring_body", "spring_point", "spring_stiffness", "spring_damping", "spring_length")
 
@@ -144,8 +140,8 @@ class Mechanism:
         """Copy the mechanism with other values of some fields.
 
         Args:
-            **changes: fields by name.  Of a chain also ``proximal`` and ``distal`` as `chain` takes them, and
-                a new ``length`` decides which joints are rods.
+            **changes: fields by name.  Of a chain also ``proximal`` and ``distal`` as `chain` takes them.  A
+                new ``length`` decides which of the rods and balls are rods.
 
         """
         near, far = changes.pop("proximal", None), changes.pop("distal", None)
@@ -155,17 +151,17 @@ class Mechanism:
         if far is not None:
             hang = np.concatenate([np.zeros_like(far[:1]), far[:-1]])
             changes["point"] = np.stack([hang, point[:, 1]], axis=1)
-        if "length" in changes and "kind" not in changes and self.is_chain:
-            changes["kind"] = _chain_kinds(changes["length"])
+        if "length" in changes and "kind" not in changes:
+            kinds = zip(self.kind, _chain_kinds(changes["length"]), strict=True)
+            changes["kind"] = tuple(new if old in (ROD, BALL) else old for old, new in kinds)
         return replace(self, **changes)
 
     @property
     def fields(self) -> dict[str, Any]:
-        """The fields by name: of a chain, those that `chain` takes; no elements where there are none."""
+        """The fields by name; no elements where there are none."""
         absent = JOINT_ELEMENTS[: 0 if self.has_joint_elements else None]
         absent += SPRING_FIELDS[: 0 if len(self.spring_body) else None]
-        names = CHAIN_FIELDS if self.is_chain else [name for name in vars(self) if name not in absent]
-        return {name: getattr(self, name) for name in names}
+        return {name: value for name, value in vars(self).items() if name not in absent}
 
     @classmethod
     def from_fields(cls, fields: dict[str, Any]) -> Mechanism:
@@ -175,8 +171,6 @@ class Mechanism:
             fields: as `fields` returns them; lists will do for arrays.
 
         """
-        if "proximal" in fields:
-            return cls.chain(**{name: np.array(value, float) for name, value in fields.items()})
         integers = ("body", "spring_body")
         arrays = {
             name: np.array(value, np.intp if name in integers else float)
@@ -196,14 +190,9 @@ class Mechanism:
         return tuple(KINDS[kind] for kind in self.kind)
 
     @property
-    def is_chain(self) -> bool:
-        """Whether it `has_chain_joints`, and inertia about every axis, which forms of chains invert."""
-        return self.has_chain_joints and not self.lacks_inertia
-
-    @property
     def has_joint_moments(self) -> bool:
-        """Whether moments at the joints are compared: those of a chain's bare rods and balls are 0."""
-        return not self.is_chain
+        """Whether a joint transmits a moment: those of bare rods and balls are 0."""
+        return self.has_joint_elements or not all(kind.holds_no_turn for kind in self.kinds)
 
     @property
     def has_chain_joints(self) -> bool:

@@ -438,25 +438,6 @@ def choose_scenarios(names: Sequence[str], families: Sequence[str]) -> list[scen
     return [s for s in found if not families or s.family in families]
 
 
-def require_chains(found: Sequence[scenarios.Scenario]) -> list[scenarios.Scenario]:
-    """Refuse trees, for commands that cover chains.
-
-    Args:
-        found: scenarios that the user named.
-
-    Raises:
-        BadParameter: one of them is not a chain of rods and ball joints from the origin.
-
-    """
-    for s in found:
-        if not s.model.is_chain:
-            raise click.BadParameter(
-                f"{s.name} is a tree; this command covers chains of rods and ball joints from the origin",
-                param_hint="SCENARIO",
-            )
-    return list(found)
-
-
 def _nearest_or_all(name: str, known: Iterable[str]) -> str:
     """Suggest the nearest known name, or list all of them."""
     names = sorted(known)

@@ -113,7 +113,7 @@ def drift(names: tuple[str, ...], rtols: tuple[float, ...], max_cpu_seconds: flo
     from plumbline.studies import drift as drifts
     from plumbline.studies.parquet_files import write_table
 
-    chosen = options.require_chains(options.read_scenarios(names or ("tumbling-ball", "tumbling-rod")))
+    chosen = options.read_scenarios(names or ("tumbling-ball", "tumbling-rod"))
     folder = options.claim_folder(out)
     with options.exit_on_io_error():
         with ProgressDisplay(sys.stderr) as progress:

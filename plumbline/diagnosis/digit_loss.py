@@ -19,7 +19,7 @@ from plumbline.model.datatypes import Array, Model, State, StateQuantities, Step
 from plumbline.model.equivalent import (
     BODY_VECTORS,
     WORLD_VECTORS,
-    first_bodies,
+    bodies_between,
     rotate_body_frames,
     rotate_world,
     unrotate,
@@ -33,7 +33,7 @@ COPIES = 8
 TURN = 1e-6  # rad
 MIN_SCATTER = 0.3  # of the error; 0.5 to 1 where its digits are lost, about TURN where it has a cause
 MIN_COPY_ERROR = 0.02  # of the error; an engine that keeps the call before is off by about TURN in a copy
-MIN_GROWTH = 4.0  # of the error in rounding bounds, from half of the chain to the whole
+MIN_GROWTH = 4.0  # of the error in rounding bounds, from half of the bodies to all
 
 Evaluate = Callable[[Model, list[State]], list[StateQuantities]]
 
@@ -50,14 +50,14 @@ def scatter_cause(quantities: Sequence[str], scatter: float) -> Cause:
 
 @dataclass(frozen=True)
 class DigitLoss:
-    """How the error of an engine scatters, and how it depends on the length of the chain."""
+    """How the error of an engine scatters, and how it depends on the number of bodies."""
 
     scatter: float  # median distance of the errors of equivalent problems from their mean, over their size
     ratio_by_length: dict[int, float]  # error in rounding bounds of the first n bodies, by n, descending
 
     @property
     def grows(self) -> bool:
-        """Whether the error grows with the chain by more than its bound does."""
+        """Whether the error grows with the number of bodies by more than its bound does."""
         ratios = list(self.ratio_by_length.values())
         return len(ratios) > 1 and ratios[0] > MIN_GROWTH * ratios[1]
 
@@ -67,7 +67,7 @@ class DigitLoss:
         text = "; rounding or noise in the algorithm"
         if self.grows:
             lengths = ", ".join(f"{ratio:.2g} for {n}" for n, ratio in self.ratio_by_length.items())
-            text = f", and the error grows with the chain (in rounding bounds: {lengths} bodies)"
+            text = f", and the error grows with the number of bodies (in rounding bounds: {lengths})"
             text += "; rounding in the algorithm"
         return replace(found, change=found.change + text)
 
@@ -217,10 +217,13 @@ def _ratios(problem: Problem, evaluate: Evaluate) -> dict[int, float]:
     """Worst error, in rounding bounds, of the whole mechanism and of its first half and quarter."""
     model = problem.model
     ratios = {model.n: problem.ratio()}
-    for n in sorted({-(-model.n // 2), -(-model.n // 4)} - {model.n}, reverse=True) if model.is_chain else ():
-        short, at = first_bodies(model, problem.state, n)
-        right, (answer,) = Predictor(short, [at], View()).right, evaluate(short, [at])
-        bound = state_rounding_bound(short, at)
+    for n in sorted({-(-model.n // 2), -(-model.n // 4)} - {model.n}, reverse=True):
+        short, at = bodies_between(model, problem.state, 0, n)
+        try:
+            right, (answer,) = Predictor(short, [at], View()).right, evaluate(short, [at])
+            bound = state_rounding_bound(short, at)
+        except Exception:  # the engine or the equations may refuse a part of the mechanism
+            continue
         ratios[n] = max(
             _ratio(np.asarray(getattr(answer, q), float) - right[q][0], q, bound) for q in problem.right
         )

@@ -188,7 +188,7 @@ class Adapter(ABC):
         if model.has_loops:
             pairs = zip(states, answers, strict=True)
             answers = [determinate_part(model, state, answer) for state, answer in pairs]
-        if model.is_chain:  # whose moments are 0, and which the causes of chains do not predict yet
+        if not model.has_joint_moments:
             answers = [replace(answer, joint_moment=None) for answer in answers]
         return answers
 
@@ -258,7 +258,7 @@ class Adapter(ABC):
         """Refuse what the adapter does not build, and elements unless it evaluates states with them."""
         if self.builds_trees and model.has_loops and self.loops_unsupported_reason:
             raise Unsupported(self.loops_unsupported_reason, "loops")
-        if not (self.builds_trees or model.is_chain):
+        if not self.builds_trees and (model.lacks_inertia or not model.has_chain_joints):
             reason = f"the adapter of {self.title} covers chains of rods and balls from the origin"
             raise Unsupported(reason, "trees")
         for gap, reason in self.gaps.items():

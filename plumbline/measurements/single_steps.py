@@ -96,8 +96,8 @@ def step_sizes(has_constraints: bool, model: Model, states: Sequence[State]) -> 
             beyond = np.zeros(model.n)
             np.maximum.at(beyond, model.body[on_body, 0], norm(model.point[on_body, 0], axis=1))
             squares.append(np.max(force * (lever + beyond[near]) / least[near]))
-            if not model.is_chain:
-                squares.append(np.max(bound.scale["joint_moment"] / least[near]))
+            moment = np.where([kind.holds_no_turn for kind in model.kinds], 0.0, bound.scale["joint_moment"])
+            squares.append(np.max(moment / least[near]))
             squares = [4 * np.max(squares)]
         if model.has_loops:
             squares.append(LOOP_RATE**2)

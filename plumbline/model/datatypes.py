@@ -37,7 +37,6 @@ from reference_impl.joint_kinds import JointKind as JointKind
 from reference_impl.joint_kinds import Kind as Kind
 from reference_impl.joint_kinds import column_count as column_count
 from reference_impl.mechanism import BODY_FIELDS as BODY_FIELDS
-from reference_impl.mechanism import CHAIN_FIELDS as CHAIN_FIELDS
 from reference_impl.mechanism import JOINT_ELEMENTS as JOINT_ELEMENTS
 from reference_impl.mechanism import JOINT_FIELDS as JOINT_FIELDS
 from reference_impl.mechanism import SPRING_FIELDS as SPRING_FIELDS

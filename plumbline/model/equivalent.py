@@ -4,10 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from plumbline.model.datatypes import BODY_FIELDS, JOINT_FIELDS, Array, Float, Indices, Int, Model, State
+from plumbline.model.datatypes import (
+    BODY_FIELDS,
+    JOINT_FIELDS,
+    SPRING_FIELDS,
+    Array,
+    Float,
+    Indices,
+    Int,
+    Model,
+    State,
+)
 from plumbline.model.kinematics import (
     complete_state,
     quaternion_conjugate,
@@ -126,15 +137,28 @@ def reorder_bodies(model: Model, state: State, order: Int[Indices, "bodies"]) ->
     return reordered, State(**{name: x[order] for name, x in vars(state).items()})
 
 
-def first_bodies(model: Model, state: State, count: int) -> tuple[Model, State]:
-    """Cut a chain behind some bodies.
+def bodies_between(model: Model, state: State, first: int, end: int) -> tuple[Model, State]:
+    """Cut off all but some consecutive bodies, with the closing joints and springs of the others.
 
     Args:
-        count: number of bodies that remain, from the pivot.
+        first: the first body that remains; joints of later ones on earlier ones are moved to the origin.
+        end: the body after the last one that remains.
 
     Returns:
-        The shorter pendulum, and the same state of it.
+        The smaller mechanism, and the state of it with the same numbers: the same state where ``first`` is 0.
 
     """
-    fields = {name: x if name == "gravity" else x[:count] for name, x in vars(model).items()}
-    return replace(model, **fields), State(**{name: x[:count] for name, x in vars(state).items()})
+    tree = np.arange(len(model.kind)) < model.n
+    inside, springs = (
+        np.all((pairs < 0) | (pairs >= first) & (pairs < end), axis=1)
+        for pairs in (model.body, model.spring_body)
+    )
+    near = model.body[:, 1]
+    joints = np.flatnonzero(np.where(tree, (near >= first) & (near < end), inside))
+    fields: dict[str, Any] = {name: getattr(model, name)[joints] for name in JOINT_FIELDS if name != "kind"}
+    fields["point"][~inside[joints], 0] = 0.0
+    fields |= {name: getattr(model, name)[first:end] for name in ("mass", "inertia", *BODY_FIELDS)}
+    fields |= {name: getattr(model, name)[springs] for name in SPRING_FIELDS}
+    fields |= {name: np.maximum(fields[name] - first, -1) for name in ("body", "spring_body")}
+    few = State(**{name: x[first:end] for name, x in vars(state).items()})
+    return replace(model, kind=tuple(model.kind[k] for k in joints), **fields), few

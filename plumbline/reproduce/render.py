@@ -186,7 +186,7 @@ def _space_functions(code: str) -> str:
 
 def _chain(case: ReproductionCase, name: str, code: str) -> str:
     """Write the fields of a chain that the code uses."""
-    values = {**case.model.fields, **vars(case.state), **_derived_fields(case.model, case.state)}
+    values = {**vars(case.model), **vars(case.state), **_derived_fields(case.model, case.state)}
     used = [field for field in FIELD_COMMENTS if re.search(rf"\bc\.{field}\b", code)]
     lines = []
     for f in used:
@@ -258,6 +258,8 @@ def _derived_fields(model: Model, state: State) -> dict[str, Array]:
         q.append(quaternion_product(quaternion_conjugate(above), x))
         w.append(spins - spins_above @ rotation_matrix(q[-1]))
     return {
+        "proximal": model.proximal,
+        "distal": model.distal,
         "A": A,
         "pdot": quaternion_rate(state.p, state.omega),
         "q": np.array(q),

@@ -16,7 +16,8 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 
 from plumbline.model.datatypes import Array, Model, State
-from plumbline.model.kinematics import state_from_minimal
+from plumbline.model.equivalent import bodies_between
+from plumbline.model.kinematics import complete_state, state_from_minimal
 from plumbline.processes.exceptions import PlumblineError
 
 CLEAR_RATIO = 10.0  # a shrunk case exceeds its tolerance this many times, or half as often as the original
@@ -169,11 +170,9 @@ def starting_cases(case: ReproductionCase) -> Iterator[ReproductionCase]:
 
 def _parts(case: ReproductionCase, count: int) -> Iterator[ReproductionCase]:
     """Yield the first bodies, and the last ones hung from the pivot."""
-    model, state, n = case.model, case.state, case.model.n
-    for part in (slice(0, count), slice(n - count, n)) if count < n else (slice(0, n),):
-        few = Model.chain(**{k: v if k == "gravity" else v[part] for k, v in model.fields.items()})
-        at = {name: getattr(state, name)[part] for name in ("p", "omega", "u", "udot")}
-        yield _changed(case, few, **at)
+    for first in sorted({0, case.model.n - count}):
+        model, state = bodies_between(case.model, case.state, first, first + count)
+        yield replace(case, model=model, state=complete_state(model, state))
 
 
 def _fewer_bodies(case: ReproductionCase) -> Iterator[ReproductionCase]:

@@ -18,7 +18,7 @@ from plumbline.judging.known_issues import project_known_issues
 from plumbline.judging.rows import Verdict
 from plumbline.measurements.order_and_limit import STEP_EXPONENTS
 from plumbline.model.datatypes import BadInput, Model, State
-from plumbline.model.kinematics import state_from_minimal
+from plumbline.model.kinematics import complete_state
 from plumbline.model.sampling import compared_states
 from plumbline.processes.exceptions import PlumblineError
 from plumbline.processes.worker_pool import Limits, Outcome, ResultCache, Task, WorkerPool
@@ -209,13 +209,13 @@ def find_disagreement(document: dict[str, Any], rows: list[StoredRow], seconds: 
     if scenario is None:
         raise NotReproducible(f"the results do not hold the scenario {row['scenario']!r}")
     model = Model.from_fields(scenario["model"])
-    if not model.is_chain:
+    if not model.has_chain_joints:  # the templates of scripts have no other joints
         raise NotReproducible(
             "scripts write out chains of rods and ball joints; this mechanism has other joints, branches, "
             "loops or elements"
         )
-    start = {name: np.array(value, float) for name, value in scenario["state"].items()}
-    state = state_from_minimal(model, **start)
+    start = State(**{name: np.array(value, float) for name, value in scenario["state"].items()})
+    state = complete_state(model, start)
     if row["level"] in ("trajectory", "invariants"):
         case = _refinement_study(document, rows, model, state)
     else:

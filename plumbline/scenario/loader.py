@@ -331,6 +331,13 @@ def build_scenario(source: YamlSource, path: Path) -> Scenario:
     content["name"] = document.name or path.stem
     canonical = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=True)
     digest = hashlib.sha256(canonical.encode()).hexdigest()
+    if model.has_loops:  # rates that the file does not give follow from the others
+        for (given, _), at in zip(bodies, places, strict=True):
+            if "angular_velocity" not in given.model_fields_set:
+                written: Any = content
+                for key in at:
+                    written = written[key]
+                written.pop("angular_velocity", None)
     return Scenario(
         name=content["name"],
         family=document.family,
@@ -538,7 +545,7 @@ def _closed_state(source: YamlSource, model: Model, state: State, bodies: list[B
         (rates, "opens: rates differ"),
     ):
         for k in np.flatnonzero(~(sizes <= LOOP_TOLERANCE)):
-            place = source.value_positions[("closes", int(k))]
+            place = source.position(("closes", int(k)))
             valid = f"a state at t = 0 that fits the joint within {LOOP_TOLERANCE:g} (m, rad, m/s, rad/s)"
             raise source.fatal_error(
                 f"has a loop, joint {k + 1} of closes, that {what} by {sizes[k]:.3g}", valid, place

@@ -14,7 +14,6 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from plumbline.judging.rows import Level
 from plumbline.model.datatypes import (
-    CHAIN_FIELDS,
     JOINT_ELEMENTS,
     JOINT_FIELDS,
     KINDS,
@@ -37,7 +36,9 @@ _MODEL_SHAPES: dict[str, tuple[int, ...]] = {  # of one body; (3,) where none is
     "spring_body": (2,), "spring_point": (2, 3), "spring_stiffness": (), "spring_damping": (),
     "spring_length": (),
 }  # fmt: skip
-_STATE_SHAPES: dict[str, tuple[int, ...]] = {"p": (4,), "omega": (3,), "u": (3,), "udot": (3,)}
+_STATE_SHAPES: dict[str, tuple[int, ...]] = {
+    "p": (4,), "omega": (3,), "u": (3,), "udot": (3,), "r": (3,), "v": (3,),
+}  # fmt: skip
 _Count = Annotated[int, Field(ge=0, le=2**53)]
 _Duration = Annotated[float, Field(ge=0, le=1e15)]  # s
 _VerdictWord = Literal[
@@ -77,26 +78,21 @@ class _Scenario(_Part):
 
     @model_validator(mode="after")
     def _check_arrays(self) -> _Scenario:
-        is_tree = self.model is not None and "kind" in self.model
         model, counts = self.model or {}, dict.fromkeys(SPRING_FIELDS, 0)
         if isinstance(model.get("spring_body"), list):
             counts = dict.fromkeys(SPRING_FIELDS, len(model["spring_body"]))
         absent = {name for name in (*JOINT_ELEMENTS, *SPRING_FIELDS) if name not in model}
         absent -= set(SPRING_FIELDS) if "spring_body" in model else set()
-        names = (
-            [f.name for f in fields(Model) if f.name not in {"kind", *absent}] if is_tree else CHAIN_FIELDS
-        )
+        names = [f.name for f in fields(Model) if f.name not in {"kind", *absent}]
         joints = self._joint_count(model)
         counts |= dict.fromkeys(JOINT_FIELDS, joints)
-        if is_tree and not _are_kinds(model["kind"], joints):
+        if self.model is not None and not _are_kinds(model.get("kind"), joints):
             raise invalid_value_error("model.kind does not fit the bodies", f"{self.bodies} kinds of joints")
         columns = (column_count(model.get("kind", ())),)
         model_shapes = _MODEL_SHAPES | dict.fromkeys(JOINT_ELEMENTS, columns)
         shapes = {name: (counts.get(name, self.bodies), *model_shapes.get(name, (3,))) for name in names}
         _check_shapes("model", self.model, shapes | {"gravity": (3,)})
-        state_shapes = _STATE_SHAPES
-        if is_tree:
-            state_shapes = _STATE_SHAPES | {"r": (3,), "v": (3,), "x": columns, "xdot": columns}
+        state_shapes = _STATE_SHAPES | {"x": columns, "xdot": columns}
         _check_shapes("state", self.state, {k: (self.bodies, *shape) for k, shape in state_shapes.items()})
         if self.model is not None and min(self.model["mass"], default=1.0) <= 0:
             raise invalid_value_error("has a mass that is not positive", "masses above 0 kg")

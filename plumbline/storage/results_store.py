@@ -28,8 +28,8 @@ from plumbline.storage.results_schema import DamagedResults, check_results
 from plumbline.storage.schema_upgrade import upgrade_document, upgrade_summary
 
 Record = dict[str, Any]
-SCHEMA_VERSION = 4
-READABLE_VERSIONS = (1, 2, 3, 4)
+SCHEMA_VERSION = 5
+READABLE_VERSIONS = (1, 2, 3, 4, 5)
 TEXT = pa.string()
 REAL = pa.float64()
 INTEGER = pa.int32()

@@ -7,10 +7,13 @@ from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 
 from plumbline.judging.findings import Finding, find_findings
 from plumbline.judging.rows import Row, Verdict, error_ratio
+from plumbline.model.datatypes import Model
+from plumbline.model.kinematics import state_from_minimal
 
 Record = dict[str, Any]
 
@@ -36,8 +39,8 @@ def upgrade_document(document: Record) -> Record:
 
     Returns:
         The document with the present names.  In version 1 the ratio of a row was in its ``extra``, or
-        followed from its value and tolerance; before version 3 causes were sentences only, and before 4
-        nothing was grouped by cause.
+        followed from its value and tolerance; before version 3 causes were sentences only, before 4 nothing
+        was grouped by cause, and before 5 chains had fields of their own.
 
     """
     if document["schema_version"] == 1:
@@ -48,7 +51,22 @@ def upgrade_document(document: Record) -> Record:
     if document["schema_version"] == 3:
         found = findings_of_records(document["rows"], document["scenarios"])
         document = document | {"schema_version": 4, "findings": [finding.record() for finding in found]}
+    if document["schema_version"] == 4:
+        scenarios = {name: _with_joints(about) for name, about in document["scenarios"].items()}
+        document = document | {"schema_version": 5, "scenarios": scenarios}
     return document
+
+
+def _with_joints(about: Record) -> Record:
+    """A scenario whose chain has the fields that all mechanisms have."""
+    old = about.get("model")
+    if old is None or "kind" in old:
+        return about
+    arrays = {name: np.array(value, float) for name, value in {**old, **about["state"]}.items()}
+    model = Model.chain(**{name: arrays[name] for name in old})
+    state = state_from_minimal(model, **{name: arrays[name] for name in ("p", "omega", "u", "udot")})
+    fields = {name: np.asarray(value).tolist() for name, value in model.fields.items()}
+    return about | {"model": fields, "state": {name: x.tolist() for name, x in vars(state).items()}}
 
 
 def findings_of_records(rows: Iterable[Record], scenarios: Mapping[str, Record]) -> list[Finding]:

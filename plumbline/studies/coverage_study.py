@@ -9,7 +9,7 @@ import pyarrow as pa
 
 from plumbline.judging.rows import Level, Row
 from plumbline.judging.smallest_detectable_mistake import COVERED_LEVELS, CoverageEntry, scenario_coverage
-from plumbline.model.datatypes import BALL, CHAIN_FIELDS, ROD
+from plumbline.model.datatypes import BALL, JOINT_ELEMENTS, ROD
 from plumbline.model.sampling import compared_states
 from plumbline.processes.cpu_time import CpuTimes
 from plumbline.processes.exceptions import PlumblineError
@@ -23,7 +23,7 @@ FILE = "coverage.parquet"
 PARAMETERS_PER_TASK = (
     160  # those of a chain of 100 bodies take minutes, and no worker has them all at the end
 )
-_CHAIN_KINDS = (*CHAIN_FIELDS, "attitude", "omega", "direction", "rod_rate")
+_OF_SOME = (*JOINT_ELEMENTS, "anchor", "frame", "body_frame")  # that not every scenario has of a first body
 
 
 class CoverageFailure(PlumblineError):
@@ -156,7 +156,7 @@ def blind_spots(entries: Iterable[CoverageEntry]) -> list[str]:
     seen: dict[tuple[str, ...], bool] = {}
     for entry in entries:
         place = "body" if entry.body else "gravity"
-        if entry.joint in (ROD, BALL) and entry.kind in _CHAIN_KINDS:
+        if entry.joint in (ROD, BALL) and entry.kind not in _OF_SOME:
             place = "first body" if entry.body == 1 else "later body"
         key = entry.level, entry.parameter, place, entry.joint
         counts = entry.is_seen and (entry.scale == abs(entry.value) or entry.unit == "rad")

@@ -17,13 +17,14 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from plumbline.model.datatypes import Array, Model, Trajectory
+from plumbline.model.datatypes import Array, Float, Model, Trajectory
 from plumbline.model.invariants import compute_invariants
-from plumbline.model.kinematics import quaternion_rate
+from plumbline.model.kinematics import joint_coordinates, quaternion_rate
 from plumbline.scenario.loader import Scenario
 from plumbline.storage.results_store import DRIFT_TABLE
 from plumbline.studies.parquet_files import make_table
 from reference_impl.fast.collocation import BatchIntegrationResult, integrate_collocation
+from reference_impl.fast.tree_elimination import eliminated_system
 
 BAUMGARTE_RATE = 10.0  # 1/s
 VARIANTS: dict[str, dict[str, Any]] = {  # by name the options of the integration
@@ -37,7 +38,7 @@ def measure_drift(
     selected_scenarios: Sequence[Scenario],
     max_cpu_seconds: float,
     rtols: Sequence[float],
-    times: Sequence[float] = TIMES,
+    times: Sequence[float] | None = None,
     progress: Callable[[int, int, str], None] = lambda done, total, what: None,
     log: Callable[[str], None] = lambda sentence: None,
 ) -> pa.Table:
@@ -47,7 +48,7 @@ def measure_drift(
         selected_scenarios: what to run; each with every variant and tolerance.
         max_cpu_seconds: most CPU time of one run [s].
         rtols: relative tolerances of the integrator.
-        times: ends of the intervals to measure, ascending [s].
+        times: ends of the intervals to measure, ascending [s]; by default `TIMES`.
         progress: called with runs done, runs in all and the current run.
         log: called with the predicted cost of each long run.
 
@@ -59,7 +60,7 @@ def measure_drift(
     records: list[dict[str, Any]] = []
     for done, (s, variant, rtol) in enumerate(planned):
         progress(done, len(planned), f"{s.name}, {variant}, rtol {rtol:g}")
-        records += _measure_variant(s, variant, rtol, max_cpu_seconds, times, log)
+        records += _measure_variant(s, variant, rtol, max_cpu_seconds, times or TIMES, log)
     progress(len(planned), len(planned), "done")
     return make_table(records, DRIFT_TABLE)
 
@@ -104,8 +105,9 @@ def _drifts(s: Scenario, variant: str, rtol: float, times: Sequence[float]) -> l
     """By the end of each interval the largest errors until then, and the share of the steps."""
     grid = np.unique(np.concatenate([np.linspace(0, end, SAMPLES + 1) for end in times]))
     start = s.state.r, s.state.p, s.state.v, quaternion_rate(s.state.p, s.state.omega)
-    run = integrate_collocation([s.model], *start, grid, rtol, **VARIANTS[variant])
-    errors = drift_errors(s.model, run)
+    system = eliminated_system([s.model], joint_coordinates(s.model, s.state)[2])
+    run = integrate_collocation(system, *start, grid, rtol, **VARIANTS[variant])
+    errors = drift_errors(s.model, run, s.state.x)
     return [
         {"time": end, "steps": round(run.steps * end / times[-1])}
         | {name: float(np.max(error[grid <= end])) for name, error in errors.items()}
@@ -113,22 +115,28 @@ def _drifts(s: Scenario, variant: str, rtol: float, times: Sequence[float]) -> l
     ]
 
 
-def drift_errors(model: Model, run: BatchIntegrationResult) -> dict[str, Array]:
+def drift_errors(
+    model: Model, run: BatchIntegrationResult, x: Float[Array, "bodies coordinates"] | None = None
+) -> dict[str, Array]:
     """Measure the errors of a motion, of the worst joint or body at each sample.
 
     Args:
-        model: a chain of rods and balls.
+        x: joint coordinates at the start, angles unwrapped.
 
     Returns:
         (T,) each: "gap" [m], "gap_rate" [m/s], "norm" |‖p‖ − 1|, and "energy" |E − E(0)| over Σ m g (reach
-        of the stretched chain), NaN with loads or drag, whose work so few samples do not give.
+        of the stretched mechanism), NaN without weight, and with loads, drag, dampers or efforts, whose work
+        so few samples do not give.
 
     """
-    drifts = compute_invariants(model, Trajectory(run.t, run.r, run.p, run.v, run.pdot, run.steps))
-    near, far = np.linalg.norm(model.proximal, axis=1), np.linalg.norm(model.distal, axis=1)
-    hang = np.cumsum(model.length + near) + np.concatenate([[0.0], np.cumsum(far)[:-1]])
-    weight = float(np.sum(model.mass * hang) * np.linalg.norm(model.gravity))
+    drifts = compute_invariants(model, Trajectory(run.t, run.r, run.p, run.v, run.pdot, run.steps, x))
+    far, near = np.moveaxis(np.linalg.norm(model.point, axis=-1), -1, 0)
+    reach = np.zeros(model.n)
+    for k, body in enumerate(model.body[: model.n, 0]):
+        reach[k] = (reach[body] if body >= 0 else 0.0) + far[k] + model.length[k] + near[k]
+    weight = float(np.sum(model.mass * reach) * np.linalg.norm(model.gravity))
     series = {"gap": drifts.joint_gap, "gap_rate": drifts.gap_rate, "norm": drifts.norm_drift}
     errors = {name: np.max(np.linalg.norm(x, axis=-1), axis=1) for name, x in series.items()}
-    is_closed = not (model.has_loads or model.has_drag)
-    return errors | {"energy": np.abs(drifts.energy_drift[:, 0, 0]) / (weight if is_closed else np.nan)}
+    does_work = model.has_loads or model.is_dissipative or bool(np.any(model.effort))
+    scale = np.nan if does_work or weight == 0 else weight
+    return errors | {"energy": np.abs(drifts.energy_drift[:, 0, 0]) / scale}

@@ -165,7 +165,7 @@ def load(
     problems = list(source.problems)
 
     def report(loc: Sequence[Any], field: str, message: str, valid: str = "") -> None:
-        problems.append(Problem(source.file, *_source_position(source, loc), field, message, valid))
+        problems.append(Problem(source.file, *source.position(tuple(loc)), field, message, valid))
 
     try:
         sweep = Sweep.model_validate(source.data)
@@ -187,8 +187,6 @@ def load(
         base = scenarios.load_scenario(file)
     except ScenarioError as error:
         raise ScenarioError([*problems, *error.problems]) from None
-    if not base.model.is_chain:
-        report(("scenario",), "scenario", f"{base.name} is a tree", "a chain of rods and ball joints")
     for name, axis in sweep.vary.items():
         if not _is_number(base.document, name):
             valid = "a field as `bodies[0].mass`, written in the scenario"
@@ -243,7 +241,7 @@ def check_integrators(path: Path, sweep: Sweep, engines: Mapping[str, EngineInfo
     for name, info in engines.items():
         known = [integrator.name for integrator in info.integrators]
         if info.missing is None and sweep.engines[name] not in known:
-            place = _source_position(source, ("engines", name))
+            place = source.position(("engines", name))
             message = f"has no integrator {shorten(repr(sweep.engines[name]))}"
             problems.append(Problem(source.file, *place, f"engines.{name}", message, ", ".join(known)))
     if problems:
@@ -297,10 +295,3 @@ def _is_number(document: Any, name: str) -> bool:
         return isinstance(_get_field(document, _parse_field_path(name)), int | float)
     except LookupError:
         return False
-
-
-def _source_position(source: YamlSource, loc: Sequence[Any]) -> tuple[int, int]:
-    path = tuple(loc)
-    while path and path not in source.value_positions:
-        path = path[:-1]
-    return source.value_positions.get(path, (1, 1))

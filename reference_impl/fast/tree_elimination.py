@@ -354,7 +354,7 @@ def eliminated_system(
     """
     if any(mechanism.has_loops or mechanism.lacks_inertia for mechanism in mechanisms):
         return DenseSystem(mechanisms, x)
-    if all(mechanism.is_chain for mechanism in mechanisms):
+    if all(mechanism.has_chain_joints for mechanism in mechanisms):
         return StructuredSystem(mechanisms)
     return TreeSystem(mechanisms, x)
 

@@ -1,24 +1,29 @@
-"""Commands that cover chains only refuse trees; a run compares trees at state level and reports them."""
+"""Commands on trees and loops: runs, coverage, sweeps and drift tables."""
 
 import json
+from unittest.mock import patch
 
+import pyarrow.parquet as pq
 from click.testing import CliRunner
 
 from plumbline.cli.main import main
 
 
-def test_a_drift_table_of_a_tree_is_refused(tmp_path):
-    done = CliRunner().invoke(main, ["drift", "furuta", "--out", str(tmp_path / "out")])
-    assert done.exit_code == 2 and "furuta is a tree" in done.output
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_sweep_of_a_tree_is_refused_with_its_place(tmp_path):
+def test_a_sweep_and_a_drift_table_of_a_tree_and_a_loop(tmp_path):
     (tmp_path / "s.yaml").write_text(
-        "schema_version: 1\nscenario: furuta\nvary:\n  bodies[0].mass: {values: [1.0]}\n"
+        "schema_version: 1\nscenario: four-bar\nvary:\n  bodies[0].mass: {values: [1.0, 2.0]}\n"
+        "duration: 0.25\nengines: {mujoco: RK4}\n"
     )
     done = CliRunner().invoke(main, ["sweep", str(tmp_path / "s.yaml"), "--out", str(tmp_path / "out")])
-    assert done.exit_code == 2 and "furuta is a tree" in done.output
+    assert done.exit_code == 0, done.output
+    rows = pq.read_table(tmp_path / "out" / "sweep.parquet").to_pylist()
+    assert [row["verdict"] for row in rows] == ["agrees"] * 4, [row["reason"] for row in rows]
+    with patch("plumbline.studies.drift.TIMES", (0.25, 0.5)):
+        done = CliRunner().invoke(
+            main, ["drift", "sprung-hinge", "--rtol", "1e-6", "--out", str(tmp_path / "out")]
+        )
+    assert done.exit_code == 0, done.output
+    assert len(pq.read_table(tmp_path / "out" / "drift.parquet")) == 6
 
 
 def test_a_tree_is_compared_with_its_joint_moments(tmp_path):

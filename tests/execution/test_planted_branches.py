@@ -46,7 +46,7 @@ def shared_truths():
 
 @cache
 def catalogue_chains():
-    return [s for s in catalogue_scenarios().values() if s.model.is_chain and s.model.n <= MAX_BODIES]
+    return [s for s in catalogue_scenarios().values() if s.model.has_chain_joints and s.model.n <= MAX_BODIES]
 
 
 @cache

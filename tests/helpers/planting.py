@@ -178,7 +178,7 @@ def diagnosis(defect: Defect) -> str:
     if not wrong:
         return ""
     with planted(defect) as engine:  # of chains with the engine, asked again for digits and where it persists
-        return diagnose(model, reported, truth, engine.evaluate if model.is_chain else None).text
+        return diagnose(model, reported, truth, engine.evaluate if model.has_chain_joints else None).text
 
 
 def assert_named(defect: Defect) -> None:

@@ -292,7 +292,9 @@ def test_no_parameter_is_blind_at_state_and_step_level():
     entries = []
     for name in [*catalogue(2), "loaded-tree", "tree-of-seven-sprung", "four-bar"]:
         s = scenario(name)
-        levels = ("state", "step") if s.model.is_chain else ("state",)  # steps of trees: with the motions
+        levels = (
+            ("state", "step") if s.model.has_chain_joints else ("state",)
+        )  # steps of trees: with the motions
         entries += scenario_coverage(s.name, s.model, s.state, s.times, states(name)[:6], [], levels)
     assert blind_spots(entries) == []
 

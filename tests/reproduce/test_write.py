@@ -36,7 +36,7 @@ def results(tmp_path):
         "bodies": scenario.model.n,
         "digest": scenario.digest,
         "model": {k: np.asarray(v).tolist() for k, v in scenario.model.fields.items()},
-        "state": {k: getattr(scenario.state, k).tolist() for k in ("p", "omega", "u", "udot")},
+        "state": {k: x.tolist() for k, x in vars(scenario.state).items()},
     }
     version = load_adapter("pinocchio-aba").version()
     context = RowContext("chain", "chain", "pinocchio-aba", "Pinocchio", version)

@@ -29,7 +29,7 @@ def test_loops_are_closed_to_rounding(name):
     s = load_scenario(find_scenario_file(name))
     gaps, rates = loop_gaps(s.model, s.state)
     assert np.max(gaps) < 1e-15 and np.max(rates) < 1e-14
-    assert s.model.has_loops and not s.model.is_chain and len(s.model.kind) > s.model.n
+    assert s.model.has_loops and not s.model.has_chain_joints and len(s.model.kind) > s.model.n
 
 
 def test_the_rates_that_are_given_stay_and_the_others_follow():

@@ -37,7 +37,7 @@ def test_a_tree_is_built_as_written():
         "joint: {kind: free, position: [1, 1, 1], velocity: [0, 0, 2]}, attitude: {quaternion: [0, 1, 0, 0]}",
     )
     assert s.model.kind == ("hinge", "slide", "ball", "universal", "free")
-    assert s.model.body[:, 0].tolist() == [-1, 0, 0, -1, -1] and not s.model.is_chain
+    assert s.model.body[:, 0].tolist() == [-1, 0, 0, -1, -1] and not s.model.has_chain_joints
     np.testing.assert_array_equal(
         s.model.point[:, 0], [[0, 0, 0], [0, 0, -1], [1, 2, 3], [4, 0, 0], [0, 0, 0]]
     )
@@ -150,7 +150,7 @@ def test_passive_elements_are_built_as_written():
 
 def test_a_chain_with_an_element_is_no_bare_chain_and_bare_files_keep_their_digest():
     bare, damped = load(BALL), load(BALL.replace("ball", "ball, damping: 1"))
-    assert bare.model.is_chain and not damped.model.is_chain and damped.model.has_elements
+    assert bare.model.has_chain_joints and not damped.model.has_chain_joints and damped.model.has_elements
     assert "springs" not in bare.document and set(bare.document["bodies"][0]["joint"]) == {"kind"}
     assert bare.digest != damped.digest
     assert not set(bare.model.fields) & {"armature", "spring_body"}

@@ -193,7 +193,10 @@ def test_temporary_files_of_a_killed_run_are_removed(tmp_path):
         ),
         (lambda d: d["rows"][0].update(scenario="t"), "rows[0].scenario is 't'; valid would be one of the"),
         (lambda d: d["rows"][0].pop("reason"), "rows[0].reason: is missing"),
-        (lambda d: d["scenarios"]["s"].update(model={"mass": [1]}), "model.inertia does not fit the bodies"),
+        (
+            lambda d: d["scenarios"]["s"].update(model={"mass": [1], "kind": ["ball"]}),
+            "model.inertia does not fit the bodies",
+        ),
         (lambda d: d.update(engines=[]), "engines: is a list"),
         (lambda d: d["rows"].extend([3] * 9), "… and 4 more problems"),
     ],

@@ -251,7 +251,7 @@ def test_horizon_is_the_last_tolerable_time():
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("name", [n for n, s in catalogue_scenarios().items() if s.model.is_chain])
+@pytest.mark.parametrize("name", [n for n, s in catalogue_scenarios().items() if s.model.has_chain_joints])
 def test_no_unstable_scenario_is_left_out(name):
     scenario = load_scenario(find_scenario_file(name))
     found = perturbation_growth(scenario.model, scenario.state, np.arange(301) * 0.05)

@@ -23,7 +23,7 @@ from tests.helpers.nightly_tests import fast_are
 from tests.helpers.random_chains import random_chain
 
 TIMES = np.arange(41) * 0.05
-CATALOGUE = [s for s in catalogue_scenarios().values() if s.model.is_chain]
+CATALOGUE = [s for s in catalogue_scenarios().values() if s.model.has_chain_joints]
 BALL_JOINT_SCENARIOS = [s for s in CATALOGUE if not s.model.rods.any()]
 FAST_BALLS = ("loaded-ball", "double-mass-ratio-1000", "chain-3-balls")  # loads, masses far apart, several
 FAST_CLOSED_FORMS = ("planar-170", "lagrange-top", "spherical", "double-conical")  # one of each kind
