@@ -1,14 +1,18 @@
 """Compact encoding of numbers for one HTML file: decimation that keeps peaks, quantisation, compression.
 
-A chunk is gzip(length of the header, header as JSON, arrays), in base64; the page inflates it when it
-is first needed.  In the header {"$": [offset, length, type]} refers to an array.
+A chunk is gzip(length of the header, header as JSON, arrays), 13 bits in two printable characters; the page
+inflates it when it is first needed.  Its header lists the types and lengths of the arrays; {"$": k} refers to
+array k, {"$rows": …} is a table of records by columns, {"$numbers": …} a list of numbers of a few digits,
+{"$lists": …} one of lists, and {"$texts": …} one of texts, by their places in the list that all chunks share.
+That list is stored as templates and the numbers in them.
 """
 
 from __future__ import annotations
 
-import base64
 import gzip
 import json
+import re
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -18,6 +22,13 @@ from plumbline.model.datatypes import AnyArray, Array, Float, Indices, Int, Shap
 
 STEPS_PER_DECADE = 500  # log-scale curves are rounded to 10^(1/500), 0.46 %
 LOWEST_DECADE = -40.0  # decade of code 2; code 0 is "no number", code 1 an exact zero
+COARSE = 40  # codes to which values are rounded that a plot alone shows: a pixel of its log scale
+DIGITS = 3  # of numbers in tables
+NUMBER = re.compile(r"\d+(?:\.\d+)?(?:e[-+]?\d+)?")
+# all that is printable but what HTML or an attribute might take for its own
+ALPHABET = np.array([c for c in range(33, 127) if chr(c) not in '<&"'], np.uint8)
+WIDTHS = {"f4": 4, "u4": 4, "u2": 2, "i2": 2, "u1": 1, "i1": 1}  # bytes
+NO_NUMBER = -(2**15)
 
 
 def bucket_edges(count: int, points: int) -> Int[Indices, "edges"]:
@@ -75,8 +86,11 @@ def decimate(y: Float[Array, "n"], points: int) -> Float[Array, "m"]:
     return out.ravel()
 
 
-def log_scale_codes(y: Float[Array, "n"]) -> Shaped[AnyArray, "n"]:
-    """Encode magnitudes on a log scale, with a relative error of at most 0.24 %.
+def log_scale_codes(y: Float[Array, "n"], coarse: int = 1) -> Shaped[AnyArray, "n"]:
+    """Encode magnitudes on a log scale, with a relative error of at most 0.24 % times ``coarse``.
+
+    Args:
+        coarse: codes of numbers are multiples of it, plus 2; fewer different ones compress better.
 
     Returns:
         uint16: 0 for not finite, 1 for exactly zero, else 2 + 500 (log10 |y| + 40).
@@ -84,7 +98,8 @@ def log_scale_codes(y: Float[Array, "n"]) -> Shaped[AnyArray, "n"]:
     """
     size = np.abs(np.asarray(y, dtype=float))
     with np.errstate(divide="ignore", invalid="ignore"):
-        codes = np.clip(np.round((np.log10(size) - LOWEST_DECADE) * STEPS_PER_DECADE), 0, 65000) + 2
+        codes = (np.log10(size) - LOWEST_DECADE) * STEPS_PER_DECADE / coarse
+        codes = np.clip(coarse * np.round(codes), 0, 65000) + 2
     codes = np.where(size == 0, 1, np.where(np.isfinite(size), codes, 0))
     return codes.astype(np.uint16)
 
@@ -92,39 +107,108 @@ def log_scale_codes(y: Float[Array, "n"]) -> Shaped[AnyArray, "n"]:
 class ChunkBuilder:
     """Collects the arrays of one chunk."""
 
-    def __init__(self) -> None:
-        """Start without arrays."""
-        self._parts: list[bytes] = []
-        self._size = 0
+    def __init__(self, texts: dict[str, int] | None = None) -> None:
+        """Start without arrays.
 
-    def add(self, array: Shaped[AnyArray, "..."]) -> dict[str, list[Any]]:
+        Args:
+            texts: places of the texts in the list that all chunks share; new ones are added.
+
+        """
+        self._parts: list[bytes] = []
+        self._arrays: list[tuple[str, int]] = []
+        self._texts = {} if texts is None else texts
+
+    def add(self, array: Shaped[AnyArray, "..."]) -> dict[str, int]:
         """Store an array.
 
         Args:
-            array: of type float32, uint16, int16, uint8 or int8.
+            array: of type float32, uint32, uint16, int16, uint8 or int8.
 
         Returns:
             The reference to the array, for the header.
 
         """
-        kind = {"float32": "f4", "uint16": "u2", "int16": "i2", "uint8": "u1", "int8": "i1"}[array.dtype.name]
+        kind = f"{array.dtype.kind}{array.dtype.itemsize}"
         data = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("<")).tobytes()
-        if kind in ("u2", "i2"):  # low bytes, then high bytes: the high ones hardly change and compress well
-            data = data[0::2] + data[1::2]
-        reference = {"$": [self._size, int(array.size), kind]}
-        padding = bytes(-len(data) % 4)
-        self._parts.append(data + padding)
-        self._size += len(data) + len(padding)
-        return reference
+        # low bytes, then higher ones, which hardly change and compress well
+        data = b"".join(data[i :: WIDTHS[kind]] for i in range(WIDTHS[kind]))
+        self._parts.append(data)
+        self._arrays.append((kind, int(array.size)))
+        return {"$": len(self._parts) - 1}
+
+    def add_table(self, records: Sequence[Mapping[str, Any]], exact: Collection[str] = ()) -> dict[str, Any]:
+        """Store records by columns; what is None, and a number that is not finite, is absent in the page.
+
+        Args:
+            records: fields of one name are texts, numbers, records, or anything.
+            exact: names of numbers that keep their digits.
+
+        Returns:
+            The table, for the header.
+
+        """
+        names = dict.fromkeys(name for record in records for name in record)
+        values = {name: [record.get(name) for record in records] for name in names}
+        columns = {name: some if name in exact else self._column(some) for name, some in values.items()}
+        return {"$rows": len(records), "columns": columns}
+
+    def add_texts(self, values: Sequence[str | None]) -> dict[str, Any]:
+        """Store texts."""
+        codes = [0 if x is None else 1 + self._texts.setdefault(x, len(self._texts)) for x in values]
+        return {"$texts": self.add(np.array(codes, np.uint32))}
+
+    def _column(self, values: list[Any]) -> Any:
+        given = [x for x in values if x is not None]
+        if all(isinstance(x, str) for x in given):
+            return self.add_texts(values)
+        if all(isinstance(x, Mapping) and "$" not in x for x in given):
+            return self.add_table([x or {} for x in values])
+        if all(isinstance(x, list) and all(y is None or isinstance(y, float) for y in x) for x in given):
+            counts = np.array([len(x or ()) for x in values], np.uint16)
+            return {"$lists": [self.add(counts), self._column([y for x in given for y in x])]}
+        if not all(isinstance(x, (int, float)) for x in given) or any(
+            isinstance(x, int) and abs(x) >= 10**DIGITS for x in given
+        ):
+            return [None if isinstance(x, float) and not np.isfinite(x) else x for x in values]
+        found = np.full(len(values), NO_NUMBER, np.int16), np.zeros(len(values), np.int8)
+        for i, x in enumerate(values):
+            if x is not None and np.isfinite(x):
+                first, _, exponent = f"{x:.{DIGITS - 1}e}".partition("e")
+                found[0][i] = int(first.replace(".", ""))
+                found[1][i] = int(exponent) - (DIGITS - 1) if found[0][i] else 0
+        return {"$numbers": [self.add(some) for some in found]}
 
     def encode(self, header: Any) -> str:
         """Finish the chunk.
 
         Returns:
-            The chunk, base64.
+            The chunk: its length in bytes, a colon and its characters.
 
         """
+        kinds, sizes = zip(*self._arrays, strict=True) if self._arrays else ((), ())
+        header = {"kinds": " ".join(kinds), "sizes": sizes, "header": header}
         text = json.dumps(header, ensure_ascii=False, separators=(",", ":"), allow_nan=False).encode()
-        text += b" " * (-len(text) % 4)
         body = len(text).to_bytes(4, "little") + text + b"".join(self._parts)
-        return base64.b64encode(gzip.compress(body, 9, mtime=0)).decode()
+        packed = gzip.compress(body, 9, mtime=0)
+        bits = np.unpackbits(np.frombuffer(packed, np.uint8))
+        groups = np.pad(bits, (0, -len(bits) % 13)).reshape(-1, 13) @ (1 << np.arange(12, -1, -1))
+        pairs = np.stack(np.divmod(groups, len(ALPHABET)), axis=1)
+        return f"{len(packed)}:{ALPHABET[pairs].tobytes().decode()}"
+
+
+def encode_texts(texts: Iterable[str]) -> str:
+    """Encode the list of texts that all chunks share: of each its template, and by template its numbers."""
+    packer, codes, templates = ChunkBuilder(), list[int](), dict[str, int]()
+    numbers: list[list[list[str]]] = []
+    for text in texts:
+        template = NUMBER.sub("\0", text)
+        code = templates.setdefault(template, len(templates))
+        codes.append(code)
+        numbers[code:] = numbers[code:] or [[]]
+        numbers[code].append(NUMBER.findall(text))
+    header = {
+        "templates": list(templates),
+        "codes": packer.add(np.array(codes, np.uint16)),
+        "numbers": [[" ".join(slot) for slot in zip(*some, strict=True)] for some in numbers],
+    }
+    return packer.encode(header)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import math
 import re
 import time
 from collections import Counter
@@ -19,6 +18,7 @@ from markupsafe import Markup
 from plumbline.judging.rows import SHOWN_STYLES
 from plumbline.storage.results_store import write_atomically
 from reports import coverage_table, reference_tables, report_data
+from reports.chunks import encode_texts
 from reports.earlier_runs import History
 from reports.findings_list import declared_gaps, findings_for_page
 from reports.stored_results import Record, Results
@@ -37,8 +37,9 @@ SCRIPT_MODULES = (
     "chunks", "text", "route", "plot", "matrix", "curves", "motion", "detail", "cost", "trend", "main"
 )  # fmt: skip
 MAX_PAGE_BYTES = 2_000_000  # bytes, for the default catalogue
-MAX_NIGHTLY_PAGE_BYTES = 8_000_000  # bytes, with a history or more than 60 scenarios
-CURVE_POINTS = (360, 240, 160, 100, 60)  # values per curve, tried in turn until the page is within its budget
+MAX_NIGHTLY_PAGE_BYTES = 8_000_000  # bytes, with a history or more scenarios than the catalogue has
+MAX_CATALOGUE = 120  # scenarios
+CURVE_POINTS = (360, 160, 80, 40, 28, 20, 14)  # values per curve, tried until the page is within its budget
 MAX_SCENARIOS = 500  # scenarios in the page at most
 MAX_FINDINGS = 60  # findings written out in the static page
 
@@ -60,18 +61,21 @@ def write(results: Results, history: Path | None = None) -> Path:
 
 def render(results: Results, history: History) -> str:
     """Render the page, with as many points per curve as its size limit allows."""
-    budget = MAX_NIGHTLY_PAGE_BYTES if history.nights or len(results.scenarios) > 60 else MAX_PAGE_BYTES
+    is_large = history.nights or len(results.scenarios) > MAX_CATALOGUE
+    budget = MAX_NIGHTLY_PAGE_BYTES if is_large else MAX_PAGE_BYTES
     shown = results.restricted_to(_scenarios_to_show(results))
     tables = {k: shown.table_by_scenario(k) for k in ("states", "curves", "trajectories")}
+    texts = dict[str, int]()
     chunks = {
-        "index": report_data.index_chunk(shown, history),
-        "convergence": report_data.convergence_chunk(shown),
+        "index": report_data.index_chunk(shown, history, texts),
+        "convergence": report_data.convergence_chunk(shown, texts),
     }
     if history.nights:
         chunks["history"] = report_data.history_chunk(shown, history)
     for points in (*CURVE_POINTS, 0):
         for k, name in enumerate(shown.scenarios):
-            chunks[f"scenario-{k}"] = report_data.scenario_chunk(name, shown, tables, points)
+            chunks[f"scenario-{k}"] = report_data.scenario_chunk(name, shown, tables, points, texts)
+        chunks["texts"] = encode_texts(texts)
         html = _render_template(results, shown, history, chunks, points)
         if len(html.encode()) <= budget:
             break
@@ -162,8 +166,6 @@ def _matrix_by_family(results: Results) -> dict[str, Any]:
                     "row": worst,
                     "ratio": error_ratio(worst),
                     "known": sum(r.get("known_issue") is not None for r in rows),
-                    "link": "#" + urlencode({"scenario": name, "engine": engine}),
-                    "track": _ratio_position(error_ratio(worst)),
                 }
         family = families.setdefault(scenario["family"], {"lines": [], "summary": {}})
         family["lines"].append({"name": name, "scenario": scenario, "cells": line, "place": place})
@@ -175,13 +177,6 @@ def _matrix_by_family(results: Results) -> dict[str, Any]:
                 if engine in line["cells"]
             )
     return families
-
-
-def _ratio_position(ratio: float | None) -> float | None:
-    """Place an error over tolerance on a cell's log scale: 0 (≤ 1e-4) … 48 (the tolerance) … 96 (≥ 1e4)."""
-    if ratio is None:
-        return None
-    return round(min(max((math.log10(max(ratio, 1e-30)) + 4) * 12, 0), 96), 1)
 
 
 def _changes_since_last_passed(results: Results, history: History) -> Record | None:
@@ -233,12 +228,15 @@ def bundle_script() -> str:
     for name in SCRIPT_MODULES:
         text = (REPORTS_FOLDER / "assets" / f"{name}.js").read_text(encoding="utf-8")
         text = re.sub(r"^import\b[^;]*;\n", "", text, flags=re.MULTILINE)
+        text = re.sub(r"^ *(?://.*|/\*\*(?:[^*]|\*(?!/))*\*/)\n", "", text, flags=re.MULTILINE)
         text = re.sub(r"^export (?=async|function|const|class|let)", "", text, flags=re.MULTILINE)
         names += re.findall(r"^(?:async function|function|const|class|let) (\w+)", text, flags=re.MULTILINE)
         parts.append(text)
     if len(names) != len(set(names)):
         raise ValueError(f"names used by two modules: {sorted(n for n in set(names) if names.count(n) > 1)}")
-    script = parts[0] + '\n(() => {\n"use strict";\n' + "\n".join(parts[1:]) + "\n})();\n"
+    script = (
+        parts[0] + '\n(() => {\n"use strict";\n' + re.sub("\n +", "\n", "\n".join(parts[1:])) + "\n})();\n"
+    )
     if re.search(r"</script|<!--", script, re.IGNORECASE):
         raise ValueError("the page's script would end its own element")
     return script

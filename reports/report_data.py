@@ -16,7 +16,7 @@ from plumbline.model.invariants import DEPARTURE, first_departure
 from plumbline.model.kinematics import quaternion_conjugate, quaternion_product, rotation_matrix
 from plumbline.model.loops import cut_open, determinate_projectors, singular_values
 from plumbline.storage.results_schema import DamagedResults
-from reports.chunks import ChunkBuilder, decimate, decimate_times, log_scale_codes
+from reports.chunks import COARSE, ChunkBuilder, decimate, decimate_times, log_scale_codes
 from reports.earlier_runs import History
 from reports.stored_results import Columns, Record, Results, group_rows
 from reports.verdicts import css_class, error_ratio, severity, shown_verdict
@@ -31,11 +31,14 @@ CURVE_COLUMNS = (
     "gap_rate",
     "norm_drift",
 )
+STUDY_COLUMNS = ("resolution", "error", "cost", "order")
 CLI_LEVEL = {"state": "state", "step": "step", "trajectory": "trajectory", "invariants": "trajectory"}
 DEFAULT_LONG_RUN_SECONDS = 100.0  # s: the default of the nightly's --long-run-seconds
 CATALOGUE_FOLDER = Path(__file__).parent.parent / "scenarios"
 RERUN_FOLDER = "repeated"
 MAX_MOTION_BYTES = 90_000  # of one scenario's motion, before compression
+POSE_LEVELS, DIFFERENCE_LEVELS = 1000, 24  # either side of 0: a pixel, and of magnified differences two
+SCALE_BITS = np.uint32(0xFFFE0000)  # of float32: 7 binary digits
 PROVED = "proved: "  # how a truth that is a certificate's midpoints begins
 _NUMBER_FIELDS = ("value", "tolerance", "uncertainty", "compared_until", "order", "user_rtol", "cpu_time")
 _TEXT_FIELDS = (
@@ -47,6 +50,10 @@ _TEXT_FIELDS = (
     "derivation",
     "engine_version",
 )
+_SCENARIO_FIELDS = (
+    "family", "title", "purpose", "file", "bodies", "joints", "duration", "sample", "exact", "digest",
+    "horizon", "truth", "truth_uncertainty",
+)  # fmt: skip
 
 ScenarioTables = dict[str, dict[str, Columns]]  # by table, then scenario
 
@@ -95,17 +102,18 @@ def _json_number(value: Any, digits: int = 6) -> Any:
     return float(f"{float(value):.{digits}g}") if np.isfinite(float(value)) else None
 
 
-def index_chunk(results: Results, history: History) -> str:
+def index_chunk(results: Results, history: History, texts: dict[str, int]) -> str:
     """Encode every row as a small integer per field, with the lists that the integers index.
 
     Args:
         results: the run, restricted to the scenarios of the page.
+        texts: places of the texts that all chunks share; new ones are added.
 
     Returns:
         The chunk, see `reports.chunks`; its header is ``Index`` in report_data.d.ts.
 
     """
-    packer = ChunkBuilder()
+    packer = ChunkBuilder(texts)
     header: dict[str, Any] = {
         "scenarios": list(results.scenarios),
         "families": [s["family"] for s in results.scenarios.values()],
@@ -115,7 +123,7 @@ def index_chunk(results: Results, history: History) -> str:
         "verdicts": list(SHOWN_STYLES),
         "glyphs": [style.glyph for style in SHOWN_STYLES.values()],
         "slugs": [css_class(verdict) for verdict in SHOWN_STYLES],
-        "reasons": [row["reason"] for row in results.rows],
+        "reasons": packer.add_texts([row["reason"] for row in results.rows]),
         "commit": results.run.get("commit"),
         "passed": history.last_passed.run["started"] if history.last_passed else None,
     }
@@ -141,40 +149,46 @@ def index_chunk(results: Results, history: History) -> str:
     return packer.encode(header)
 
 
-def scenario_chunk(name: str, results: Results, tables: ScenarioTables, points: int) -> str:
+def scenario_chunk(
+    name: str, results: Results, tables: ScenarioTables, points: int, texts: dict[str, int]
+) -> str:
     """Encode everything that the cells of one scenario show.
 
     Args:
         tables: states, curves and trajectories by scenario.
         points: largest number of values per curve; 0 for no curves and no motion.
+        texts: places of the texts that all chunks share; new ones are added.
 
     Returns:
-        The chunk, see `reports.chunks`; its header is ``ScenarioChunk`` in report_data.d.ts.
+        The chunk, see `reports.chunks`; its header is ``PackedScenario`` in report_data.d.ts.
 
     """
-    packer = ChunkBuilder()
+    packer = ChunkBuilder(texts)
     scenario = results.scenarios[name]
-    details: dict[str, Record] = {}
+    details: list[Record] = []
     commands: dict[str, str] = {}
     for index in results.row_indices[name]:
         row = results.rows[index]
         detail: Record = {k: row[k] for k in _TEXT_FIELDS if row.get(k) not in (None, "")}
-        detail |= {k: _json_number(row[k]) for k in _NUMBER_FIELDS if row.get(k) is not None}
-        detail["extra"] = {k: _json_number(v) for k, v in (row.get("extra") or {}).items()}
-        detail["script"] = results.scripts.get(row["key"])
-        details[str(index)] = {k: v for k, v in detail.items() if v not in (None, {})}
+        detail |= {k: row[k] for k in _NUMBER_FIELDS if row.get(k) is not None}
+        details.append(detail | {"extra": row.get("extra"), "script": results.scripts.get(row["key"])})
         level = "long" if _is_long_run(row) else row["level"]
         commands[f"{row['engine']}/{level}"] = rerun_command(row, scenario)
     header = {
         "scenario": {
-            k: _json_number(v) if isinstance(v, float) else v for k, v in scenario.items() if k != "model"
+            k: _json_number(scenario[k]) if isinstance(scenario[k], float) else scenario[k]
+            for k in _SCENARIO_FIELDS
+            if k in scenario
         }
         | {"loops": _loop_facts(scenario)},
-        "rows": details,
+        "places": np.diff(results.row_indices[name], prepend=0).tolist(),
+        "rows": packer.add_table(details),
         "commands": commands,
         "departures": _departures(name, results, tables),
-        "states": _state_errors(name, tables, packer),
-        "curves": _error_curves(name, tables, packer, points) if points else None,
+        "states": packer.add_table(_state_errors(name, tables, packer)),
+        "curves": packer.add_table(_error_curves(name, tables, packer, points), ["crossing"])
+        if points
+        else None,
         "motion": _motion_frames(name, scenario, tables, packer, points) if points else None,
     }
     return packer.encode(header)
@@ -187,16 +201,15 @@ def _state_errors(name: str, tables: ScenarioTables, packer: ChunkBuilder) -> li
     error, bound = (states[column].astype(float) for column in ("error", "bound"))
     with np.errstate(divide="ignore", invalid="ignore"):
         quotient = np.where((error == 0) & (bound == 0), 0.0, error / bound)  # both of a body at rest
-    codes, sizes = log_scale_codes(quotient), np.where(np.isfinite(quotient), quotient, np.inf)
+    codes, sizes = log_scale_codes(quotient, COARSE), np.where(np.isfinite(quotient), quotient, np.inf)
     found = []
     for (engine, quantity), rows in group_rows(states, "engine", "quantity"):
-        order = rows[np.argsort(states["state"][rows], kind="stable")]
         top = rows[int(np.argmax(sizes[rows]))]
         found.append(
             {
                 "engine": engine,
                 "quantity": quantity,
-                "ratio": packer.add(codes[order]),
+                "ratio": packer.add(np.sort(codes[rows])),
                 "worst": [int(states["state"][top]), int(states["body"][top]) + 1],
                 "bound": _json_number(np.median(bound[rows]), 3),
                 "error": _json_number(error[top], 3),
@@ -226,10 +239,11 @@ def _error_curves(name: str, tables: ScenarioTables, packer: ChunkBuilder, point
         }
         if np.isfinite(tolerance).any():
             one["judged"] = judged
-            one["tolerance"] = packer.add(log_scale_codes(decimate(tolerance, points)))
+            one["tolerance"] = packer.add(log_scale_codes(decimate(tolerance, points), COARSE))
         for curve in CURVE_COLUMNS:
             if curve in curves and np.any(np.isfinite(curves[curve][rows]) & (curves[curve][rows] != 0)):
-                one[curve] = packer.add(log_scale_codes(decimate(curves[curve][rows].astype(float), points)))
+                values = decimate(curves[curve][rows].astype(float), points)
+                one[curve] = packer.add(log_scale_codes(values, COARSE))
         found.append(one)
     return found
 
@@ -291,10 +305,9 @@ def _motion_frames(
     errors = _final_errors(name, tables)
     engines = dict.fromkeys(engine for engine, _ in runs)
     best = [min((k for k in runs if k[0] == e), key=lambda k: errors.get(k, np.inf)) for e in engines]
-    shown = list(runs) if n <= 3 else best
     base = next((k for k in best if k[0] == "reference"), best[0])
     r0, p0, t = _run_poses(poses, runs[base], n)
-    frames = int(np.clip(MAX_MOTION_BYTES * points / 300 / (n * (14 + 6 * len(shown))), 24, points))
+    frames = int(np.clip(MAX_MOTION_BYTES * points / 300 / (n * (14 + 6 * len(best))), 24, points))
     pick = np.unique(np.linspace(0, len(t) - 1, min(frames, len(t))).round().astype(int))
     span = float(np.max(np.abs(r0))) or 1.0
     header: Record = {
@@ -302,12 +315,12 @@ def _motion_frames(
         "bodies": n,
         "base": list(base),
         "span": span,
-        "r": packer.add(np.round(r0[pick] / span * 32767).astype(np.int16)),
-        "p": packer.add(np.round(p0[pick] * 32767).astype(np.int16)),
+        "r": packer.add(_few_levels(r0[pick] / span, 32767, POSE_LEVELS).astype(np.int16)),
+        "p": packer.add(_few_levels(p0[pick], 32767, POSE_LEVELS).astype(np.int16)),
         "shape": _body_shapes(scenario),
         "runs": [],
     }
-    for key in shown:
+    for key in best:
         r, p, times = _run_poses(poses, runs[key], n)
         if len(times) != len(t) or np.any(np.abs(times - t) > 1e-9 * max(1.0, t[-1])):
             continue
@@ -315,16 +328,23 @@ def _motion_frames(
         usable = np.isfinite(difference).all((1, 2))
         scale = np.abs(np.where(usable[:, None, None], difference, 0)).max((1, 2))
         with np.errstate(divide="ignore", invalid="ignore"):
-            small = np.where(scale[:, None, None] > 0, difference / scale[:, None, None], 0) * 127
+            share = np.where(scale[:, None, None] > 0, difference / scale[:, None, None], 0)
+        share = np.where(usable[:, None, None], share, 0)
+        sizes = np.where(usable, scale, np.nan).astype(np.float32)
         header["runs"].append(
             {
                 "engine": key[0],
                 "integrator": key[1],
-                "scale": packer.add(np.where(usable, scale, np.nan).astype(np.float32)),
-                "d": packer.add(np.round(np.where(usable[:, None, None], small, 0)).astype(np.int8)),
+                "scale": packer.add((sizes.view(np.uint32) & SCALE_BITS).view(np.float32)),
+                "d": packer.add(_few_levels(share, 127, DIFFERENCE_LEVELS).astype(np.int8)),
             }
         )
     return header
+
+
+def _few_levels(x: Array, most: int, levels: int) -> Array:
+    """Round −1 … 1 to multiples of −most … most that a picture distinguishes; fewer compress better."""
+    return np.round(np.round(x * levels) * (most / levels))
 
 
 def _still(scenario: Record, packer: ChunkBuilder) -> Record | None:
@@ -416,8 +436,8 @@ def _body_shapes(scenario: Record) -> list[Record]:
                 "is_apart": kind.holds_distance or bool(kind.slide_axes),
                 "far": int(model.body[k, 0]),
                 "body": int(model.body[k, 1]),
-                "hang": [_json_number(x) for x in model.point[k, 0]],
-                "near": [_json_number(x) for x in model.point[k, 1]],
+                "hang": [_json_number(x, 4) for x in model.point[k, 0]],
+                "near": [_json_number(x, 4) for x in model.point[k, 1]],
                 "far_axes": axes_in(k, 0, moving[:-1]),
                 "near_axes": axes_in(k, 1, moving[-1:]),
                 "axes": [],
@@ -432,8 +452,11 @@ def _body_shapes(scenario: Record) -> list[Record]:
     return shapes
 
 
-def convergence_chunk(results: Results) -> str:
+def convergence_chunk(results: Results, texts: dict[str, int]) -> str:
     """Encode every convergence study: error, cost and observed order at each resolution, coarse to fine.
+
+    Args:
+        texts: places of the texts that all chunks share; new ones are added.
 
     Returns:
         The chunk, see `reports.chunks`; its header is a list of ``Study`` in report_data.d.ts.
@@ -458,13 +481,11 @@ def convergence_chunk(results: Results) -> str:
                 "kind": method.get("kind", "step"),
                 "declared": method.get("order"),
                 "alias": method.get("alias_of"),
-                **{
-                    k: [_json_number(v, 4) for v in columns[k][order]]
-                    for k in ("resolution", "error", "cost", "order")
-                },
+                **{k: columns[k][order].astype(float).tolist() for k in STUDY_COLUMNS},
             }
         )
-    return ChunkBuilder().encode(studies)
+    packer = ChunkBuilder(texts)
+    return packer.encode(packer.add_table(studies))
 
 
 def history_chunk(results: Results, history: History) -> str:

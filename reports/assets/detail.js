@@ -28,7 +28,10 @@ export async function showCell(root, index, fields, back) {
     root.replaceChildren(h("h1", { class: "cell-title", tabindex: -1 }, "No such cell"), h("p", {}, `This run has no scenario “${fields.scenario}” with engine “${fields.engine}”. `, h("a", { href: back }, "To the matrix")));
     return;
   }
-  const [data, studies] = /** @type {[ScenarioChunk, Study[]]} */ (await Promise.all([chunk(`scenario-${s}`), chunk("convergence")]));
+  const [packed, studies] = /** @type {[import("./report_data").PackedScenario, Study[]]} */ (await Promise.all([chunk(`scenario-${s}`), chunk("convergence")]));
+  let place = 0;
+  /** @type {ScenarioChunk} */
+  const data = { ...packed, rows: Object.fromEntries(packed.places.map((step, k) => [(place += step), packed.rows[k]])) };
   const ours = [...index.rows.scenario.keys()].filter((i) => index.rows.scenario[i] === s && index.rows.engine[i] === e);
   const { scenario } = data;
   const title = index.engine_titles[e];
@@ -227,7 +230,7 @@ function moving(root, index, data, fields) {
   const curves = data.curves ?? [];
   if (!curves.length && !data.motion) return;
   const end = Math.max(...curves.map((set) => set.t[set.t.length - 1]), data.motion ? data.motion.t[data.motion.t.length - 1] : 0);
-  const crossings = curves.filter((set) => set.engine === fields.engine && set.crossing !== null);
+  const crossings = curves.filter((set) => set.engine === fields.engine && set.crossing !== undefined);
   const first = crossings.length ? crossings.reduce((a, b) => (/** @type {number} */ (b.crossing) < /** @type {number} */ (a.crossing) ? b : a)) : null;
   const room = h("section", { class: "moving", "aria-label": "Motion and curves" });
   root.append(h("h2", { class: "sub" }, data.motion && !data.motion.base[0] ? "Initial state" : "Motion and curves"), room);
@@ -375,9 +378,9 @@ function stateSpread(spreads) {
       const [q1, q2, q3] = [0.25, 0.5, 0.75].map((q) => plot.x(Math.max(low, sorted[Math.floor(q * (sorted.length - 1))])));
       plot.root.append(svg("rect", { class: "box s0", x: q1, y: y - 9, width: Math.max(1, q3 - q1), height: 18 }), svg("path", { class: "ln s0", d: `M${q2} ${y - 9}V${y + 9}` }));
     }
-    values[k].forEach((v, state) => {
+    values[k].forEach((v, place) => {
       const at = Number.isNaN(v) ? high : Math.min(Math.max(v, low), high);
-      plot.root.append(svg("circle", { class: v <= 1 ? "pt s0" : "bad", cx: plot.x(at).toFixed(1), cy: (y - 8 + ((state * 7) % 17)).toFixed(1), r: 1.8 }, svg("title", {}, `state ${state}: ${number(v, 3)}`)));
+      plot.root.append(svg("circle", { class: v <= 1 ? "pt s0" : "bad", cx: plot.x(at).toFixed(1), cy: (y - 8 + ((place * 7) % 17)).toFixed(1), r: 1.8 }, svg("title", {}, number(v))));
     });
   });
   const top = spreads.reduce((a, b) => (Math.max(...b.ratio) > Math.max(...a.ratio) ? b : a));

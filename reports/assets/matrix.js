@@ -66,6 +66,7 @@ export function showMatrix(index, fields) {
     built = true;
     buildFilters(index);
     buildFolds(table);
+    complete(index, table);
     for (const line of table.querySelectorAll("tr.line")) asWritten.push([...line.querySelectorAll("td")].map((td) => td.cloneNode(true)));
     table.addEventListener("keydown", moveByArrow);
     table.addEventListener("focusin", (event) => event.target instanceof HTMLAnchorElement && setTabStop(table, event.target));
@@ -84,20 +85,8 @@ export function showMatrix(index, fields) {
   }
   const filters = filtersOf(fields);
   const filtered = Object.keys(filters).length > 0;
-  /** @type {Map<number, number>} */
-  const cells = new Map();
-  const passes = chosen(index, filters);
   const { rows } = index;
-  let count = 0;
-  if (filtered) {
-    for (let i = 0; i < rows.scenario.length; i++) {
-      if (!passes(i)) continue;
-      count++;
-      const place = rows.scenario[i] * index.engines.length + rows.engine[i];
-      const worst = cells.get(place);
-      if (worst === undefined || outranks(index, i, worst)) cells.set(place, i);
-    }
-  }
+  const [cells, count] = filtered ? speakers(index, chosen(index, filters)) : [new Map(), 0];
   let lines = 0;
   table.querySelectorAll("tr.line").forEach((line, place) => {
     const scenario = Number(/** @type {HTMLElement} */ (line).dataset.scenario);
@@ -122,6 +111,44 @@ export function showMatrix(index, fields) {
   status.prepend(unknownFilters(index, filters));
   /** @type {HTMLElement} */ (document.getElementById("findings")).hidden = filtered;
   setTabStop(table, table.querySelector("a[tabindex='0']"));
+}
+
+/**
+ * The row that stands for each cell, by scenario and engine, and the number of rows that pass.
+ * @param {import("./report_data").Index} index @param {(row: number) => boolean} passes
+ * @returns {[Map<number, number>, number]}
+ */
+function speakers(index, passes) {
+  const { rows } = index;
+  const cells = new Map();
+  let count = 0;
+  for (let i = 0; i < rows.scenario.length; i++) {
+    if (!passes(i)) continue;
+    count++;
+    const place = rows.scenario[i] * index.engines.length + rows.engine[i];
+    const worst = cells.get(place);
+    if (worst === undefined || outranks(index, i, worst)) cells.set(place, i);
+  }
+  return [cells, count];
+}
+
+/**
+ * Add links, reasons and marks to the cells of the static page.
+ * @param {import("./report_data").Index} index @param {HTMLTableElement} table
+ */
+function complete(index, table) {
+  const [cells] = speakers(index, () => true);
+  for (const line of /** @type {NodeListOf<HTMLElement>} */ (table.querySelectorAll("tr.line"))) {
+    line.querySelectorAll("td").forEach((td, e) => {
+      const row = cells.get(Number(line.dataset.scenario) * index.engines.length + e);
+      const link = td.querySelector("a");
+      if (row === undefined || !link) return;
+      const ratio = fromCode(index.rows.ratio[row]);
+      link.href = href({ scenario: index.scenarios[index.rows.scenario[row]], engine: index.engines[e] });
+      link.title += `: ${index.reasons[row]}`;
+      if (!Number.isNaN(ratio)) link.append(track(ratio));
+    });
+  }
 }
 
 /**

@@ -18,7 +18,7 @@ export interface RowDetail {
 }
 
 export interface CurveSet {
-  engine: string; integrator: string; resolution: number; t: Float32Array; crossing: number | null;
+  engine: string; integrator: string; resolution: number; t: Float32Array; crossing?: number;
   tolerance?: Uint16Array; judged?: string; limit_error?: Uint16Array; position_error?: Uint16Array; attitude_error?: Uint16Array; energy_drift?: Uint16Array;
   momentum_drift?: Uint16Array; joint_gap?: Uint16Array; gap_rate?: Uint16Array; norm_drift?: Uint16Array;
 }
@@ -48,6 +48,9 @@ export interface ScenarioChunk {
   rows: Record<string, RowDetail>; commands: Record<string, string>;
   departures: Departures | null; states: StateSpread[]; curves: CurveSet[] | null; motion: MotionData | null;
 }
+
+/** As it is stored: the rows in order, and by how much the place of each in the index exceeds the one before. */
+export type PackedScenario = Omit<ScenarioChunk, "rows"> & { places: number[]; rows: RowDetail[] };
 
 export interface Study {
   scenario: string; engine: string; integrator: string; quantity: string; kind: "step" | "tolerance"; declared: number | null;
