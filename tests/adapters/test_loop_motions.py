@@ -8,6 +8,8 @@ from plumbline.model.datatypes import Unsupported
 from plumbline.model.invariants import compute_invariants, position_error
 from plumbline.truth.reference_motions import simulate_notes_form
 from tests.helpers.catalogue import catalogue_scenarios
+from tests.helpers.nightly_tests import SLOW
+from tests.helpers.shared_answers import sharing
 from tests.helpers.true_answers import converging_runs
 
 EPS = np.finfo(float).eps
@@ -18,6 +20,13 @@ NEXT_TERM = 64 * STEPS[1]
 ORDER_MARGIN = np.log2(1 + NEXT_TERM)  # of log₂ of two errors, (1 + 2 c h) / (1 + c h)
 TOLERANCES = 1e-8, 1e-11
 ENGINES = ["reference", "mujoco", "pinocchio", "exudyn"]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def shared_truths():
+    """True motions are the same for every engine."""
+    with sharing(__name__, "simulate_notes_form"):
+        yield
 
 
 @pytest.mark.parametrize("name", ["four-bar", "slider-crank", "bricard"])
@@ -59,7 +68,7 @@ def test_other_columns_refuse_motions_of_loops(engine):
             adapter.simulate(s.model, s.state, TIMES, method.name, 2.0**-8)
 
 
-@pytest.mark.parametrize(("name", "steps"), [("bricard", 60), ("slider-crank", 400)])
+@pytest.mark.parametrize(("name", "steps"), [("bricard", 60), pytest.param("slider-crank", 400, marks=SLOW)])
 def test_a_run_keeps_its_independent_rows(name, steps):
     """Chosen anew in every stage, off the constraints, the rows differ: runs stall or end as singular."""
     case = catalogue_scenarios()[name]

@@ -7,6 +7,7 @@ import pytest
 
 from reference_impl.joint_kinds import KINDS
 from tests.architecture.test_layers import MODULES
+from tests.helpers.import_graph import syntax_tree
 
 OWN_TABLES = r"""
     reference_impl\.joint_kinds      # the table
@@ -24,21 +25,21 @@ FILES = [
 
 def kinds_named(tree):
     """Words of kinds that stand as text by themselves, but in types and lists of bases of robots' files."""
-    types = [node for node in ast.walk(tree) if isinstance(node, ast.Subscript)]
+    nodes = list(ast.walk(tree))
+    types = [node for node in nodes if isinstance(node, ast.Subscript)]
     literals = [node for node in types if isinstance(node.value, ast.Name) and node.value.id == "Literal"]
     in_types = {id(constant) for node in literals for constant in ast.walk(node)}
-    lists = [node.elts for node in ast.walk(tree) if isinstance(node, ast.List | ast.Tuple)]
+    lists = [node.elts for node in nodes if isinstance(node, ast.List | ast.Tuple)]
     words = [[one for one in elements if isinstance(one, ast.Constant)] for elements in lists]
     of_bases = {id(one) for some in words if "fixed" in [one.value for one in some] for one in some}
-    texts = [node for node in ast.walk(tree) if isinstance(node, ast.Constant)]
-    texts = [node for node in texts if id(node) not in in_types | of_bases]
+    left_out = in_types | of_bases
+    texts = [node for node in nodes if isinstance(node, ast.Constant) and id(node) not in left_out]
     return {node.value for node in texts if node.value in KINDS.keys() - OTHER_MEANINGS.keys()}
 
 
 @pytest.mark.parametrize("name", FILES)
 def test_a_file_names_no_joint_kind(name):
-    tree = ast.parse(MODULES[name].read_text(encoding="utf-8"))
-    assert not kinds_named(tree), "ask the entry of the table what the joint does"
+    assert not kinds_named(syntax_tree(name)), "ask the entry of the table what the joint does"
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from graphlib import CycleError, TopologicalSorter
 
 import pytest
 
-from tests.helpers.import_graph import MODULES, OUTSIDE, PROJECT, ROOT, imports, layer, picture
+from tests.helpers.import_graph import MODULES, OUTSIDE, PROJECT, ROOT, imports, layer, picture, syntax_tree
 
 
 def test_the_picture_of_the_packages_is_today_s():
@@ -67,7 +67,7 @@ def test_the_readable_reference_imports_no_fast_form():
 @pytest.mark.parametrize("name", sorted(m for m in MODULES if m.startswith("plumbline.judging.")))
 def test_judging_runs_no_engine(name):
     """Of calls to engines it imports the types of the answers; what calls engines is in measurements."""
-    nodes = ast.walk(ast.parse(MODULES[name].read_text(encoding="utf-8")))
+    nodes = ast.walk(syntax_tree(name))
     taken = {(n.module, alias.name) for n in nodes if isinstance(n, ast.ImportFrom) for alias in n.names}
     assert ("plumbline.engines.registry", "load_adapter") not in taken
     for module, member in taken:
@@ -107,7 +107,7 @@ def test_the_main_job_needs_no_optional_package():
     for name in (
         m for m in MODULES if m.split(".")[0] in ("plumbline", "reports", "adapters", "reference_impl")
     ):
-        body = ast.parse(MODULES[name].read_text(encoding="utf-8")).body
+        body = syntax_tree(name).body
         found = {a.name for node in body if isinstance(node, ast.Import) for a in node.names}
         found |= {node.module for node in body if isinstance(node, ast.ImportFrom)}
         if foreign := {module.split(".")[0] for module in found} - allowed:

@@ -213,7 +213,7 @@ CHECKS = [check_scenarios, check_sweeps, check_known]
 
 @pytest.mark.parametrize("check", CHECKS)
 def test_damaged_files_of_users_are_bad_files(no_work, tmp_path, check):
-    outcomes = check(tmp_path, 100, seed=1)
+    outcomes = check(tmp_path, 60, seed=1)
     assert min(outcomes.values()) > 5 and len(outcomes) == 2, outcomes
 
 

@@ -38,7 +38,7 @@ def explanation(adapter, integrator, joints="balls", loaded=False, change=lambda
     return describe(explain_steps(model, states, integrator.method, answer))
 
 
-@pytest.mark.parametrize("defect", some_fast(STEP_DEFECTS, 3))
+@pytest.mark.parametrize("defect", some_fast(STEP_DEFECTS, 9))
 def test_a_planted_integrator_is_named(defect):
     integrator = load_adapter(defect.engine).integrator(defect.integrator)
     with planted(defect) as adapter:
@@ -118,7 +118,7 @@ LOOP_STEPS = [
 ]
 
 
-@pytest.mark.parametrize("defect", some_fast(LOOP_STEPS, 3))
+@pytest.mark.parametrize("defect", some_fast(LOOP_STEPS, 6))
 def test_a_planted_integrator_is_named_on_a_loop(defect):
     """A mechanism with loops has more joints than bodies."""
     model, states = loop_subject("four-bar")

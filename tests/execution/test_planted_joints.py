@@ -39,7 +39,7 @@ def test_every_defect_is_reported(defect):
     "defect",
     [
         case
-        for defects, step in ((ELEMENT_DEFECTS, 8), (JOINT_DEFECTS, 12), (LOOP_DEFECTS, 14))
+        for defects, step in ((ELEMENT_DEFECTS, 16), (JOINT_DEFECTS, 24), (LOOP_DEFECTS, 14))
         for case in some_fast([d for d in defects if d.expected], step)
     ],
 )

@@ -41,7 +41,8 @@ def test_only_motions_without_a_proof_are_proved_and_short_chains_first():
 
 def test_a_proof_that_fails_is_reported():
     wild = short("tumbling-ball")
-    wild = replace(wild, model=replace(wild.model, inertia=0 * wild.model.inertia))
+    without_inertia = replace(wild.model, inertia=0 * wild.model.inertia)
+    wild = replace(wild, model=without_inertia, duration=wild.sample_interval)
     sentences = []
     found = prove_changed_motions([wild], 1, LIMITS, 100.0, sentences.append)
     assert list(found.failed) == ["tumbling-ball"] and "1 could not be proved" in found.sentence

@@ -1,6 +1,7 @@
 """The project's import graph: its packages from the top down, its modules, and what each imports."""
 
 import ast
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -42,9 +43,15 @@ def modules() -> dict[str, Path]:
 MODULES = modules()
 
 
+@cache
+def syntax_tree(name: str) -> ast.Module:
+    """Of a module; not to be changed."""
+    return ast.parse(MODULES[name].read_text(encoding="utf-8"))
+
+
+@cache
 def imports(name: str, *, at_import: bool) -> set[str]:
     """Modules of the project that a module imports; with at_import only those that loading it imports."""
-    tree = ast.parse(MODULES[name].read_text(encoding="utf-8"))
     found = set[str]()
 
     def visit(node: ast.AST) -> None:
@@ -61,7 +68,7 @@ def imports(name: str, *, at_import: bool) -> set[str]:
         for child in ast.iter_child_nodes(node):
             visit(child)
 
-    visit(tree)
+    visit(syntax_tree(name))
     return {module for module in found if module.split(".")[0] in PROJECT}
 
 
