@@ -22,6 +22,7 @@ from plumbline.model.datatypes import BadInput, EngineFailure, Unsupported
 from plumbline.truth.rounding_bound import state_rounding_bound
 from tests.helpers import engine_process as worker
 from tests.helpers import newton_euler, pendulums
+from tests.helpers.nightly_tests import SLOW
 from tests.helpers.pendulums import JOINT_PATTERNS
 from tests.helpers.refinement import observed_orders, romberg_columns
 
@@ -163,8 +164,17 @@ def assert_agrees(engine, answer, name, expected, scale, relative=1e-11):
         assert_close(got, expected, scale, name, relative)
 
 
-@pytest.mark.parametrize("loaded", [False, True], ids=["free", "loads and drag"])
-@pytest.mark.parametrize("joints", JOINT_PATTERNS)
+@pytest.mark.parametrize(
+    ("joints", "loaded"),
+    [
+        pytest.param(joints, loaded, id=f"{joints}-{words}", marks=SLOW if joints in marked else [])
+        for loaded, words, marked in (
+            (False, "free", JOINT_PATTERNS.keys() - {"balls", "rods"}),
+            (True, "loads and drag", ()),
+        )
+        for joints in JOINT_PATTERNS
+    ],
+)
 def test_states_obey_newton_and_euler(engine, joints, loaded):
     subject, states, truth = expected_states(joints, loaded)
     answers = ask(engine, "evaluate", subject, states)

@@ -10,19 +10,19 @@ from plumbline.scenario.loader import Scenario
 MOTIONS = {  # scenario: what it adds to those above it, of the cheapest ones
     "conical": "a rod, a closed form",
     "loaded-ball": "a ball, every load",
-    "double-ball-then-rod": "several bodies, a rod on a ball",
-    "sprung-slider-on-arm": "a hinge, a slide, springs",
     "nesc-tumbling-brick": "a free body",
 }
 STEPS = MOTIONS | {
+    "double-ball-then-rod": "several bodies, a rod on a ball",
+    "sprung-slider-on-arm": "a hinge, a slide, springs",
     "drag-rod": "loads on a rod",
+}
+STATES = STEPS | {
     "double-rod-then-ball": "a ball on a rod",
     "sprung-cylinder": "a cylindrical joint",
     "planar-top": "a planar joint",
     "universal-pendulum": "a universal joint",
     "wrecking-ball": "a weld",
-}
-STATES = STEPS | {
     "double-loaded-rods": "every load on rods",
     "double-mass-ratio-1000": "masses far apart",
     "chain-5-mixed": "rods and balls in turn",

@@ -28,6 +28,7 @@ from plumbline.model.kinematics import (
 )
 from plumbline.model.random_mechanisms import random_tree
 from tests.helpers import newton_euler, pendulums
+from tests.helpers.nightly_tests import SLOW
 from tests.helpers.random_chains import random_chain
 
 TIMES = np.linspace(0.0, 1.0, 41)
@@ -237,8 +238,17 @@ def test_the_energy_of_a_spring_counts_full_turns():
     assert np.max(np.abs(lost)) > 10
 
 
-@pytest.mark.parametrize("options", [{}, {"loads": True}, {"drag": True}], ids=str)
-@pytest.mark.parametrize("rods", [[False, False], [True, False], [True]], ids=str)
+OPTIONS = ({}, {"loads": True}, {"drag": True})
+
+
+@pytest.mark.parametrize(
+    ("rods", "options"),
+    [
+        pytest.param(rods, options, id=f"{rods}-{options}", marks=[] if k == place else SLOW)
+        for rods, place in (([False, False], 1), ([True, False], 2), ([True], None))
+        for k, options in enumerate(OPTIONS)
+    ],
+)
 def test_true_motion_has_no_drift(rods, options):
     model, run = make_motion(rods, np.linspace(0, 1, 161), **options)
     found = compute_invariants(model, run)
