@@ -144,7 +144,7 @@ def integrate_dop853(
     x: Float[Array, "joints 2"] | None = None,
     atol: float | None = None,
 ) -> IntegrationResult:
-    """Integrate (N6) by scipy's DOP853; with springs on angles, beside it the angles by their rates.
+    """Integrate (N6) by scipy's DOP853; the turns of angles with springs are counted step by step.
 
     Args:
         r: initial positions [m].
@@ -174,23 +174,17 @@ def integrate_dop853(
         sizes = np.where(sizes > 0, sizes, np.where(reached > 0, reached, 1.0))
     limits = rtol * sizes
     limits = limits if atol is None else np.full(size, atol)
-    if elements.has_winding_angles:  # they only choose the turn of an angle: no error control
-        y0 = np.concatenate([y0, elements.coordinates(r, p, v, pdot, x)[0].ravel()])
-        limits = np.concatenate([limits, np.full(len(y0) - size, np.inf)])
-    samples = np.empty((len(times), len(y0)))
+    samples = np.empty((len(times), size))
     samples[0], done, steps = y0, 1, 0
 
     def rate(_: float, y: Array) -> Array:
         """(N6) ẏ = (ṙ, ṗ, r̈, p̈)."""
-        state, angles = (
-            unpack_state(y[:size], n),
-            y[size:].reshape(-1, chain.columns) if len(y) > size else None,
-        )
-        of_angles = np.zeros(0) if angles is None else elements.coordinates(*state)[1].ravel()
-        return np.concatenate([y[7 * n : size], accelerate(*state, angles), of_angles])
+        return np.concatenate([y[7 * n :], accelerate(*unpack_state(y, n), x)])
 
     solver = DOP853(rate, times[0], y0, times[-1], rtol=rtol, atol=limits)
     while done < len(times):
+        if elements.has_winding_angles:  # no angle changes by half a turn within a step
+            x = elements.coordinates(*unpack_state(solver.y, n), x)[0]
         message = solver.step()
         if solver.status == "failed":
             raise ArithmeticError(f"DOP853 stopped at t = {solver.t} s: {message}")
@@ -201,4 +195,4 @@ def integrate_dop853(
             if times[reached - 1] == solver.t:
                 samples[reached - 1] = solver.y
             done = reached
-    return IntegrationResult(times, *unpack_state(samples[:, :size], n), steps, solver.nfev)
+    return IntegrationResult(times, *unpack_state(samples, n), steps, solver.nfev)
