@@ -187,7 +187,7 @@ class Mechanism:
     @property
     def kinds(self) -> tuple[JointKind, ...]:
         """(J,) the entries of `KINDS`."""
-        return tuple(KINDS[kind] for kind in self.kind)
+        return _entries(self.kind)
 
     @property
     def has_joint_moments(self) -> bool:
@@ -296,6 +296,11 @@ def side_by_side(mechanisms: Sequence[Mechanism]) -> Mechanism:
 @lru_cache(maxsize=64)  # what is computed of a mechanism is remembered by its identity
 def _tree_of(mechanism: Mechanism) -> Mechanism:
     return replace(mechanism, **{name: getattr(mechanism, name)[: mechanism.n] for name in JOINT_FIELDS})
+
+
+@lru_cache(maxsize=64)
+def _entries(kinds: tuple[Kind, ...]) -> tuple[JointKind, ...]:
+    return tuple(KINDS[kind] for kind in kinds)
 
 
 @lru_cache(maxsize=64)

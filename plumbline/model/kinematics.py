@@ -353,17 +353,13 @@ class JointFrame:
 
         """
         shift = shift_rate = spin = np.zeros(3)
-        turn = self.turn_far
-        for i, (what, axis) in enumerate(self.motions):
+        axes, turn = self._axes_and_turn(x)
+        for i, (what, along) in enumerate(axes):
             value, rate = x[..., i, None], xdot[..., i, None]
-            along = rotate_vectors(self.above, rotation_matrix(turn)[..., axis])
             if what == "slide":
                 shift, shift_rate = shift + along * value, shift_rate + along * rate
             else:
                 spin = spin + along * rate
-                half = np.zeros((*value.shape[:-1], 4), value.dtype)
-                half[..., :1], half[..., 1 + axis, None] = np.cos(value / 2), np.sin(value / 2)
-                turn = quaternion_product(turn, half)
         return (shift, quaternion_product(turn, quaternion_conjugate(self.turn_near))), (shift_rate, spin)
 
     def axes(self, x: Float[Array, "... coordinates"]) -> list[tuple[str, Float[Array, "... 3"]]]:
@@ -373,8 +369,19 @@ class JointFrame:
             "turn" or "slide" and the axis, of every motion.
 
         """
-        rates = [self.motion(x, unit)[1] for unit in np.eye(len(self.motions))]
-        return [(what, rate[what == "turn"]) for (what, _), rate in zip(self.motions, rates, strict=False)]
+        return self._axes_and_turn(x)[0]
+
+    def _axes_and_turn(self, x: Array) -> tuple[list[tuple[str, Array]], Array]:
+        """`axes`, and the quaternion from the near body's joint frame to the far body."""
+        turn, axes = self.turn_far, list[tuple[str, Array]]()
+        for i, (what, axis) in enumerate(self.motions):
+            value = x[..., i, None]
+            axes.append((what, rotate_vectors(self.above, rotation_matrix(turn)[..., axis])))
+            if what == "turn":
+                half = np.zeros((*value.shape[:-1], 4), value.dtype)
+                half[..., :1], half[..., 1 + axis, None] = np.cos(value / 2), np.sin(value / 2)
+                turn = quaternion_product(turn, half)
+        return axes, turn
 
 
 def joint_vectors(
