@@ -145,14 +145,13 @@ def feature_words(features: Sequence[Feature], shown: str) -> str:
     """
     counted = Counter(feature.what for feature in features)
     first = {feature.what: feature for feature in reversed(features)}
-    places = {
-        what: f"line {f.source.line}" if f.source.file == shown else str(f.source)
-        for what, f in first.items()
-    }
-    return ", ".join(
-        f"{count} × {what} ({first[what].name}, {places[what]}{' …' if count > 1 else ''})"
-        for what, count in counted.items()
-    )
+    words = []
+    for what, count in counted.items():
+        source = first[what].source
+        place = f"line {source.line}" if source.file == shown else str(source)
+        place = ", ".join(filter(None, (first[what].name, place)))  # an element of no body has no name
+        words.append(f"{count} × {what} ({place}{' …' if count > 1 else ''})")
+    return ", ".join(words)
 
 
 def mechanism_of_model(model: NeutralModel, connections: Sequence[Connection], shown: str) -> dict[str, Any]:

@@ -196,12 +196,14 @@ def robot(tmp_path):
 
 def test_a_robot_runs_and_what_is_left_out_comes_first(robot, tmp_path):
     out = tmp_path / "out"
+    robot.write_text(ROBOT.replace("</robot>", "<gazebo/></robot>"))
     found = plumbline("run", robot, "--level", "state", "--engine", "mujoco", "--jobs", 1, "--out", out)
     assert found.exit_code == 0, found.output
     assert "8 agree" in found.stdout
     first = found.stderr.splitlines()[0]
     assert "1 × limit (shoulder, line" in first
     assert "1 × mimic (grip, line" in first
+    assert "1 × gazebo (line" in first  # an element of no link
     assert "contacts" in first
 
 
