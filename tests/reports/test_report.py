@@ -307,12 +307,14 @@ def test_tables_keep_three_digits_and_leave_out_what_is_no_number():
         {"x": 1.23456e-17, "n": 7, "word": "ä", "extra": {"a": -2.5}},
         {"x": 0.0, "n": 1_234_567, "word": None, "extra": {}},
         {"x": float("nan"), "word": "ä", "more": ["b"]},
+        {"x": 1e308, "extra": {"a": 1e-300}},
     ]
     chunk = packer.encode({"table": packer.add_table(records)})
     assert decode_chunk(chunk, list(texts))["table"] == [
         {"x": 1.23e-17, "n": 7, "word": "ä", "extra": {"a": -2.5}},
         {"x": 0.0, "n": 1_234_567, "extra": {}},
         {"word": "ä", "extra": {}, "more": ["b"]},
+        {"x": 1e308, "extra": {"a": 1e-300}},
     ]  # fmt: skip
 
 
