@@ -318,7 +318,7 @@ def test_a_name_stays_text_on_the_terminal_in_html_and_in_junit(tmp_path):
     [
         (["run", "tumbling-bal"], "tumbling-ball"),
         (["run", "--engine", "mujocco"], "did you mean 'mujoco'"),
-        (["run", "--family", "singel"], "did you mean 'single'"),
+        (["run", "rest", "--family", "singel"], "did you mean 'single'"),
         (["run", "--level", "all of them"], "level"),
         (["run", "--jobs", "0"], "jobs"),
         (["run", "--user-rtol", "-1"], "user-rtol"),

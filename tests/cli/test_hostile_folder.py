@@ -118,7 +118,7 @@ def test_no_engine_of_the_folder_is_started_and_no_module_imported(hostile):
     done = plumbline(folder, *run, "--engine", "mujoco")
     assert done.returncode == 0 and "7 agree" in done.stdout, done.stdout + done.stderr
     check(hostile, done)
-    for name in ("program", "file", "module", "shell"):
+    for name in ("program", "file", "module"):
         done = plumbline(folder, *run, "--engine", name)
         assert done.returncode == 2 and "--trust allows it" in done.stderr, done.stderr
         check(hostile, done)

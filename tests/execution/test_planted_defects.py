@@ -162,7 +162,7 @@ BRANCHES = [
 ]
 
 
-@pytest.mark.parametrize("defect", some_fast(BRANCHES, 3))
+@pytest.mark.parametrize("defect", some_fast(BRANCHES, 6))
 def test_a_defect_in_a_rare_branch_gets_no_wrong_name(defect):
     assert WITHOUT_NAME in diagnosis(defect)
 

@@ -98,10 +98,10 @@ OF_BODIES_NOT_JOINTS = (
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("step", [5, pytest.param(1, marks=SLOW)])
+@pytest.mark.parametrize("step", [10, pytest.param(1, marks=SLOW)])
 @pytest.mark.parametrize("mechanism", [EVERY_JOINT, RANDOM_LOOP])
 def test_defects_of_chains_are_reported_in_trees_and_loops(mechanism, step):
-    """Those of numbers, conventions and answers, wherever they make a difference; fast every fifth."""
+    """Those of numbers, conventions and answers, wherever they make a difference; fast every tenth."""
     chosen = [d for d in STATE_DEFECTS if not d.patch and d.name != "digits-lost-along-chain"]
     moved = [
         replace(d, engine="pinocchio", mechanism=mechanism, loaded=False)

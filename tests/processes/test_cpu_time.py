@@ -58,7 +58,7 @@ def test_a_run_accounts_for_its_time():
     pytest.importorskip("mujoco")
     begin, wall = time.process_time(), time.monotonic()
     chosen = loader.load_scenarios(["rest"])
-    plan = Plan(chosen, ["reference", "mujoco"], random_state_count=3, jobs=1)
+    plan = Plan(chosen, ["reference", "mujoco"], "state", random_state_count=3, jobs=1)
     seconds = run_plan(plan, lambda *_: None).cpu_times.seconds
     own, wall = time.process_time() - begin, time.monotonic() - wall
     assert all(seconds[k] > 0 for k in ("engines", "reference", "truth", "process", "judging")), seconds

@@ -2,7 +2,6 @@
 
 import json
 import math
-from functools import cache
 
 import numpy as np
 import pytest
@@ -17,6 +16,7 @@ from plumbline.model.kinematics import joint_vectors, quaternion_product, rotati
 from plumbline.model.sampling import compared_states
 from plumbline.scenario import loader as scenarios
 from plumbline.scenario.schema import Attitude, Document, Inertia, attitude_quaternion, inertia_matrix
+from tests.helpers.catalogue import catalogue_scenarios
 from tests.helpers.relative_equilibria import relative_equilibrium
 
 EPS = np.finfo(float).eps
@@ -80,9 +80,8 @@ CLOSED_FORMS = {
 }
 
 
-@cache
 def load(name):
-    return scenarios.load_scenario(scenarios.find_scenario_file(name))
+    return catalogue_scenarios()[name]
 
 
 TREE_OF_SEVEN = ("ball", "hinge", "universal", "weld", "cylindrical", "rod", "slide", "free")

@@ -15,9 +15,10 @@ from plumbline.model.features import ROLES, Feature, Place, features, joint_role
 from plumbline.model.kinematics import complete_state
 from plumbline.model.sampling import compared_states
 from plumbline.scenario.generator import random_mechanism
-from plumbline.scenario.loader import catalogue, load_scenario
+from plumbline.scenario.loader import catalogue
 from plumbline.studies import feature_pairs
 from plumbline.truth.ground_truth import state_truth
+from tests.helpers.catalogue import catalogue_scenarios
 from tests.helpers.immediate_executor import Immediate
 
 PARTS = [f"crowded-loops-{k}" for k in range(1, 7)]  # together they have all pairs
@@ -25,7 +26,7 @@ GROUP = 14  # places: larger groups make fewer examples of the same pairs
 
 
 def load(name):
-    return load_scenario(catalogue()[name])
+    return catalogue_scenarios()[name]
 
 
 def test_every_kind_is_legal_in_every_role_but_a_free_body_that_closes_a_loop():
