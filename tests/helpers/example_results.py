@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from plumbline.judging.rows import Row, RowContext, Verdict, error_ratio
+from plumbline.model.datatypes import Model
 from plumbline.storage.results_store import ResultTables, read_results, write_results
 from plumbline.storage.script_index import scripts_folder, write_script_index
 
@@ -289,7 +290,18 @@ def scenario_record(
 ) -> dict[str, Any]:
     """Describe a scenario of n links as results.json does."""
     rod = "rod" in name
-    inertia = np.array([np.diag([0.002, 0.0015, 0.0008]) / n**2] * n)
+    model = Model.chain(
+        mass=np.ones(n),
+        inertia=np.array([np.diag([0.002, 0.0015, 0.0008]) / n**2] * n),
+        proximal=np.array([[0.0, 0.0, 0.4 / n if rod else 1.0 / n]] * n),
+        distal=np.zeros((n, 3)),
+        length=np.full(n, 0.6 / n if rod else 0.0),
+        gravity=np.array([0.0, 0.0, -G]),
+        force=np.zeros((n, 3)),
+        moment=np.zeros((n, 3)),
+        drag_force=np.zeros(n),
+        drag_moment=np.zeros(n),
+    )
     return {
         "family": family,
         "title": NASTY if name == HOSTILE else f"{n} {'rods' if rod else 'balls'}, released from {angle} rad",
@@ -302,18 +314,7 @@ def scenario_record(
         "exact": "Jacobi elliptic functions" if n == 1 else None,
         "horizon": 2.6 if n == 2 else duration,
         "truth_uncertainty": 3e-14,
-        "model": {
-            "mass": [1.0] * n,
-            "inertia": inertia.tolist(),
-            "proximal": [[0.0, 0.0, 0.4 / n if rod else 1.0 / n]] * n,
-            "distal": [[0.0, 0.0, 0.0]] * n,
-            "length": [0.6 / n if rod else 0.0] * n,
-            "gravity": [0.0, 0.0, -G],
-            "force": [[0.0] * 3] * n,
-            "moment": [[0.0] * 3] * n,
-            "drag_force": [0.0] * n,
-            "drag_moment": [0.0] * n,
-        },
+        "model": {key: np.asarray(value).tolist() for key, value in model.fields.items()},
         "digest": hashlib.sha256(name.encode()).hexdigest()[:16],
     }
 
