@@ -37,13 +37,10 @@ ALLOWED_SKIPS = {  # pattern of the skip's reason: why continuous integration ca
 
 LONGEST_FIRST = (  # begun last, one of these would keep one process busy while the others have no work;
     # dask_cluster and worker_pool mostly wait, so one begins when another ends
-    "report_browser", "dask_cluster", "diagnose", "planted_defects", "adapter_contract", "exit_codes",
-    "step_level", "tree_motions", "scripts", "worker_pool", "engines_on_loops", "command_line",
-    "engines_on_trees", "relations", "nightly", "smallest_detectable_mistake", "planted_branches",
-    "tree_motion", "sweep", "certificate_proof", "planted_joints", "integrator_search", "importer_cause",
-    "trajectory_truth", "tree_relations", "selftest", "environments", "model_command", "reference_pages",
-    "resume", "collocation", "docs", "rounding_bound", "long_runs", "report",
-    "predictability_horizon", "storage_faults",
+    "report_browser", "dask_cluster", "adapter_contract", "exit_codes", "step_level", "worker_pool",
+    "certificate_proof", "nightly", "environments", "diagnose", "command_line", "planted_defects", "layers",
+    "misbehaving_engines", "relations", "proofs", "integrator_search", "result_cache", "proof_commands",
+    "tree_motion", "planted_joints", "sweep", "protocol", "scripts", "conformance", "isolation",
 )  # fmt: skip
 LAST = ("matrix",)  # scenario by scenario it fills what is left
 
