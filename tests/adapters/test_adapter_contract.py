@@ -503,6 +503,12 @@ def not_finite(real, *args):
     return replace(run, v=v)
 
 
+def run_arguments(engine, integrator):
+    subject = one_body(engine)
+    state = pendulums.state_from_seed(subject)
+    return subject, state, TIMES, integrator.name, step_or_tolerance(integrator)
+
+
 def missing_body(real, *args):
     run = real(*args)
     return replace(run, r=run.r[:, :-1])
@@ -523,14 +529,7 @@ def missing_body(real, *args):
 )
 @every_integrator
 def test_detects_in_a_trajectory(engine, integrator, tampering, message):
-    subject = one_body(engine)
-    args = (
-        subject,
-        pendulums.state_from_seed(subject),
-        TIMES,
-        integrator.name,
-        step_or_tolerance(integrator),
-    )
+    args = run_arguments(engine, integrator)
     worker.call_adapter(engine, "simulate", *args, overrides={"_simulate": unchanged})
     with pytest.raises(EngineFailure, match=message):
         worker.call_adapter(engine, "simulate", *args, overrides={"_simulate": tampering})
@@ -544,14 +543,7 @@ def one_step_more(real, *args):
 @every_integrator
 def test_detects_another_number_of_steps(engine, integrator):
     """Of fixed steps: those of a tolerance are the engine's own choice."""
-    subject = one_body(engine)
-    args = (
-        subject,
-        pendulums.state_from_seed(subject),
-        TIMES,
-        integrator.name,
-        step_or_tolerance(integrator),
-    )
+    args = run_arguments(engine, integrator)
     with pytest.raises(EngineFailure, match="steps is") if integrator.kind == "step" else nullcontext():
         worker.call_adapter(engine, "simulate", *args, overrides={"_simulate": one_step_more})
 

@@ -181,127 +181,73 @@ def _mistake(
     return RunMistake(defect, first, quantities)
 
 
-_masses, _gravity, _step, _rates = _scaled_masses, _scaled_gravity, _scaled_step, _scaled_rates
-_RODS, _BALLS, _SKEW, _TREE = (
-    "double-tumbling-rods", "double-tumbling-balls", "double-hinge-skew", "loaded-tree",
+_RODS, _BALLS, _SKEW, _TREE, _LOOP = (
+    "double-tumbling-rods", "double-tumbling-balls", "double-hinge-skew", "loaded-tree", "four-bar",
+)  # fmt: skip
+_EULER = "semi-implicit-euler"
+_OF_MUJOCO = (
+    ("masses", _scaled_masses, (
+        ("from step 500 on", _BALLS, "RK4", from_step(500), 500),
+        ("in four steps", _RODS, "RK4", steps(300, 303), 300),
+        ("every hundredth step", _SKEW, "Euler", every(100), 100),
+        ("beyond half a turn", _SKEW, "RK4", beyond_angle(1, np.pi), None),
+        ("at high rates", _SKEW, "implicit", faster_than(5.0), None),
+        ("at low rates", _SKEW, "RK4", slower_than(1.5), None),
+        ("in the last step", _BALLS, "Euler", from_step(600), 600),
+        ("in the first step", _RODS, "RK4", steps(1, 1), 1),
+        ("beyond two radians", _BALLS, "RK4", beyond_turn(0, 2.0), None),
+    )),
+    ("gravity", _scaled_gravity, (
+        ("from step 500 on", _RODS, "Euler", from_step(500), 500),
+        ("in four steps", _BALLS, "implicit", steps(520, 523), 520),
+        ("every hundredth step", _SKEW, "RK4", every(100), 100),
+        ("beyond a quarter turn", _SKEW, "Euler", beyond_angle(1, np.pi / 2), None),
+    )),
+    ("time step", _scaled_step, (
+        ("from step 500 on", _BALLS, "Euler", from_step(500), 500),
+        ("in one step", _RODS, "RK4", steps(77, 77), 77),
+        ("every fiftieth step", _TREE, "RK4", every(50), 50),
+    )),
+    ("velocities", _scaled_rates, (
+        ("after step 250", _BALLS, "RK4", steps(250, 250), 250),
+        ("every hundredth step", _RODS, "implicit", every(100), 100),
+        ("at high rates", _BALLS, "Euler", faster_than(6.0), None),
+    )),
+)  # fmt: skip
+_OF_PINOCCHIO = (
+    ("accelerations in one step", _BALLS, "rkmk4", steps(411, 411), 411),
+    ("accelerations from step 500 on", _BALLS, _EULER, from_step(500), 500),
+    ("accelerations in four steps", _RODS, "rkmk4", steps(300, 303), 300),
+    ("accelerations every hundredth step", _SKEW, "rkmk4", every(100), 100),
+    ("masses of Pinocchio from step 500 on", _SKEW, "rkmk4", from_step(500), 500),
+    ("accelerations in a loop from step 500 on", _LOOP, "rkmk4", from_step(500), 500),
+    ("accelerations in a loop in four steps", _LOOP, _EULER, steps(410, 413), 410),
+)
+_OF_SAMPLES = (
+    ("positions of samples from 500 on", _BALLS, "RK4", 500, "mujoco", "r", lambda n: slice(500, n)),
+    ("velocities of samples every hundredth", _SKEW, "RK44", 100, "exudyn-tree", "v",
+     lambda n: slice(100, n, 100)),
+    ("rates of samples from 500 on", _BALLS, "RK4", 500, "mujoco", "pdot", lambda n: slice(500, n)),
+    ("velocities of Exudyn from 500 on", _BALLS, "generalized-alpha", 500, "exudyn", "v",
+     lambda n: slice(500, n)),
 )  # fmt: skip
 RUN_MISTAKES = (
-    _mistake("masses from step 500 on", _BALLS, "RK4", mujoco_mistake(from_step(500), _masses), 500),
-    _mistake("masses in four steps", _RODS, "RK4", mujoco_mistake(steps(300, 303), _masses), 300),
-    _mistake("masses every hundredth step", _SKEW, "Euler", mujoco_mistake(every(100), _masses), 100),
-    _mistake(
-        "accelerations in one step",
-        _BALLS,
-        "rkmk4",
-        pinocchio_mistake(steps(411, 411), "rkmk4"),
-        411,
-        "pinocchio",
+    *(
+        _mistake(f"{what} {where}", mechanism, integrator, mujoco_mistake(when, change), first)
+        for what, change, places in _OF_MUJOCO
+        for where, mechanism, integrator, when, first in places
     ),
     _mistake(
-        "positions of samples from 500 on",
-        _BALLS,
-        "RK4",
-        None,
-        500,
-        run=wrong_samples("r", lambda n: slice(500, n)),
-    ),
-    _mistake("masses beyond half a turn", _SKEW, "RK4", mujoco_mistake(beyond_angle(1, np.pi), _masses)),
-    _mistake(
-        "masses in the second run",
-        _BALLS,
-        "RK4",
-        mujoco_mistake(from_step(1), _masses, run=2),
+        "masses in the second run", _BALLS, "RK4", mujoco_mistake(from_step(1), _scaled_masses, run=2),
         quantities=("step_rate", "step_velocity"),
     ),
-    _mistake("gravity from step 500 on", _RODS, "Euler", mujoco_mistake(from_step(500), _gravity), 500),
-    _mistake("gravity in four steps", _BALLS, "implicit", mujoco_mistake(steps(520, 523), _gravity), 520),
-    _mistake("gravity every hundredth step", _SKEW, "RK4", mujoco_mistake(every(100), _gravity), 100),
-    _mistake(
-        "gravity beyond a quarter turn", _SKEW, "Euler", mujoco_mistake(beyond_angle(1, np.pi / 2), _gravity)
+    *(
+        _mistake(name, mechanism, integrator, pinocchio_mistake(when, integrator, "masses" in name), first,
+                 "pinocchio")
+        for name, mechanism, integrator, when, first in _OF_PINOCCHIO
     ),
-    _mistake("time step from step 500 on", _BALLS, "Euler", mujoco_mistake(from_step(500), _step), 500),
-    _mistake("time step in one step", _RODS, "RK4", mujoco_mistake(steps(77, 77), _step), 77),
-    _mistake("time step every fiftieth step", _TREE, "RK4", mujoco_mistake(every(50), _step), 50),
-    _mistake("velocities after step 250", _BALLS, "RK4", mujoco_mistake(steps(250, 250), _rates), 250),
-    _mistake("velocities every hundredth step", _RODS, "implicit", mujoco_mistake(every(100), _rates), 100),
-    _mistake("velocities at high rates", _BALLS, "Euler", mujoco_mistake(faster_than(6.0), _rates)),
-    _mistake("masses at high rates", _SKEW, "implicit", mujoco_mistake(faster_than(5.0), _masses)),
-    _mistake("masses at low rates", _SKEW, "RK4", mujoco_mistake(slower_than(1.5), _masses)),
-    _mistake("masses in the last step", _BALLS, "Euler", mujoco_mistake(from_step(600), _masses), 600),
-    _mistake("masses in the first step", _RODS, "RK4", mujoco_mistake(steps(1, 1), _masses), 1),
-    _mistake("masses beyond two radians", _BALLS, "RK4", mujoco_mistake(beyond_turn(0, 2.0), _masses)),
-    _mistake(
-        "accelerations from step 500 on",
-        _BALLS,
-        "semi-implicit-euler",
-        pinocchio_mistake(from_step(500), "semi-implicit-euler"),
-        500,
-        "pinocchio",
+    *(
+        _mistake(name, mechanism, integrator, None, first, engine, wrong_samples(field, rows))
+        for name, mechanism, integrator, first, engine, field, rows in _OF_SAMPLES
     ),
-    _mistake(
-        "accelerations in four steps",
-        _RODS,
-        "rkmk4",
-        pinocchio_mistake(steps(300, 303), "rkmk4"),
-        300,
-        "pinocchio",
-    ),
-    _mistake(
-        "accelerations every hundredth step",
-        _SKEW,
-        "rkmk4",
-        pinocchio_mistake(every(100), "rkmk4"),
-        100,
-        "pinocchio",
-    ),
-    _mistake(
-        "masses of Pinocchio from step 500 on",
-        _SKEW,
-        "rkmk4",
-        pinocchio_mistake(from_step(500), "rkmk4", True),
-        500,
-        "pinocchio",
-    ),
-    _mistake(
-        "accelerations in a loop from step 500 on",
-        "four-bar",
-        "rkmk4",
-        pinocchio_mistake(from_step(500), "rkmk4"),
-        500,
-        "pinocchio",
-    ),
-    _mistake(
-        "accelerations in a loop in four steps",
-        "four-bar",
-        "semi-implicit-euler",
-        pinocchio_mistake(steps(410, 413), "semi-implicit-euler"),
-        410,
-        "pinocchio",
-    ),
-    _mistake(
-        "velocities of samples every hundredth",
-        _SKEW,
-        "RK44",
-        None,
-        100,
-        "exudyn-tree",
-        wrong_samples("v", lambda n: slice(100, n, 100)),
-    ),
-    _mistake(
-        "rates of samples from 500 on",
-        _BALLS,
-        "RK4",
-        None,
-        500,
-        run=wrong_samples("pdot", lambda n: slice(500, n)),
-    ),
-    _mistake(
-        "velocities of Exudyn from 500 on",
-        _BALLS,
-        "generalized-alpha",
-        None,
-        500,
-        "exudyn",
-        wrong_samples("v", lambda n: slice(500, n)),
-    ),
-)
+)  # fmt: skip

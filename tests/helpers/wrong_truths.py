@@ -12,26 +12,23 @@ from plumbline.truth import certified_state, ground_truth, trajectory_truth
 GRAVITY_ERROR = 1e-7  # relative
 
 
-def prepare(*arguments: Any) -> None:
-    """Initialise a worker, and give Taylor's method a gravity that is wrong by 1e-7."""
-    initialize_worker(*arguments)
-    right = trajectory_truth.simulate_taylor
-
+def with_wrong_gravity(right: Any) -> Any:
     def wrong(model: Model, *rest: Any) -> Any:
         return right(model.changed(gravity=model.gravity * (1 + GRAVITY_ERROR)), *rest)
 
-    trajectory_truth.simulate_taylor = wrong  # type: ignore[assignment]
+    return wrong
+
+
+def prepare(*arguments: Any) -> None:
+    """Initialise a worker, and give Taylor's method a gravity that is wrong by 1e-7."""
+    initialize_worker(*arguments)
+    trajectory_truth.simulate_taylor = with_wrong_gravity(trajectory_truth.simulate_taylor)
 
 
 def prepare_states(*arguments: Any) -> None:
     """Initialise a worker, and certify states with a gravity that is wrong by 1e-7."""
     initialize_worker(*arguments)
-    right = certified_state.enclose_quantities
-
-    def wrong(model: Model, *rest: Any) -> Any:
-        return right(model.changed(gravity=model.gravity * (1 + GRAVITY_ERROR)), *rest)
-
-    certified_state.enclose_quantities = wrong  # type: ignore[assignment]
+    certified_state.enclose_quantities = with_wrong_gravity(certified_state.enclose_quantities)
 
 
 def prepare_accepted(*arguments: Any) -> None:

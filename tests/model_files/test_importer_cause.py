@@ -179,16 +179,21 @@ ARMATURE = """<mujoco><worldbody><body name="a"><joint name="j" axis="0 1 0" arm
 """
 
 
-def test_pinocchio_leaves_some_armatures_out_of_its_kinetic_energy(tmp_path):
-    """A difference of Pinocchio 4.1.0 itself: of joints whose axis is no positive coordinate axis."""
-    path = tmp_path / "m.xml"
-    path.write_text(ARMATURE)
-    prepared = prepare_file(str(path), tmp_path)
+def pinocchio_judged(path, root):
+    """What Pinocchio makes of a file, judged by what MuJoCo reads in it."""
+    prepared = prepare_file(str(path), root)
     model = prepared.neutral_model(read_model_file("mujoco", prepared.file))
     reading = read_model_file("pinocchio", prepared.file)
     states = model_states(reading.model, STATES, state_seed(str(path)))
     answer = Answer(reading, states, tuple(evaluate_model_file("pinocchio", prepared.file, states)))
-    result = judge_file(str(path), model, ("pinocchio", describe_importer("pinocchio"), answer), STATES)
+    return judge_file(str(path), model, ("pinocchio", describe_importer("pinocchio"), answer), STATES)
+
+
+def test_pinocchio_leaves_some_armatures_out_of_its_kinetic_energy(tmp_path):
+    """A difference of Pinocchio 4.1.0 itself: of joints whose axis is no positive coordinate axis."""
+    path = tmp_path / "m.xml"
+    path.write_text(ARMATURE)
+    result = pinocchio_judged(path, tmp_path)
     assert {row.quantity for row in result.rows if row.verdict == Verdict.DISAGREES} == {"kinetic_energy"}
     ((cause,),) = (explanation.causes for explanation in result.explanations.values())
     assert "leaves the armature of joint k out of its kinetic energy" in cause.sentence
@@ -291,13 +296,7 @@ def test_a_free_body_whose_coordinates_count_from_elsewhere_is_named(tmp_path):
     """Pinocchio 4.1.0 itself: a root that the file turns by R is displaced by p − R p, here (0, 1, 1)."""
     path = tmp_path / "free.xml"
     path.write_text(FREE)
-    prepared = prepare_file(str(path), tmp_path)
-    model = prepared.neutral_model(read_model_file("mujoco", prepared.file))
-    reading = read_model_file("pinocchio", prepared.file)
-    states = model_states(reading.model, STATES, state_seed(str(path)))
-    answer = Answer(reading, states, tuple(evaluate_model_file("pinocchio", prepared.file, states)))
-    column = ("pinocchio", describe_importer("pinocchio"), answer)
-    result = judge_file(str(path), model, column, STATES)
+    result = pinocchio_judged(path, tmp_path)
     ((cause,),) = (explanation.causes for explanation in result.explanations.values())
     assert "coordinates of the free joint of body a from (0, 1, 1) and not from" in cause.sentence
     assert "this alone explains every quantity" in cause.sentence
