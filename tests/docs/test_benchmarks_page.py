@@ -21,9 +21,7 @@ def test_the_page_is_made_from_the_stored_figures():
     assert (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8") == write_page(STORED)
 
 
-@pytest.mark.skipif(
-    not (find_spec("heyoka") and find_spec("flint")), reason="the truth tools are not installed"
-)
+@needs_truth
 @pytest.mark.parametrize("name", ["A01", "A02", "A03", "cart-pole", "NESC-2"])
 def test_stored_values_are_computed_again(name):
     from bench.classics_values import VALUES
@@ -51,9 +49,7 @@ def test_the_goals_are_reached(problem, engine):
     assert smallest_error(problem, engine) <= GOALS[problem, engine]
 
 
-@pytest.mark.skipif(
-    not (find_spec("heyoka") and find_spec("flint")), reason="the truth tools are not installed"
-)
+@needs_truth
 @pytest.mark.parametrize("engine", ["mujoco", "exudyn-tree"])
 def test_a_stored_limit_is_measured_again(engine):
     """The tumbling brick takes a tenth of a second of each engine."""

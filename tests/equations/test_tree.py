@@ -17,7 +17,7 @@ from plumbline.scenario.generator import random_mechanism
 from plumbline.truth.certified_state import certify_state, enclose_quantities
 from plumbline.truth.rounding_bound import state_rounding_bound
 from tests.helpers.catalogue import catalogue_scenarios
-from tests.helpers.nightly_tests import slow
+from tests.helpers.nightly_tests import SLOW
 
 BITS = 400
 SHARE = 0.1  # of the rounding bound that doubles may be off by
@@ -90,7 +90,8 @@ def evaluated(num, model, state):
     }
 
 
-def check_doubles(name):
+@pytest.mark.parametrize("name", [pytest.param(x, marks=[] if x in SAMPLE else SLOW) for x in TREES])
+def test_doubles_in_a_batch_are_within_a_tenth_of_the_rounding_bound(name):
     """The errors of doubles over the rounding bounds that engines are judged by."""
     model, states = catalogue_scenarios()[name].model, states_of(catalogue_scenarios()[name], 4)
     found = evaluated(floats(), model, batch(states))
@@ -105,17 +106,6 @@ def check_doubles(name):
             if quantity not in ("mass_matrix", "kinetic_energy", "potential_energy"):
                 error = np.linalg.norm(error, axis=-1)
             assert np.all(error <= SHARE * bound.tolerance(quantity)), quantity
-
-
-@pytest.mark.parametrize("name", SAMPLE)
-def test_doubles_in_a_batch_are_within_a_tenth_of_the_rounding_bound(name):
-    check_doubles(name)
-
-
-@slow
-@pytest.mark.parametrize("name", sorted(set(TREES) - set(SAMPLE)))
-def test_doubles_in_a_batch_are_within_a_tenth_of_the_rounding_bound_everywhere(name):
-    check_doubles(name)
 
 
 @pytest.mark.parametrize("name", ["double-loaded-rods", "tree-of-seven-sprung", "free-body-with-rotors"])

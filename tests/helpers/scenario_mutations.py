@@ -238,7 +238,6 @@ EDITS_OF_DATA = (
     _exchange, _shuffle, _names, _kind, _close, _repeat,
 )  # fmt: skip
 EDITS_OF_TEXT = (_indent, _mark, _repeat_line, _characters)
-MUTATORS = [edit.__name__.strip("_") for edit in (*EDITS_OF_DATA, *EDITS_OF_TEXT, damaged_bytes)]
 
 
 def mutated(document: Any, draw: random.Random) -> tuple[str, bytes]:
