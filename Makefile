@@ -42,9 +42,10 @@ lint: .venv/test.done  ## style and types only
 	$(PYTHON) -m ruff format --check .
 	$(PYTHON) -m mypy
 
-nightly: .venv/test.done  ## the full matrix with random scenarios and the servers that are built, then the long tests
+nightly: .venv/test.done  ## the full matrix with random scenarios and the servers that are built, the long tests, a search
 	$(PYTHON) -m tools.engine_servers --options | xargs $(PYTHON) -m plumbline nightly
 	$(PYTHON) -m pytest -n 2 -m full
+	$(PYTHON) -m plumbline fuzz --minutes 10
 
 bench: .venv/test.done  ## right-hand sides and work-precision beside the engines, as ratios within one run; the daily loop
 	$(PYTHON) -m bench.summary

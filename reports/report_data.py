@@ -12,7 +12,7 @@ import numpy as np
 
 from plumbline.judging.rows import RUN_FAMILY, SHOWN_STYLES
 from plumbline.model.datatypes import Array, Float, Model, State
-from plumbline.model.invariants import DEPARTURE, first_departure
+from plumbline.model.invariants import DEPARTURE, LONG_RUN_QUANTITIES, first_departure
 from plumbline.model.kinematics import quaternion_conjugate, quaternion_product, rotation_matrix
 from plumbline.model.loops import cut_open, determinate_projectors, singular_values
 from plumbline.storage.results_schema import DamagedResults
@@ -77,7 +77,7 @@ def rerun_command(row: Record, scenario: Record) -> str:
     ours = not file or file in _catalogue_files()
     what = row["scenario"] if ours else file
     words = ["python", "-m", "plumbline", "run", "--engine", row["engine"]]
-    if _is_long_run(row):
+    if row["quantity"] in LONG_RUN_QUANTITIES:
         words[3:] = ["nightly", "--engine", row["engine"], "--random", "0", "--no-self-test"]
         asked = (row.get("extra") or {}).get("asked", DEFAULT_LONG_RUN_SECONDS)
         words += [] if asked == DEFAULT_LONG_RUN_SECONDS else ["--long-run-seconds", f"{asked:g}"]
@@ -88,11 +88,6 @@ def rerun_command(row: Record, scenario: Record) -> str:
         return shlex.join(words)
     words[4:4] = [] if what.startswith("-") else [what]
     return shlex.join(words + (["--", what] if what.startswith("-") else []))
-
-
-def _is_long_run(row: Record) -> bool:
-    """Report whether a row is about a nightly's long runs."""
-    return str(row["quantity"]).endswith(("_long", "_long_growth"))
 
 
 def _json_number(value: Any, digits: int = 6) -> Any:
@@ -172,7 +167,7 @@ def scenario_chunk(
         detail: Record = {k: row[k] for k in _TEXT_FIELDS if row.get(k) not in (None, "")}
         detail |= {k: row[k] for k in _NUMBER_FIELDS if row.get(k) is not None}
         details.append(detail | {"extra": row.get("extra"), "script": results.scripts.get(row["key"])})
-        level = "long" if _is_long_run(row) else row["level"]
+        level = "long" if row["quantity"] in LONG_RUN_QUANTITIES else row["level"]
         commands[f"{row['engine']}/{level}"] = rerun_command(row, scenario)
     header = {
         "scenario": {

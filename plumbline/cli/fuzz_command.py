@@ -14,7 +14,7 @@ from plumbline import layout
 from plumbline.cli import options
 from plumbline.cli.findings_output import describe_run
 from plumbline.cli.help_texts import EXIT_CODES, examples
-from plumbline.cli.terminal_output import count_noun, line_width, make_console
+from plumbline.cli.terminal_output import command_line, count_noun, line_width, make_console
 from plumbline.execution.exit_codes import ExitCode
 from plumbline.execution.plan import Plan
 from plumbline.processes.worker_pool import Limits
@@ -81,8 +81,8 @@ def fuzz(
     """Compare random mechanisms at states until the time is over or enough new findings are found.
 
     What is found is grouped at once: one cause is one finding. Of each new one the smallest mechanism that
-    still shows it is written to OUT as a scenario file, which `run` repeats. Ctrl-C ends with the findings so
-    far.
+    still shows it is written to OUT as a scenario file, which `run` repeats; `explain` and `report` read OUT.
+    Ctrl-C ends with the findings so far.
     """
     from plumbline.studies.fuzz import Corpus, FuzzResult, search, write_findings
 
@@ -101,7 +101,7 @@ def fuzz(
             )  # fmt: skip
         except KeyboardInterrupt:
             is_interrupted = True
-        written = list(write_findings(result, folder))
+        written = list(write_findings(result, folder, command_line()))
     new = result.new
     summary = f"{count_noun(result.scenario_count, 'scenario')}, {count_noun(len(new), 'new finding')}"
     _log(f"{summary}, {time.monotonic() - began:.0f} s")

@@ -20,8 +20,8 @@ ASKEW = 1e-6  # of a direction: it lies along an axis but for rounding
 LENGTHS = (" m", " rad")  # units of a mechanism's geometry, by which loops may open
 WORDS = {"rest": "rest position", "force": "applied force", "moment": "applied moment",
          "drag_force": "drag force", "drag_moment": "drag moment", "omega": "angular velocity ω′",
-         "udot": "rod rate u̇", "xdot": "rates", "spring_length": "length", "spring_stiffness": "stiffness",
-         "spring_damping": "damping"}  # fmt: skip
+         "udot": "rod rate u̇", "xdot": "rates", "spring_point": "point", "spring_length": "length",
+         "spring_stiffness": "stiffness", "spring_damping": "damping"}  # fmt: skip
 OF_SPRINGS = {name: f"{WORDS[name]} of springs between points" for name in SPRING_FIELDS[2:]}
 UNITS = {"mass": " kg", "inertia": " kg m²", "force": " N", "moment": " N m", "drag_force": " N s/m",
          "drag_moment": " N m s", "gravity": " m/s²", "length": " m", "point": " m"}  # fmt: skip

@@ -126,7 +126,7 @@ def _every_reading(case: Case) -> Iterator[tuple[str, str, str, Change]]:
     for term, names in MISSING.items():
         present = [name for name in names if np.any(getattr(model, name))]
         if len(present) > 1:  # one field alone is a cause with a factor
-            place = "" if term.endswith("points") else "all joints"
+            place = "all joints" if names[0] in JOINT_ELEMENTS else ""
             yield term, place, "missing", _fields(**{name: 0 * getattr(model, name) for name in present})
     for i, j in ((0, 1), (0, 2), (1, 2)):
         order = [j if axis == i else i if axis == j else axis for axis in range(3)]
@@ -502,7 +502,7 @@ def _fields_of_others(model: Model) -> Iterator[tuple[str, str, str, Change]]:
         **dict.fromkeys(body_values, "body"),
         **dict.fromkeys(SPRING_FIELDS[1:], "spring"),
     }.items():
-        values, term = getattr(model, name), WORDS.get(name, name.removeprefix("spring_"))
+        values, term = getattr(model, name), WORDS.get(name, name)
         count = len(values)
         if count < 2:
             continue

@@ -37,18 +37,23 @@ class MetamorphicHooks(Adapter):
     option: str = ""  # the one of `options`, `joint_options` or `linear_solvers` in use
     has_welded_halves: bool = False  # whether `body_pieces` divides every body
 
+    @property
+    def ways(self) -> tuple[str, ...]:
+        """All that `with_option` takes."""
+        return *self.options, *self.joint_options, *self.linear_solvers
+
     def with_option(self, option: str) -> Self:
         """Copy the adapter, set to another algorithm or linear solver.
 
         Args:
-            option: one of `options`, `joint_options` or `linear_solvers`.
+            option: one of `ways`.
 
         Raises:
             KeyError: the engine has no such option; the message lists those it has.
 
         """
-        if option not in (ways := (*self.options, *self.joint_options, *self.linear_solvers)):
-            raise KeyError(f"{self.name} has no option {option!r}; it has {list(ways)}")
+        if option not in self.ways:
+            raise KeyError(f"{self.name} has no option {option!r}; it has {list(self.ways)}")
         other = copy(self)
         other.option = option
         return other

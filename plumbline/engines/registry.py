@@ -27,6 +27,8 @@ ENGINES = {
     "exudyn-tree": "adapters.exudyn_tree_engine:ExudynTree",
 }
 
+REFERENCE_ENGINES = ("reference", "reference-printed")
+
 # Engines of the user by name: specifications, as `plumbline.engines.specifications` has them. Workers get the
 # specification, not the name.
 USER_ENGINES: dict[str, str] = {}

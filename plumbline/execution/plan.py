@@ -8,6 +8,7 @@ from enum import StrEnum
 from typing import Literal
 
 from plumbline.engines.adapter import EngineInfo
+from plumbline.engines.registry import REFERENCE_ENGINES
 from plumbline.judging.known_issues import KnownIssue, project_known_issues
 from plumbline.judging.rows import Row
 from plumbline.processes.worker_pool import Limits, ResultCache
@@ -110,9 +111,7 @@ class TaskKey:
     @property
     def cpu_time_kind(self) -> str:
         """The kind of `plumbline.processes.cpu_time` that the call counts as."""
-        return _CPU_TIME_KINDS.get(
-            self.kind, "reference" if self.engine.startswith("reference") else "engines"
-        )
+        return _CPU_TIME_KINDS.get(self.kind, "reference" if self.engine in REFERENCE_ENGINES else "engines")
 
 
 def scenario_level(

@@ -9,6 +9,7 @@ import subprocess
 import time
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property
@@ -153,12 +154,18 @@ def compare_surfaces(executor: Executor) -> list[SurfaceChanges]:
     return [found[name] for name in SURFACES if name in found]
 
 
-def run_plan(plan: Plan, progress: ProgressCallback, observer: RunObserver | None = None) -> RunResult:
+def run_plan(
+    plan: Plan,
+    progress: ProgressCallback,
+    observer: RunObserver | None = None,
+    executor: Executor | None = None,
+) -> RunResult:
     """Run a whole plan.
 
     Args:
         progress: called after every task.
         observer: gets the rows as they are judged.
+        executor: makes the calls; None for one that ends with the run.
 
     Returns:
         The result; a task that is lost becomes a row with the verdict failed.
@@ -169,8 +176,9 @@ def run_plan(plan: Plan, progress: ProgressCallback, observer: RunObserver | Non
     """
     begin, started = time.monotonic(), datetime.now(UTC)
     run = _Run(plan, observer or RunObserver())
-    with run.cpu_times.measure_overhead(), make_executor(plan) as executor:
-        run.execute(executor, progress)
+    calls = make_executor(plan) if executor is None else nullcontext(executor)
+    with run.cpu_times.measure_overhead(), calls as given:
+        run.execute(given, progress)
     result = run.result()
     result.metadata = {
         "id": started.strftime("%Y%m%dT%H%M%SZ"),

@@ -41,10 +41,10 @@ from plumbline.engines.registry import ENGINES, IMPORTERS, USER_ENGINES
 from plumbline.importers.neutral_model import MODEL_UNITS
 from plumbline.judging.rows import DECLARED_PREFIX, Level, Row, Verdict
 from plumbline.judging.state_level import SINGULAR_POSE, STATE_UNITS
-from plumbline.measurements.relation_result import REPEATABILITY, UNEXPLAINED
+from plumbline.measurements.relation_result import OTHER_FORMULATIONS, REPEATABILITY, UNEXPLAINED
 from plumbline.measurements.run_relations import REVERSED_IN_TIME
 from plumbline.measurements.state_relations import REDESCRIPTIONS, STATE_RELATIONS, WELDED_HALVES
-from plumbline.model.invariants import INVARIANT_UNITS, MOTION_UNITS
+from plumbline.model.invariants import INVARIANT_UNITS, LONG_RUN_QUANTITIES, MOTION_UNITS
 from plumbline.scenario.generator import MECHANISM_PREFIX, MOTION_PREFIX, RANDOM_FAMILY
 from plumbline.scenario.line_and_column_errors import Problem, ScenarioError, did_you_mean, shorten
 from plumbline.scenario.loader import catalogue
@@ -504,10 +504,9 @@ def _problem(
 def _quantities() -> set[str]:
     """Every quantity that a row may have, except of information."""
     trajectory = ("order", *(f"{name}_limit" for name in MOTION_UNITS))
-    long_runs = ("all_long", "energy_drift_long_growth", *(f"{name}_long" for name in INVARIANT_UNITS))
     own = (*REDESCRIPTIONS, WELDED_HALVES, REVERSED_IN_TIME, REPEATABILITY)
     relations = (*(r.name for r in STATE_RELATIONS), *own)
-    others = *(f"as {name}" for name in ENGINES), *(f"by {text}" for text in declared_texts())
+    others = *OTHER_FORMULATIONS, *(f"by {text}" for text in declared_texts())
     steps = (*STEP_UNITS, *CONSTRAINED_UNITS, *RUN_UNITS)
     return {
         "all",
@@ -517,7 +516,7 @@ def _quantities() -> set[str]:
         *steps,
         *trajectory,
         *INVARIANT_UNITS,
-        *long_runs,
+        *LONG_RUN_QUANTITIES,
         *relations,
         *others,
     }

@@ -30,7 +30,7 @@ from plumbline.measurements.long_run_study import (
 from plumbline.measurements.order_and_limit import ORDER_MARGIN
 from plumbline.measurements.refinement_study import ROUNDING_PER_STEP
 from plumbline.model.datatypes import Array, Float, Integrator, Model
-from plumbline.model.invariants import INVARIANT_UNITS
+from plumbline.model.invariants import ALL_LONG, INVARIANT_UNITS
 from plumbline.truth.ground_truth import DETECTABLE_PARAMETER_ERROR
 
 MIN_ORDER_IN_TOLERANCE = 0.5  # order of a drift in the tolerance of a method with step control, at least
@@ -56,7 +56,7 @@ def judge_long_runs(
     cost = sum(run.cpu_time for run in study.runs)
     if missing := _missing_runs(study):
         row = context.make_row(
-            "invariants", integrator.name, "all_long", *missing, gap=study.gap,
+            "invariants", integrator.name, ALL_LONG, *missing, gap=study.gap,
             cpu_time=cost, extra={"asked": study.plan.requested_seconds},
         )  # fmt: skip
         return JudgingResult([row])

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from plumbline.judging.rows import Level, Row, Verdict
 from plumbline.judging.state_level import STATE_UNITS
 from plumbline.measurements.single_steps import MAX_STEP_BODIES, STEP_STATES, step_sizes
-from plumbline.model.datatypes import Array, Float, Model, State, Trajectory
+from plumbline.model.datatypes import SPRING_FIELDS, Array, Float, Model, State, Trajectory
 from plumbline.model.invariants import (
     INVARIANT_UNITS,
     MOTION_UNITS,
@@ -188,7 +188,7 @@ def _entries(
                 name,
                 level,
                 one.body + 1,
-                "spring" if one.kind.startswith("spring_") else ("", *model.kind)[one.body + 1],
+                "spring" if one.kind in SPRING_FIELDS else ("", *model.kind)[one.body + 1],
                 one.kind,
                 one.name,
                 one.value,

@@ -5,7 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from plumbline.engines.registry import ENGINES
+
 OTHER_FORMULATION_PREFIX = "as "  # names of relations: "as NAME" is the engine's other formulation NAME
+OTHER_FORMULATIONS = {OTHER_FORMULATION_PREFIX + name: name for name in ENGINES}
 OPTION_PREFIX = "by "  # "by NAME" is another algorithm or linear solver of the same engine
 
 UNEXPLAINED = "unexplained"  # in a row's `extra`: `RelationResult.unexplained`

@@ -210,6 +210,10 @@ INVARIANT_UNITS = {
     "gap_rate": "m/s",
     "norm_drift": "1",
 }
+ALL_LONG = "all_long"  # quantity of long runs that were refused or failed
+LONG_RUN_QUANTITIES = frozenset(
+    {ALL_LONG, "energy_drift_long_growth", *(f"{name}_long" for name in INVARIANT_UNITS)}
+)
 
 
 def work_of_loads(

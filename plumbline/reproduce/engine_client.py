@@ -76,6 +76,6 @@ def _evaluate_variant(engine: str, variant: str, model: Model, state: State) -> 
     if variant == WELDED_HALVES:
         adapter = adapter.with_welded_halves()
     elif variant:
-        adapter = adapter.with_option(variant.removeprefix(OPTION_PREFIX))
+        adapter = adapter.with_option({OPTION_PREFIX + way: way for way in adapter.ways}[variant])
     (found,) = adapter.evaluate(model, [state])
     return found

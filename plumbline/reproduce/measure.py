@@ -20,7 +20,7 @@ from plumbline.judging.invariant_drift import invariant_rows
 from plumbline.judging.refinement_analysis import RefinementAnalysis
 from plumbline.judging.rows import Row, RowContext, Verdict
 from plumbline.judging.trajectory_level import FINEST_RUN_SHOWN, LIMIT_QUANTITIES, trajectory_rows
-from plumbline.measurements.relation_result import OTHER_FORMULATION_PREFIX
+from plumbline.measurements.relation_result import OTHER_FORMULATIONS
 from plumbline.measurements.state_relations import (
     QUANTITIES,
     STATE_RELATIONS,
@@ -209,8 +209,7 @@ class RelationMeasure:
         usual, transform = StateMeasure(self.engine), TRANSFORMS.get(self.name)
         if self.name == TIME_REVERSED.name:
             case = replace(case, model=scale_fields(case.model, drag_force=0.0, drag_moment=0.0))
-        if self.name.startswith(OTHER_FORMULATION_PREFIX):
-            name = self.name.removeprefix(OTHER_FORMULATION_PREFIX)
+        if name := OTHER_FORMULATIONS.get(self.name):
             other = replace(usual, engine=replace(self.engine, name=name))(case)
         elif transform is not None:
             other = usual(ReproductionCase(*transform(case.model, case.state)))

@@ -18,11 +18,13 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from packaging.version import InvalidVersion, Version
 
+from plumbline.engines.declared_names import declared_texts
 from plumbline.engines.environments import declared_attribute
 from plumbline.measurements.order_and_limit import ORDER_MARGIN
-from plumbline.measurements.relation_result import OPTION_PREFIX, OTHER_FORMULATION_PREFIX
+from plumbline.measurements.relation_result import OPTION_PREFIX, OTHER_FORMULATIONS
 from plumbline.measurements.state_relations import WELDED_HALVES
 from plumbline.model.datatypes import Array, Model, State
+from plumbline.model.invariants import LONG_RUN_QUANTITIES
 from plumbline.model.kinematics import (
     quaternion_conjugate,
     quaternion_product,
@@ -43,7 +45,6 @@ from plumbline.reproduce.shrink import ReproductionCase
 from plumbline.truth.step_comparison import CONSTRAINED_UNITS, RUN_UNITS
 
 TEMPLATES = Path(__file__).parent / "templates"
-LONG_RUN_SUFFIXES = ("_long", "_long_growth")  # of the quantities that long runs judge
 LINE = 100  # characters
 FIELD_COMMENTS = {  # of a chain's literals, in the order of the script
     "mass": "kg",
@@ -94,7 +95,7 @@ def render_script(row: dict[str, Any], evidence: Evidence) -> str:
         "evaluates": shows == "state",  # how the engine is called; else it runs
         "engine": evidence.engine,
         "welded": variant == WELDED_HALVES,
-        "option": "" if variant == WELDED_HALVES else variant.removeprefix(OPTION_PREFIX),
+        "option": {OPTION_PREFIX + text: text for text in declared_texts()}.get(variant, ""),
         "ties": variant == f"{OPTION_PREFIX}tendon equalities",
         "rods": bool(np.any(model.rods)),
         "loads": model.has_loads or model.has_drag,
@@ -118,24 +119,24 @@ def no_script_reason(engine: str, row: dict[str, Any]) -> str:
         A sentence, or an empty string where the row has a script.
 
     """
-    relation, is_other = row["quantity"], str(row["quantity"]).startswith(OTHER_FORMULATION_PREFIX)
-    for name in (engine, relation.removeprefix(OTHER_FORMULATION_PREFIX) if is_other else engine):
+    relation = row["quantity"]
+    other = OTHER_FORMULATIONS.get(relation)
+    for name in (engine, other or engine):
         if not declared_attribute(name, "reproduction_template"):
             return f"engine {name} has no template of scripts"
     if row["level"] == "step" and row["quantity"] in CONSTRAINED_UNITS:
         return "rows of single steps with constraints have no script"
     if row["level"] == "step" and row["quantity"] in RUN_UNITS:
         return "rows on every step of a run have no script: what single steps show has one"
-    if relation.endswith(LONG_RUN_SUFFIXES):
+    if relation in LONG_RUN_QUANTITIES:
         return "rows of long runs have no script"
     if row["level"] != "relations":
         return ""
     if row["integrator"] != "-":
         return "relations of runs have no script"
-    if relation in TRANSFORMS or is_other:
+    if relation in TRANSFORMS or other:
         return ""
-    block = {relation: "option"} if relation.startswith(OPTION_PREFIX) else {WELDED_HALVES: "welded"}
-    is_known = block.get(relation) in _template(engine).blocks
+    is_known = ("welded" if relation == WELDED_HALVES else "option") in _template(engine).blocks
     return "" if is_known else f"scripts of {engine} cannot show {relation!r}"
 
 

@@ -18,13 +18,14 @@ from plumbline.judging.known_issues import project_known_issues
 from plumbline.judging.rows import Verdict
 from plumbline.measurements.order_and_limit import STEP_EXPONENTS
 from plumbline.model.datatypes import BadInput, Model, State
+from plumbline.model.invariants import LONG_RUN_QUANTITIES
 from plumbline.model.kinematics import complete_state
 from plumbline.model.sampling import compared_states
 from plumbline.processes.exceptions import PlumblineError
 from plumbline.processes.worker_pool import Limits, Outcome, ResultCache, Task, WorkerPool
 from plumbline.reproduce.engine_client import EngineClient
 from plumbline.reproduce.measure import Disagreement
-from plumbline.reproduce.render import LONG_RUN_SUFFIXES, no_script_reason, render_script
+from plumbline.reproduce.render import no_script_reason, render_script
 from plumbline.reproduce.shrink import OutOfTime, ReproductionCase
 from plumbline.storage.results_store import read_results, write_atomically
 from plumbline.storage.script_index import read_script_index, script_name, scripts_folder, write_script_index
@@ -283,13 +284,9 @@ def _largest_printed_ratio(printed: str) -> float:
 def _cell(row: StoredRow) -> tuple[str, ...]:
     """Return what rows share a script: scenario, engine, level and integrator, or relation."""
     relation = (row["quantity"],) if row["level"] == "relations" else ()
-    if _is_long_run(row):
+    if row["quantity"] in LONG_RUN_QUANTITIES:
         relation = ("long run",)
     return row["scenario"], row["engine"], row["level"], row["integrator"], *relation
-
-
-def _is_long_run(row: StoredRow) -> bool:
-    return str(row["quantity"]).endswith(LONG_RUN_SUFFIXES)
 
 
 def _refinement_study(
@@ -302,7 +299,7 @@ def _refinement_study(
         for row in document["rows"]
         if (_cell(row)[:2], row["integrator"]) == cell
         and row["level"] in ("trajectory", "invariants")
-        and not _is_long_run(row)
+        and row["quantity"] not in LONG_RUN_QUANTITIES
     ]
     finest = min((row["extra"]["resolution"] for row in every if "resolution" in row["extra"]), default=None)
     declared = next((row["declared_order"] for row in every if row["declared_order"]), None)

@@ -11,21 +11,29 @@ import copy
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from functools import partial
 from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 from plumbline.engines.adapter import EngineInfo
+from plumbline.execution.exit_codes import ExitCode
 from plumbline.execution.plan import Plan
-from plumbline.execution.runner import run_plan
+from plumbline.execution.random_batch import RandomBatch
+from plumbline.execution.runner import RunResult, make_executor, run_plan, save
 from plumbline.judging.findings import Finding, find_findings
 from plumbline.judging.rows import Row
 from plumbline.model.features import features
+from plumbline.processes.cpu_time import CpuTimes
 from plumbline.processes.exceptions import PlumblineError
+from plumbline.processes.worker_pool import Executor
+from plumbline.reproduce.shrink import shrink
 from plumbline.scenario.generator import random_mechanism, random_scenario
 from plumbline.scenario.loader import Scenario, scenario_from_dict
-from plumbline.storage.results_store import write_atomically
+from plumbline.storage.results_store import ResultTables, write_atomically
 
 BATCH = 8  # scenarios compared together, whatever the number of jobs
 MAX_SHRINKINGS = 60  # smaller scenarios that are tried of one finding
@@ -43,20 +51,50 @@ class FuzzResult:
     seed: int
     scenario_count: int = 0
     rows: list[Row] = field(default_factory=list)
-    bodies: dict[str, int] = field(default_factory=dict)  # by scenario
+    scenarios: dict[str, Document] = field(default_factory=dict)  # of the rows: model, title, bodies …
     engines: dict[str, EngineInfo] = field(default_factory=dict)
+    metadata: Document = field(default_factory=dict)  # of the last run
     smallest: dict[str, Scenario] = field(default_factory=dict)  # by finding, made smaller
     kept: int = 0  # mechanisms added to the corpus
+    started: datetime = field(default_factory=lambda: datetime.now(UTC))
 
     @property
     def findings(self) -> list[Finding]:
         """All findings, those that nothing expects first."""
-        return find_findings(self.rows, self.bodies)
+        return find_findings(self.rows, {name: about["bodies"] for name, about in self.scenarios.items()})
 
     @property
     def new(self) -> list[Finding]:
         """Those that nothing expects."""
         return [finding for finding in self.findings if finding.needs_attention]
+
+    def as_run(self) -> RunResult:
+        """The rows that need a look as those of one run."""
+        tables = ResultTables()
+        tables.add_rows(self.rows)
+        found = RunResult(
+            self.rows,
+            [],
+            self.engines,
+            self.scenarios,
+            RandomBatch(),
+            tables,
+            CpuTimes(),
+            dict(self.metadata),
+        )
+        found.metadata |= {
+            "id": self.started.strftime("%Y%m%dT%H%M%SZ"),
+            "started": self.started.isoformat(timespec="seconds"),
+            "duration": (datetime.now(UTC) - self.started).total_seconds(),
+            "sentence": f"{self.scenario_count} mechanisms of seed {self.seed}, {len(self.new)} new findings",
+            "exit_code": int(ExitCode.DISAGREEMENT if self.new else ExitCode.SUCCESS),
+            "random_batch": None,
+        }
+        return found
+
+
+class TimeOver(Exception):
+    """The time of a search is over; what was not finished does not count."""
 
 
 def scenario_of(seed: int, index: int) -> Scenario:
@@ -83,66 +121,83 @@ def search(
 
     """
     end = time.monotonic() + seconds
-    for index in corpus.first_indices(result.seed):
-        if time.monotonic() > end or len(result.new) >= max_findings:
-            return
-        batch = [scenario_of(result.seed, k) for k in range(index, index + BATCH)]
-        known = {finding.name for finding in result.new}
-        _compare(plan, batch, result)
-        result.scenario_count += len(batch)
-        result.kept += sum(map(corpus.add, batch))
-        for finding in result.new:
-            if finding.name not in known and len(result.smallest) < MAX_STORED:
-                log(f"new: {finding.name} ({finding.scenarios[0]})")
-                start = next(s for s in batch if s.name in finding.scenarios)
-                result.smallest[finding.name] = shrink(plan, start, finding, end)
+    with suppress(TimeOver), make_executor(plan) as executor:
+        compare = partial(_compare, plan, executor, end)
+        for index in corpus.first_indices(result.seed):
+            if len(result.new) >= max_findings:
+                return
+            batch = [scenario_of(result.seed, k) for k in range(index, index + BATCH)]
+            known = {finding.name for finding in result.new}
+            compare(batch, result)
+            result.scenario_count += len(batch)
+            result.kept += sum(map(corpus.add, batch))
+            for finding in result.new:
+                if finding.name not in known and len(result.smallest) < MAX_STORED:
+                    log(f"new: {finding.name} ({finding.scenarios[0]})")
+                    start = next(s for name in finding.scenarios for s in batch if s.name == name)
+                    _shrink(compare, start, finding, result.smallest)
 
 
-def _compare(plan: Plan, scenarios: Sequence[Scenario], result: FuzzResult) -> None:
-    found = run_plan(replace(plan, scenarios=[], random_scenarios=scenarios), lambda *_: None)
-    result.engines = found.engines
-    result.rows += [row for row in found.rows if row.verdict.needs_attention]
-    result.bodies |= {scenario.name: scenario.model.n for scenario in scenarios}
+def _compare(
+    plan: Plan, executor: Executor, end: float, scenarios: Sequence[Scenario], result: FuzzResult,
+    engines: Sequence[str] = (),
+) -> None:  # fmt: skip
+    """Add what engines return on scenarios; raises `TimeOver` after the monotonic time ``end``."""
+
+    def check_clock(*_: Any) -> None:
+        if time.monotonic() > end:
+            raise TimeOver
+
+    check_clock()
+    plan = replace(plan, scenarios=[], random_scenarios=scenarios, engines=engines or plan.engines)
+    found = run_plan(plan, check_clock, executor=executor)
+    result.engines, result.metadata = found.engines, found.metadata
+    rows = [row for row in found.rows if row.verdict.needs_attention]
+    result.rows += rows
+    result.scenarios |= {row.scenario: found.scenarios[row.scenario] for row in rows}
 
 
-def shrink(plan: Plan, scenario: Scenario, finding: Finding, end: float) -> Scenario:
+def _shrink(
+    compare: Callable[[Sequence[Scenario], FuzzResult, Sequence[str]], None],
+    scenario: Scenario,
+    finding: Finding,
+    smallest: dict[str, Scenario],
+) -> None:
     """Make a scenario smaller as long as it shows a finding.
 
     Args:
-        end: monotonic time after which nothing more is tried.
+        compare: adds what engines return on scenarios to a result.
+        smallest: gets the smallest scenario so far, by the finding's name.
 
     """
-    engines = list(dict.fromkeys(row.engine for row in finding.rows))[:1]
-    plan, tried = replace(plan, engines=engines), 0
-    is_smaller = True
-    while is_smaller:
-        is_smaller = False
-        for document in _smaller(scenario.document):
-            if tried >= MAX_SHRINKINGS or time.monotonic() > end:
-                return scenario
-            try:
-                candidate = scenario_from_dict(document, f"{scenario.name}.yaml")
-            except PlumblineError:
-                continue  # no mechanism, or loops that do not close
-            tried += 1
-            result = FuzzResult(0)
-            _compare(plan, [candidate], result)
-            if any(one.identity == finding.identity for one in result.findings):
-                scenario, is_smaller = candidate, True
-                break
-    return scenario
+    smallest[finding.name] = scenario
+    tried = 0
+
+    def shows(document: Document) -> bool:
+        nonlocal tried
+        try:
+            candidate = scenario_from_dict(document, f"{scenario.name}.yaml")
+        except PlumblineError:
+            return False  # no mechanism, or loops that do not close
+        tried += 1
+        result = FuzzResult(0)
+        compare([candidate], result, [finding.rows[0].engine])
+        if is_shown := any(one.identity == finding.identity for one in result.findings):
+            smallest[finding.name] = candidate
+        return is_shown
+
+    shrink(scenario.document, [_smaller, _smaller], shows, lambda: tried >= MAX_SHRINKINGS)
 
 
 def _smaller(document: Document) -> Iterator[Document]:
-    """Documents with one thing less: a body without others on it, a closing joint, a spring, a load."""
+    """Documents with one thing less: a body, whose parent carries its branches, a loop, a load and so on."""
     bodies = document["bodies"]
-    named = [one for part in ("closes", "springs") for one in document.get(part) or ()]
-    used = json.dumps([[body.get("parent") for body in bodies], named])
-    for k in reversed(range(len(bodies))):
-        name = bodies[k].get("name")
-        is_last = k == len(bodies) - 1
-        if len(bodies) > 1 and (is_last if name is None else json.dumps(name) not in used):
-            yield _without(document, "bodies", k)
+    for k in reversed(range(len(bodies) if len(bodies) > 1 else 0)):
+        changed = _without(document, "bodies", k)
+        for body in changed["bodies"]:
+            if body.get("parent") is not None and body["parent"] == bodies[k].get("name"):
+                body["parent"] = bodies[k].get("parent")
+        yield changed
     for part in ("closes", "springs"):
         for k in range(len(document.get(part) or ())):
             yield _without(document, part, k)
@@ -217,15 +272,9 @@ def write_scenario(scenario: Scenario, path: Path) -> None:
     write_atomically(path, json.dumps(scenario.document, indent=1).encode())
 
 
-def write_findings(result: FuzzResult, folder: Path) -> Iterable[Path]:
-    """Write fuzz.json and a scenario file of each new finding."""
-    folder.mkdir(parents=True, exist_ok=True)
-    document = {
-        "seed": result.seed,
-        "scenarios": result.scenario_count,
-        "findings": [finding.record() for finding in result.findings],
-    }
-    write_atomically(folder / "fuzz.json", json.dumps(document, ensure_ascii=False, indent=1).encode())
+def write_findings(result: FuzzResult, folder: Path, command: str) -> Iterable[Path]:
+    """Write the results as those of a run, and a scenario file of each new finding."""
+    save(result.as_run(), folder, command)
     for name, scenario in result.smallest.items():
         path = folder / f"{name[:120]}.yaml"
         write_scenario(scenario, path)

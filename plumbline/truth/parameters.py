@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from plumbline.model.datatypes import JOINT_ELEMENTS, SPRING_FIELDS, Array, Model, State
+from plumbline.model.datatypes import JOINT_ELEMENTS, KINDS, SPRING_FIELDS, Array, Model, State
 from plumbline.model.kinematics import complete_state, quaternion_product, stretched_length
 
 AXES = ("x", "y", "z")
@@ -35,6 +35,12 @@ STATE_KINDS = (
     "attitude", "omega", "direction", "rod_rate", "coordinate", "rate", "position", "velocity",
 )  # fmt: skip
 NEGLIGIBLE = 1e-9  # of the natural size: a value below is a rounded zero
+SLIDES = {  # names of motions
+    name
+    for kind in KINDS.values()
+    for (motion, _), name in zip(kind.motions, kind.motion_names, strict=True)
+    if motion == "slide"
+}
 
 
 @dataclass(frozen=True)
@@ -57,7 +63,7 @@ class Parameter:
     @property
     def unit(self) -> str:
         """Unit of value and scale."""
-        return (SLIDE_UNITS if self.entry.startswith("slide") else UNITS)[self.kind]
+        return (SLIDE_UNITS if self.entry in SLIDES else UNITS)[self.kind]
 
 
 def list_parameters(model: Model, state: State) -> list[Parameter]:
@@ -127,7 +133,7 @@ def _joint_elements(model: Model, k: int, rate: float) -> Iterator[Parameter]:
     inertia = float(np.trace(model.inertia[near])) / 3, float(model.mass[near])
     is_ball = model.kinds[k].is_spherical
     for i, what in enumerate(["turn"] if is_ball else model.kinds[k].motion_names):
-        is_slide = what.startswith("slide")
+        is_slide = what in SLIDES
         size, arm = inertia[is_slide], float(np.sqrt(3 * inertia[0] / inertia[1]))
         natural = (size, size * rate, size * rate**2, arm if is_slide else 1.0, size * rate**2)
         for name, own in zip(JOINT_ELEMENTS, natural, strict=True):
@@ -149,7 +155,7 @@ def _initial_state(model: Model, state: State, k: int, span: float, spin: float)
         yield from _components("position", k, state.r[k], span)
         yield from _components("velocity", k, state.v[k], span * spin)
     for i, what in enumerate(model.kinds[k].motion_names):
-        is_slide = what.startswith("slide")
+        is_slide = what in SLIDES
         angle = Parameter("coordinate", k, what, 0.0, 1.0)
         yield _parameter("coordinate", k, what, state.x[k, i], span) if is_slide else angle
         yield _parameter("rate", k, what, state.xdot[k, i], span * spin if is_slide else spin)

@@ -13,17 +13,34 @@ from plumbline.studies.fuzz import BATCH, Corpus, _smaller, scenario_of
 
 PLANTED = """
 from dataclasses import replace
+import numpy as np
 from adapters.mujoco_engine import Mujoco
+
+def has(model, kind, field):
+    return any(np.any(x) for own, x in zip(model.kind, getattr(model, field)) if own == kind)
 
 class Planted(Mujoco):
     name = "planted"
 
     def _evaluate(self, model, states):
         found = super()._evaluate(model, states)
-        if model.damping.any():
+        if has(model, "cylindrical", "armature"):
             found = [replace(a, kinetic_energy=1.5 * a.kinetic_energy) for a in found]
+        if "weld" in model.kind and np.any(model.moment):
+            found = [replace(a, joint_moment=-a.joint_moment) for a in found]
+        if "planar" in model.kind and "hinge" in model.kind:
+            found = [replace(a, acceleration=a.acceleration - model.gravity) for a in found]
+        if has(model, "universal", "effort"):
+            found = [replace(a, angular_momentum=2 * a.angular_momentum) for a in found]
+        if any(np.any(b < 0) and d for b, d in zip(model.spring_body, model.spring_damping)):
+            found = [replace(a, potential_energy=-a.potential_energy) for a in found]
         return found
 """
+FIVE = {
+    "planted-kinetic-energy-multiplied-by", "planted-joint-forces-with-opposite-sign",
+    "planted-acceleration-minus-gravity", "planted-angular-momentum-multiplied-by",
+    "planted-potential-energy-with-opposite-sign",
+}  # fmt: skip
 
 
 def test_a_seed_gives_the_same_mechanisms():
@@ -58,15 +75,24 @@ def test_a_corpus_keeps_new_combinations_up_to_its_size_and_where_a_search_ended
     assert len(load_scenarios([str(path) for path in (tmp_path / "corpus").glob("*.yaml")])) == 2
 
 
+def test_a_batch_that_is_not_finished_in_time_does_not_count_and_explain_reads_the_folder(tmp_path):
+    words = ["--minutes", "0", "--corpus", str(tmp_path / "corpus"), "--out", str(tmp_path / "out")]
+    done = CliRunner().invoke(main, ["fuzz", "--engine", "reference", *words])
+    assert done.exit_code == ExitCode.SUCCESS and "0 scenarios, 0 new findings" in done.stderr, done.output
+    assert not (tmp_path / "corpus").exists()
+    explained = CliRunner().invoke(main, ["explain", "--results", str(tmp_path / "out")])
+    assert (explained.exit_code, explained.stderr) == (0, "no finding\n"), explained.output
+
+
 def test_a_planted_defect_is_found_named_and_shown_by_the_smallest_mechanism(tmp_path):
-    planted = tmp_path / "planted.py"
+    """Five of them, each active under a rare condition."""
+    planted, out = tmp_path / "planted.py", tmp_path / "out"
     planted.write_text(PLANTED)
-    words = ["--adapter", f"{planted}:Planted", "--seed", "3", "--findings", "1", "--jobs", "1", "--json"]
-    done = CliRunner().invoke(main, ["fuzz", *words, "--minutes", "20", "--out", str(tmp_path / "out")])
+    words = ["--adapter", f"{planted}:Planted", "--seed", "3", "--findings", "5", "--jobs", "1", "--json"]
+    done = CliRunner().invoke(main, ["fuzz", *words, "--minutes", "60", "--out", str(out)])
     assert done.exit_code == ExitCode.DISAGREEMENT, done.output
-    (found,) = json.loads(done.stdout)
-    assert found["name"] == "planted-kinetic-energy-multiplied-by"
-    (smallest,) = (tmp_path / "out").glob("*.yaml")
-    (scenario,) = load_scenarios([str(smallest)])
-    assert scenario.model.n == 1 and scenario.model.damping.any()
-    assert "new: planted-kinetic-energy-multiplied-by" in done.stderr
+    assert {found["name"] for found in json.loads(done.stdout)} == FIVE
+    smallest = load_scenarios([str(path) for path in out.glob("*.yaml")])
+    assert len(smallest) == 5 and all(scenario.model.n <= 3 for scenario in smallest)
+    explained = CliRunner().invoke(main, ["explain", "--results", str(out)])
+    assert {line.split(":")[0] for line in explained.stdout.splitlines()} == FIVE
