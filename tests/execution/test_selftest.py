@@ -11,7 +11,6 @@ from plumbline.execution import selftest
 from plumbline.execution.selftest import SelfTestResult
 from plumbline.processes.worker_pool import Limits
 from plumbline.scenario import loader
-from tests.helpers.nightly_tests import SLOW
 
 PASSING_TEST = """
 def test_rates(record_property):
@@ -115,7 +114,7 @@ def test_every_list_of_planted_defects_is_in_the_self_test():
     assert found and found <= named
 
 
-@pytest.mark.parametrize("trouble", ["half of them", pytest.param("", marks=SLOW)])
+@pytest.mark.parametrize("trouble", ["half of them", ""])
 def test_a_night_whose_self_test_misses_a_defect_is_not_green(tmp_path, trouble):
     pytest.importorskip("mujoco")
 

@@ -19,21 +19,17 @@ STEPS = MOTIONS | {
 }
 STATES = STEPS | {
     "double-rod-then-ball": "a ball on a rod",
-    "sprung-cylinder": "a cylindrical joint",
     "planar-top": "a planar joint",
     "universal-pendulum": "a universal joint",
     "wrecking-ball": "a weld",
     "double-loaded-rods": "every load on rods",
     "double-mass-ratio-1000": "masses far apart",
     "chain-5-mixed": "rods and balls in turn",
-    "chain-10-rods": "a long chain",
     "sprung-ball": "springs of balls",
     "sprung-without-rotors": "no rotor",
     "robot-arm": "a chain of hinges",
-    "hand-on-welds": "branches on welds",
     "tree-of-seven-sprung": "every joint, load and element in one tree",
     "four-bar": "a loop",
-    "slider-crank": "a loop with a slide",
 }
 LOADS = ("force", "moment", "drag_force", "drag_moment")
 

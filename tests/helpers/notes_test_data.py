@@ -5,8 +5,6 @@ polynomials over the rationals: an identity that holds there holds for all value
 """
 
 import numpy as np
-from sympy import QQ
-from sympy.polys.rings import ring
 
 from reference_impl.euler_parameters import euler_parameter_rate
 from tests.helpers.random_chains import random_state
@@ -27,6 +25,9 @@ class Symbols:
     """Symbols r, p, ṙ, ṗ, s of N bodies and ℓ, and differentiation of what is built of them."""
 
     def __init__(self, bodies, attachments):
+        from sympy import QQ  # takes longer than to collect all tests of a folder
+        from sympy.polys.rings import ring
+
         n, counts = bodies, {"r": 3 * bodies, "p": 4 * bodies, "v": 3 * bodies, "w": 4 * bodies}
         names = [
             f"{k}{i}" for k, m in {**counts, "s": 3 * attachments, "l": bodies}.items() for i in range(m)
