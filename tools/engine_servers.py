@@ -49,6 +49,12 @@ class Server:
         """The engine as `--adapter` takes it; its column is called after the server's file."""
         return "cmd:" + shlex.join(map(str, self.command))
 
+    @property
+    def options(self) -> list[str]:
+        """The options that add the engine to a run, and what is recorded of it."""
+        known = SERVERS / f"{self.name}_known_issues.yaml"
+        return ["--adapter", self.adapter, *(["--known", str(known)] if known.exists() else [])]
+
 
 def _needs(program: str, why: str) -> Callable[[], str]:
     return lambda: "" if shutil.which(program) else f"{program} is not installed; {why}"
@@ -108,7 +114,7 @@ def main() -> int:
     options = parser.parse_args()
     chosen = [s for s in ENGINE_SERVERS if not options.names or s.name in options.names]
     if options.options:
-        own = [word for s in chosen if s.is_built for word in ("--adapter", s.adapter)]
+        own = [word for s in chosen if s.is_built for word in s.options]
         print(shlex.join([word for name in ENGINES for word in ("--engine", name)] + own if own else []))
         return 0
     for s in chosen:

@@ -56,3 +56,14 @@ def test_a_server_agrees_with_the_truth(server, tmp_path, monkeypatch):
     found = compare(server.adapter, scenarios, "state")
     assert not found.problems, [f"{row.key}: {row.reason}" for row in found.problems]
     assert sum(row.verdict == Verdict.AGREES for row in found.rows) >= 6
+
+
+def test_what_is_recorded_of_a_server_is_found_again(tmp_path):
+    dart = next(server for server in ENGINE_SERVERS if server.name == "dart")
+    if not dart.is_built:
+        pytest.skip("dart is not built here: `make engines` builds it")
+    command = [sys.executable, "-m", "plumbline", "run", "chain-10-small", "--level", "state", "--engine",
+               "reference", *dart.options, "--out", tmp_path]  # fmt: skip
+    done = subprocess.run([*map(str, command)], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout
+    assert "2 disagree as recorded" in " ".join(done.stdout.split())
