@@ -39,6 +39,7 @@ BATCH = 8  # scenarios compared together, whatever the number of jobs
 MAX_SHRINKINGS = 60  # smaller scenarios that are tried of one finding
 MAX_STORED = 50  # findings with a scenario file
 REMOVABLE = ("load", "drag")  # fields of bodies
+CONTENT = ("name", "mass", "inertia", *REMOVABLE)  # of a body, whatever joint it is on
 ELEMENTS = ("armature", "damping", "stiffness", "rest", "effort")  # fields of joints
 
 Document = dict[str, Any]
@@ -201,6 +202,14 @@ def _smaller(document: Document) -> Iterator[Document]:
     for part in ("closes", "springs"):
         for k in range(len(document.get(part) or ())):
             yield _without(document, part, k)
+    for k, closing in enumerate(document.get("closes") or ()):
+        changed = _without(document, "closes", k)
+        for body in changed["bodies"]:
+            if body.get("name") == closing["body"]:  # it hangs on the closing joint alone
+                kept = {name: body[name] for name in CONTENT if name in body}
+                body.clear()
+                body |= kept | {name: x for name, x in closing.items() if name != "body"}
+        yield changed
     for k, body in enumerate(bodies):
         for name in REMOVABLE:
             if body.get(name):
