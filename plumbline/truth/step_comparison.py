@@ -56,6 +56,7 @@ from plumbline.truth.step_formulas import (
     fastest_rates,
     first_acceleration_bound,
     first_coordinate_acceleration,
+    has_written_rows,
     joint_space_steps,
     steps_in_charts,
 )
@@ -654,7 +655,7 @@ def compare_parts(
                 worst, body = np.argmax(part.ratios, axis=0), np.arange(part.errors.shape[1])
                 errors, bounds, effects = (x[worst, body] for x in (part.errors, part.bounds, part.effects))
                 found[f"step_{name}"].add(errors, bounds, effects, place)
-        if not model.has_chain_joints:  # the rows of its other joints off |p| = 1 are not written here
+        if not has_written_rows(model):
             continue
         if index not in first:
             solved = remembered_rounding_bound(model, states[index])
@@ -683,7 +684,7 @@ def constrained_deviations(
             for difference, bound, effect in _quadrature_differences(method, run, h, model.has_loops)
         ]
     }
-    if not model.has_chain_joints:  # the rows of its other joints off |p| = 1 are not written here
+    if not has_written_rows(model):
         return found
     residual = constrained_residual(model, method, run)
     allowed = np.maximum(method.solver_atol, method.solver_rtol * residual.size)

@@ -18,7 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plumbline.model.datatypes import Model, State, StepRun
-from plumbline.model.kinematics import cross, cross_matrix, quaternion_product, rotate_vectors
+from plumbline.model.kinematics import (
+    cross,
+    cross_matrix,
+    quaternion_conjugate,
+    quaternion_product,
+    rotate_vectors,
+)
 from plumbline.model.step_methods import ConstrainedMethod, JointSpaceMethod
 from plumbline.truth.step_charts import BodyStates, LongDouble, StepCharts
 
@@ -227,6 +233,11 @@ class ConstrainedResidual:
     size: Array  # (T,) norm of the largest terms, N and m or m/s
 
 
+def has_written_rows(model: Model) -> bool:
+    """Whether `constrained_residual` has the rows of all joints off |p| = 1: those of bare rods and balls."""
+    return not (model.has_joint_moments or model.has_loops or len(model.spring_body))
+
+
 def constrained_residual(model: Model, method: ConstrainedMethod, run: StepRun) -> ConstrainedResidual:
     """Evaluate Exudyn's equations of rigid bodies with Euler parameters at its answers.
 
@@ -252,47 +263,31 @@ def constrained_residual(model: Model, method: ConstrainedMethod, run: StepRun) 
     drag = model.drag_force.astype(LongDouble)[:, None] * v
     torque = rotate_vectors(A, np.broadcast_to(model.moment.astype(LongDouble), omega.shape))
     torque = torque - model.drag_moment.astype(LongDouble)[:, None] * world_rate
-    transpose = np.swapaxes(G, -1, -2)
-    gyroscopic = rotate_vectors(transpose, cross(omega, rotate_vectors(J, omega)))
-    applied = 2 * rotate_vectors(np.swapaxes(_world_rate_matrix(p), -1, -2), torque)
+    gyroscopic = rotate_vectors(G.mT, cross(omega, rotate_vectors(J, omega)))
+    applied = 2 * rotate_vectors(_world_rate_matrix(p).mT, torque)
+    turning = rotate_vectors(G.mT, rotate_vectors(J, rotate_vectors(G, qddot[..., 3:])))
+    C, gaps = _constraint_rows(model, q)
+    used = np.ones((model.n, 4), bool)
+    used[model.rods, 1:3] = False
+    held = rotate_vectors(C.mT, multipliers[:, used]).reshape(q.shape)
     terms = [
-        (
-            mass * qddot[..., :3],
-            rotate_vectors(transpose, rotate_vectors(J, rotate_vectors(G, qddot[..., 3:]))),
-        ),
-        (drag - model.force.astype(LongDouble) - gravity, gyroscopic - applied),
+        np.concatenate([mass * qddot[..., :3], turning], -1),
+        np.concatenate([drag - model.force.astype(LongDouble) - gravity, gyroscopic - applied], -1),
+        held,
     ]
-    near, far = model.proximal.astype(LongDouble), model.distal.astype(LongDouble)
-    d, ddot = _joint_differences(A, r, v, omega, near, far)
-    rods, length = model.rods, model.length.astype(LongDouble)[:, None]
-    distance = np.sqrt(np.sum(d * d, -1, keepdims=True))
-    along = d / np.where(rods[:, None], distance, LongDouble(1))
-    F = np.where(rods[:, None], along * multipliers[..., :1], multipliers[..., :3])
-    below = np.concatenate([F[..., 1:, :], np.zeros_like(F[..., :1, :])], -2)
-
-    def pushed(s: Array, force: Array) -> Array:
-        """(−A s̃ G)ᵀ F."""
-        return rotate_vectors(transpose, cross(s, rotate_vectors(np.swapaxes(A, -1, -2), force)))
-
-    terms.append((F - below, pushed(near, F) - pushed(far, below) + 2 * p * multipliers[..., 3:]))
-    if method.constraint_level == "position":
-        gaps = np.where(rods[:, None], distance - length, d)
-        norms = np.sum(p * p, -1, keepdims=True) - 1
-    else:
-        gaps = np.where(rods[:, None], np.sum(along * ddot, -1, keepdims=True), ddot)
-        norms = 2 * np.sum(p * pdot, -1, keepdims=True)
-    gaps = np.where(rods[:, None] & (np.arange(3) > 0), LongDouble(0), gaps)
+    if method.constraint_level == "velocity":
+        gaps = rotate_vectors(C, qdot.reshape(len(qdot), -1))
 
     def norm(*parts: Any) -> Array:
-        return np.asarray(np.sqrt(sum(np.sum(part**2, axis=(-2, -1)) for part in parts)), float)
+        return np.asarray(np.sqrt(sum(np.sum(part**2, axis=-1) for part in parts)), float)
 
-    sums = [sum(term[i] for term in terms) for i in range(2)]
-    lengths = np.abs(r).max(-1, keepdims=True) + np.abs(near).max() + np.abs(far).max() + length
-    sizes = [np.sqrt(sum(term[i] ** 2 for term in terms)) for i in range(2)]
+    far, near = np.abs(model.point).max(axis=(0, 2))
+    lengths = np.abs(r).max(-1) + far + near + model.length.astype(LongDouble)
+    flat = np.array(terms).reshape(len(terms), len(q), -1)
     return ConstrainedResidual(
-        residual=norm(*sums, gaps, norms),
-        first_residual=norm(*terms[1]),
-        size=norm(*sizes, np.broadcast_to(lengths, r[..., :1].shape)),
+        residual=norm(flat.sum(0), gaps),
+        first_residual=norm(flat[1]),
+        size=norm(*flat, lengths),
     )
 
 
@@ -328,7 +323,7 @@ def first_acceleration_bound(model: Model, method: ConstrainedMethod, state: Sta
     q̈ is off by |S⁻¹| times that.
 
     Args:
-        model: the chain.
+        model: a tree on bare rods and balls.
         method: whose ``difference_step`` is δ.
         state: where the step starts.
 
@@ -336,19 +331,22 @@ def first_acceleration_bound(model: Model, method: ConstrainedMethod, state: Sta
         (N,) largest error of a coordinate of each body [m/s² or 1/s²].
 
     """
-    n, q = model.n, np.concatenate([state.r, state.p], -1).ravel()
+    n, q = model.n, np.concatenate([state.r, state.p], -1)
     G = 2 * _body_rate_matrix(state.p)
-    rates = np.concatenate([state.v, 0.25 * rotate_vectors(np.swapaxes(G, -1, -2), state.omega)], -1).ravel()
+    rates = np.concatenate([state.v, 0.25 * rotate_vectors(G.mT, state.omega)], -1).ravel()
     M = np.zeros((7 * n, 7 * n))
     for k in range(n):
         positions, turns = slice(7 * k, 7 * k + 3), slice(7 * k + 3, 7 * k + 7)
         M[positions, positions], M[turns, turns] = model.mass[k] * np.eye(3), G[k].T @ model.inertia[k] @ G[k]
-    levers = np.linalg.norm(model.proximal, axis=-1) + np.linalg.norm(model.distal, axis=-1)
+    levers, on_body = np.zeros(n), model.body >= 0
+    np.add.at(levers, model.body[on_body], np.linalg.norm(model.point, axis=-1)[on_body])
     sizes = np.ones((n, 7))
     sizes[:, :3] = np.abs(state.r) + levers[:, None]
-    h = 1e-4 * np.eye(7 * n)  # the derivatives vary over lengths and angles of order 1: exact to 1e-8
-    C = _chain_constraint_rows(model, q)
-    after, before = (_chain_constraint_rows(model, q + change) @ rates for change in (h, -h))
+    h = 1e-4 * np.eye(7 * n).reshape(
+        -1, n, 7
+    )  # the derivatives vary over lengths and angles of order 1: exact to 1e-8
+    C = _constraint_rows(model, q)[0]
+    after, before = (_constraint_rows(model, q + change)[0] @ rates for change in (h, -h))
     first, second = np.abs(after - before).T / 2e-4, np.abs(after - 2 * C @ rates + before).T / 1e-8
     S = np.block([[M, C.T], [C, np.zeros((len(C), len(C)))]])
     speed = np.sqrt(_dependence(model) @ rates**2)
@@ -358,84 +356,55 @@ def first_acceleration_bound(model: Model, method: ConstrainedMethod, state: Sta
     return np.asarray(np.max(error.reshape(n, 7), axis=1))
 
 
-def _chain_constraint_rows(model: Model, q: Array) -> Array:
-    """C (..., rows, 7N) of a chain at q (..., 7N): of each body its joint's three rows or one, and |p|²."""
-    n = model.n
-    parts = q.reshape(*q.shape[:-1], n, 7)
-    r, p = parts[..., :3], parts[..., 3:]
+def _constraint_rows(model: Model, q: Array) -> tuple[Array, Array]:
+    """C (..., rows, 7N) and the gaps (..., rows) of a tree on bare rods and balls at q (..., N, 7).
+
+    Of each body in turn the rows of its joint, three or a rod's distance, and that of |p|².
+    """
+    r, p, n = q[..., :3], q[..., 3:], model.n
     A, G = _euler_parameter_rotation(p), 2 * _body_rate_matrix(p)
-    near, far = model.proximal, model.distal
-    here, there = (r + rotate_vectors(A, np.broadcast_to(s, r.shape)) for s in (near, far))
-    d, rows = here - _before(there), []
-    for k in range(n):
-        positions, turns = slice(7 * k, 7 * k + 3), slice(7 * k + 3, 7 * k + 7)
-        point, norm = np.zeros((*q.shape[:-1], 3, 7 * n)), np.zeros((*q.shape[:-1], 1, 7 * n))
-        point[..., positions], point[..., turns] = np.eye(3), _turning(A, G, near, k)
-        if k:
-            point[..., 7 * k - 7 : 7 * k - 4] = -np.eye(3)
-            point[..., 7 * k - 4 : 7 * k] = -_turning(A, G, far, k - 1)
-        norm[..., 0, turns] = 2 * p[..., k, :]
+    rows, gaps = list[Array](), list[Array]()
+    for k, (pair, points) in enumerate(zip(model.body, model.point.astype(q.dtype), strict=True)):
+        point, norm = np.zeros((*q.shape[:-2], 3, n, 7), q.dtype), np.zeros((*q.shape[:-2], 1, n, 7), q.dtype)
+        d = 0 * r[..., 0, :]
+        for b, s, sign in zip(pair, points, (-1, 1), strict=True):
+            if b >= 0:
+                point[..., b, :3] = sign * np.eye(3)
+                point[..., b, 3:] = -sign * A[..., b, :, :] @ cross_matrix(s) @ G[..., b, :, :]
+            d = d + sign * (r[..., b, :] + A[..., b, :, :] @ s if b >= 0 else s)
         if model.rods[k]:
-            across = d[..., k, None, :]
-            point = across / np.linalg.norm(across, axis=-1, keepdims=True) @ point
+            distance = np.sqrt(np.sum(d * d, -1, keepdims=True))
+            point = np.einsum("...i,...ijk->...jk", d / distance, point)[..., None, :, :]
+            d = distance - model.length[k].astype(q.dtype)
+        norm[..., 0, k, 3:] = 2 * p[..., k, :]
         rows += [point, norm]
-    return np.concatenate(rows, -2)
-
-
-def _turning(A: Array, G: Array, arm: Array, k: int) -> Array:
-    """(..., 3, 4) derivative of body k's point with arm (N, 3) by its Euler parameters."""
-    return -A[..., k, :, :] @ cross_matrix(arm[k]) @ G[..., k, :, :]
+        gaps += [d, np.sum(p[..., k, :] ** 2, -1, keepdims=True) - 1]
+    C = np.concatenate(rows, -3)
+    return C.reshape(*C.shape[:-2], -1), np.concatenate(gaps, -1)
 
 
 def _dependence(model: Model) -> Array:
     """(rows, 7N) whether a row of C changes with a coordinate, also where it is 0 at a state."""
     blocks = []
-    for k in range(model.n):
+    for k, pair in enumerate(model.body):
         joint, norm = np.zeros((2, model.n, 7), bool)
-        joint[max(k - 1, 0) : k + 1, 0 if model.rods[k] else 3 :] = True
+        joint[pair[pair >= 0], 0 if model.rods[k] else 3 :] = True
         norm[k, 3:] = True
         blocks += [joint.ravel()] * (1 if model.rods[k] else 3) + [norm.ravel()]
     return np.array(blocks)
 
 
-def _joint_differences(
-    A: Array, r: Array, v: Array, omega: Array, near: Array, far: Array
-) -> tuple[Array, Array]:
-    """Vectors (T, N, 3) from where each joint hangs to the body's proximal point, and their rates."""
-
-    def point(s: Array) -> tuple[Array, Array]:
-        arms = np.broadcast_to(s, r.shape)
-        return r + rotate_vectors(A, arms), v + rotate_vectors(A, cross(omega, arms))
-
-    (here, here_v), (there, there_v) = point(near), point(far)
-    return here - _before(there), here_v - _before(there_v)
-
-
-def _before(x: Array) -> Array:
-    """Value (..., n, 3) at the body before each body, 0 at the pivot."""
-    return np.concatenate([np.zeros_like(x[..., :1, :]), x[..., :-1, :]], -2)
-
-
 def _euler_parameter_rotation(p: Array) -> Array:
     """A(p) with the diagonal 1 − 2 (y² + z²), …: a rotation only where |p| = 1."""
-    w, x, y, z = np.moveaxis(p, -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, -1) for row in rows], -2)
+    excess = 1 - np.sum(p * p, -1)[..., None, None]
+    return np.asarray(_world_rate_matrix(p) @ _body_rate_matrix(p).mT + excess * np.eye(3))
 
 
 def _body_rate_matrix(p: Array) -> Array:
     """L(p) (..., 3, 4): ω′ = 2 L(p) ṗ."""
-    w, x, y, z = np.moveaxis(p, -1, 0)
-    rows = [[-x, w, z, -y], [-y, -z, w, x], [-z, y, -x, w]]
-    return np.stack([np.stack(row, -1) for row in rows], -2)
+    return quaternion_product(quaternion_conjugate(p)[..., None, :], np.eye(4))[..., 1:].mT
 
 
 def _world_rate_matrix(p: Array) -> Array:
     """E(p) (..., 3, 4): ω = 2 E(p) ṗ."""
-    w, x, y, z = np.moveaxis(p, -1, 0)
-    rows = [[-x, w, -z, y], [-y, z, w, -x], [-z, -y, x, w]]
-    return np.stack([np.stack(row, -1) for row in rows], -2)
+    return quaternion_product(np.eye(4), quaternion_conjugate(p)[..., None, :])[..., 1:].mT

@@ -14,7 +14,7 @@ from plumbline.engines.registry import load_adapter
 from plumbline.judging.rows import RowContext, Verdict
 from plumbline.judging.step_level import judge_steps
 from plumbline.measurements.single_steps import STEP_STATES, step_sizes
-from plumbline.model.datatypes import KINDS, SPRING_FIELDS
+from plumbline.model.datatypes import BALL, KINDS, ROD, SPRING_FIELDS
 from plumbline.model.kinematics import complete_state
 from plumbline.model.loops import STABILISATION
 from plumbline.model.random_mechanisms import random_loop_mechanism, random_tree
@@ -101,6 +101,20 @@ def test_honest_engines_take_the_declared_step(engine, joints):
         rows = judged(load_adapter(engine), integrator, model, states)
         assert not disagreeing(rows), [row.reason for row in rows]
         assert all(row.level == "step" and row.ratio < 1 for row in rows)
+
+
+def test_equations_of_a_branching_tree_of_rods_and_balls_are_compared():
+    model = random_tree(np.random.default_rng(2), 4, (ROD, BALL))
+    assert model.body[:, 0].tolist() == [-1, 0, 1, -1]
+    states, adapter = random_states(model, 2, seed=3), load_adapter("exudyn")
+    for integrator in methods("exudyn"):
+        answer = stepped(adapter, integrator, model, states)
+        rows = judge_steps(CONTEXT, integrator, model, states, answer).rows
+        assert {"step_equations", "step_first_acceleration"} <= {row.quantity for row in rows}
+        assert not disagreeing(rows), [row.reason for row in rows]
+        lighter = replace(model, mass=model.mass * [1, 1, 1 - 1e-6, 1])
+        wrong = disagreeing(judge_steps(CONTEXT, integrator, lighter, states, answer).rows)
+        assert wrong["step_equations"] > 1
 
 
 @cache
