@@ -16,7 +16,7 @@ from plumbline.engines.registry import ENGINES, load_adapter
 from plumbline.model.datatypes import EngineFailure, Unsupported
 from plumbline.model.invariants import first_departure, position_error
 from plumbline.scenario.loader import Scenario, find_scenario_file, load_scenario
-from plumbline.truth.proved_motion import ProvedMotion, find_proof
+from plumbline.truth.certificate_proof import ProvedMotion, find_proof
 
 TOLERANCE = 1e-12
 

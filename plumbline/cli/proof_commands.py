@@ -139,8 +139,7 @@ def _prove(
 ) -> tuple[dict[str, Any], bytes | None]:
     """Prove one scenario; keep the proof for runs; return its record and certificate."""
     from plumbline.execution.proofs import proved_radii
-    from plumbline.truth.certificate_proof import load_checker, prove_motion
-    from plumbline.truth.proved_motion import round_enclosure, store_proof
+    from plumbline.truth.certificate_proof import load_checker, prove_motion, round_enclosure, store_proof
 
     began, pair = time.process_time(), (scenario.model, scenario.state)
     record: dict[str, Any] = {"scenario": scenario.name}

@@ -1,4 +1,7 @@
-"""Kinds of numbers that the equations are evaluated in: what each offers, and NumPy's floating-point types.
+"""Kinds of numbers that the equations are evaluated in: what each offers.
+
+NumPy's floating-point types in batches, Python objects as expressions of heyoka and numbers of mpmath, and
+balls of python-flint, which enclose every rounding of their computation.
 
 Every quantity is a matrix: vectors have one column, scalars are what `Arithmetic.scalar` returns.  Sums,
 differences and products with scalars are the operators + − * of the matrices; quotients are of scalars.
@@ -10,6 +13,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol, cast
 
 import numpy as np
+
+from plumbline.model.datatypes import Array
 
 _NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])  # of each axis the next and the one after
 
@@ -125,3 +130,209 @@ class _Floats:
     def turn_over_sine(self, sine: Any, cosine: Any) -> Any:
         theta = np.arctan2(sine, cosine)
         return np.where(sine > 0, theta / np.where(sine > 0, sine, 1), 1)
+
+
+def objects(functions: Any, number: Callable[[Any], Any] = lambda x: x) -> Arithmetic:
+    """Take objects that can be added and multiplied.
+
+    Expressions that are 0 have to be Python's 0.0, which costs nothing: heyoka does not simplify a − a.
+
+    Args:
+        functions: a module with ``sqrt``, ``sin``, ``cos`` and, of numbers, ``atan2`` and ``sinc``.
+        number: what makes an object of a double.
+
+    Returns:
+        Operations on arrays of objects (rows, columns); scalars are the objects.
+
+    """
+    return cast(Arithmetic, _Objects(functions, number))
+
+
+class _Objects:
+    """As `objects`."""
+
+    def __init__(self, functions: Any, number: Callable[[Any], Any]) -> None:
+        self.functions, self.number, self.sqrt = functions, number, functions.sqrt
+
+    def scalar(self, x: Any) -> Any:
+        return self.number(np.asarray(x, object).item())
+
+    def vector(self, x: Any) -> Any:
+        return np.array([[self.number(e)] for e in x], object)
+
+    def matrix(self, x: Any) -> Any:
+        return np.array([[self.number(e) for e in row] for row in x], object)
+
+    def entry(self, x: Any, row: int, column: int = 0) -> Any:
+        return x[row, column]
+
+    def from_rows(self, rows: Sequence[Sequence[Any]]) -> Any:
+        return np.array(rows, object)
+
+    def columns(self, vectors: Sequence[Any]) -> Any:
+        return np.concatenate(vectors, 1)
+
+    def widened(self, x: Any, like: Any) -> Any:
+        return self.columns([x] + [np.full(x.shape, 0.0, object)] * (like.shape[1] - 1))
+
+    def assemble(self, size: int, blocks: Mapping[tuple[int, int], Any]) -> Any:
+        out = np.full((size, size), 0.0, object)
+        for (i, j), block in blocks.items():
+            out[i : i + block.shape[0], j : j + block.shape[1]] = block
+        return out
+
+    def mul(self, a: Any, b: Any) -> Any:
+        return a @ b
+
+    def transpose(self, a: Any) -> Any:
+        return a.T
+
+    def symmetric(self, a: Any) -> Any:
+        return np.where(np.tri(len(a), dtype=bool), a.T, a)
+
+    def dot(self, a: Any, b: Any) -> Any:
+        return (a.T @ b).item()
+
+    def cross(self, a: Any, b: Any) -> Any:
+        return np.cross(a, b, axis=0)
+
+    def cross_matrix(self, a: Any) -> Any:
+        x, y, z = a[:, 0]
+        return self.from_rows([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+    def inverse_parts(self, a: Any) -> tuple[Any, Any]:
+        cofactors = self.symmetric(np.cross(np.roll(a, -1, 1), np.roll(a, -2, 1), axis=0))
+        return cofactors, self.dot(a[:, :1], cofactors[:, :1])
+
+    def inverse(self, a: Any) -> Any:
+        cofactors, determinant = self.inverse_parts(a)
+        return cofactors * (1 / determinant)
+
+    def sin_cos(self, x: Any) -> tuple[Any, Any]:
+        return self.functions.sin(x), self.functions.cos(x)
+
+    def turn_over_sine(self, sine: Any, cosine: Any) -> Any:
+        return 1 / self.functions.sinc(self.functions.atan2(sine, cosine))
+
+
+def balls(flint: Any) -> Arithmetic:
+    """Take balls at the working precision of ``flint.ctx``.
+
+    Returns:
+        Operations on ``arb_mat``; scalars are ``arb``.
+
+    """
+    return cast(Arithmetic, _Balls(flint))
+
+
+class _Balls:
+    """As `balls`."""
+
+    def __init__(self, flint: Any) -> None:
+        self.mat, self.arb = flint.arb_mat, flint.arb
+
+    def scalar(self, x: Any) -> Any:
+        return self.arb(float(x))
+
+    def vector(self, x: Any) -> Any:
+        return self.mat(3, 1, [float(e) for e in x])
+
+    def matrix(self, x: Any) -> Any:
+        return self.mat(3, 3, [float(e) for e in np.ravel(x)])
+
+    def entry(self, x: Any, row: int, column: int = 0) -> Any:
+        return x[row, column]
+
+    def from_rows(self, rows: Sequence[Sequence[Any]]) -> Any:
+        return self.mat(len(rows), len(rows[0]), [e for row in rows for e in row])
+
+    def columns(self, vectors: Sequence[Any]) -> Any:
+        rows = range(vectors[0].nrows())
+        return self.mat(len(rows), len(vectors), [v[row, 0] for row in rows for v in vectors])
+
+    def widened(self, x: Any, like: Any) -> Any:
+        if like.ncols() == 1:
+            return x
+        out = self.mat(x.nrows(), like.ncols())
+        for row in range(x.nrows()):
+            out[row, 0] = x[row, 0]
+        return out
+
+    def assemble(self, size: int, blocks: Mapping[tuple[int, int], Any]) -> Any:
+        out = self.mat(size, size)
+        for (i, j), block in blocks.items():
+            for row in range(block.nrows()):
+                for column in range(block.ncols()):
+                    out[i + row, j + column] = block[row, column]
+        return out
+
+    def mul(self, a: Any, b: Any) -> Any:
+        return a * b
+
+    def transpose(self, a: Any) -> Any:
+        return a.transpose()
+
+    def symmetric(self, a: Any) -> Any:
+        return a
+
+    def dot(self, a: Any, b: Any) -> Any:
+        return a[0, 0] * b[0, 0] + a[1, 0] * b[1, 0] + a[2, 0] * b[2, 0]
+
+    def cross(self, a: Any, b: Any) -> Any:
+        (x, y, z), (u, v, w) = ((c[0, 0], c[1, 0], c[2, 0]) for c in (a, b))
+        return self.mat(3, 1, [y * w - z * v, z * u - x * w, x * v - y * u])
+
+    def cross_matrix(self, a: Any) -> Any:
+        x, y, z = a[0, 0], a[1, 0], a[2, 0]
+        return self.mat(3, 3, [0, -z, y, z, 0, -x, -y, x, 0])
+
+    def inverse(self, a: Any) -> Any:
+        return a.inv()
+
+    def inverse_parts(self, a: Any) -> tuple[Any, Any]:
+        return a.inv(), self.arb(1)
+
+    def sqrt(self, x: Any) -> Any:
+        return x.nonnegative_part().sqrt()
+
+    def sin_cos(self, x: Any) -> tuple[Any, Any]:
+        found: tuple[Any, Any] = x.sin_cos()
+        return found
+
+    def turn_over_sine(self, sine: Any, cosine: Any) -> Any:
+        return 1 / self.arb.atan2(sine, cosine).sinc()
+
+
+def entries(v: Any) -> list[Any]:
+    """List the balls of a matrix of one column.
+
+    Args:
+        v: an ``arb_mat`` (m, 1).
+
+    """
+    return list(v.entries())
+
+
+def flatten(ball: list[Any]) -> list[Any]:
+    """List all balls of a list or of a list of lists.
+
+    Args:
+        ball: balls, or lists of them.
+
+    """
+    return [x for row in ball for x in row] if isinstance(ball[0], list) else ball
+
+
+def midpoints(ball: list[Any]) -> Array:
+    """Return midpoints rounded to double.
+
+    Args:
+        ball: balls, or lists of them.
+
+    Returns:
+        An array of the list's shape.
+
+    """
+    return np.array(
+        [[float(x.mid()) for x in row] if isinstance(row, list) else float(row.mid()) for row in ball]
+    )

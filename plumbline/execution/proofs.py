@@ -15,16 +15,16 @@ from typing import Any
 from plumbline.processes.worker_pool import Limits, Task, WorkerPool
 from plumbline.scenario.line_and_column_errors import shorten
 from plumbline.scenario.loader import Scenario, catalogue, load_scenarios
-from plumbline.truth.certificate_file import Certificate, parse_certificate
+from plumbline.truth.certificate_file import MAX_BYTES, Certificate, MalformedCertificate, parse_certificate
 from plumbline.truth.certificate_proof import (
     certificate_digest,
+    find_proof,
     load_checker,
     numbers_digest,
     reason_not_provable,
+    store_proof,
 )
 from plumbline.truth.closed_form import exact_samples
-from plumbline.truth.compressed_json import MAX_BYTES, MalformedCertificate
-from plumbline.truth.proved_motion import find_proof, store_proof
 from plumbline.truth.trajectory_truth import prove_and_judge_claim
 
 TRUTH_TOOLS = ("flint", "heyoka", "mpmath")

@@ -43,9 +43,9 @@ from plumbline.processes.record_encoding import EncodedRecord
 from plumbline.processes.worker_pool import Outcome, Packed, Task
 from plumbline.scenario.loader import Scenario
 from plumbline.truth import ground_truth, has_independent_truth
+from plumbline.truth.certificate_proof import find_proof
 from plumbline.truth.closed_form import exact_samples
 from plumbline.truth.ground_truth import MotionTruth, StateTruth
-from plumbline.truth.proved_motion import find_proof
 
 _LEVELS: dict[TaskKind, Level] = {
     TaskKind.STATE: "state",

@@ -34,7 +34,9 @@ from plumbline.model.step_methods import classical_runge_kutta
 from plumbline.truth.parameter_effects import difference_effects, effects_at_states
 from plumbline.truth.parameters import STATE_KINDS, Parameter, list_parameters, perturb
 from plumbline.truth.predictability_horizon import project_to_manifold
-from plumbline.truth.reference_motions import (
+from plumbline.truth.rounding_bound import EPS, remembered_rounding_bound
+from plumbline.truth.step_comparison import FormulaSteps
+from plumbline.truth.trajectory_truth import (
     MOTION_MISTAKE,
     AccurateMotion,
     PerturbedMotion,
@@ -43,8 +45,6 @@ from plumbline.truth.reference_motions import (
     perturbed_motions,
     resolved_motions,
 )
-from plumbline.truth.rounding_bound import EPS, remembered_rounding_bound
-from plumbline.truth.step_comparison import FormulaSteps
 
 COVERED_LEVELS: tuple[Level, ...] = ("state", "step", "trajectory", "invariants")
 MAX_MISTAKE = 0.1  # of a parameter's scale: only larger ones are reported, or none; the level does not see it

@@ -203,7 +203,7 @@ def _first_doubt(
     model: Model, state: State, run: Trajectory | None, reduced: LongRun, seconds: float
 ) -> float | None:
     """When [s] a run may have come to a singular pose, its energy in range; inf where it failed in range."""
-    from plumbline.truth.regular_motion import first_doubt  # with SciPy: not in a run's own process
+    from plumbline.truth.trajectory_truth import first_doubt  # with SciPy: not in a run's own process
 
     if run is None:
         return np.inf
@@ -221,7 +221,7 @@ def _first_doubt(
 
 def _regular_length(model: Model, state: State, times: Array) -> tuple[float, str]:
     """The last sample [s] before the motion comes to a singular pose, and what to say of it."""
-    from plumbline.truth.regular_motion import regular_motion
+    from plumbline.truth.trajectory_truth import regular_motion
 
     try:
         regular = regular_motion(model, state, times)

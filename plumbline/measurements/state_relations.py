@@ -64,7 +64,7 @@ Evaluate = Callable[[Model, list[State]], list[StateQuantities]]
 
 def _terms_of_tendons(model: Model, state: State) -> dict[str, Array]:
     """Load what only this needs where it is needed: known issues are read at the start of every run."""
-    from plumbline.truth.tendon_equalities import effects_of_missing_terms
+    from plumbline.measurements.tendon_equalities import effects_of_missing_terms
 
     return effects_of_missing_terms(model, state)
 

@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from plumbline.equations.balls import balls, entries, flatten, midpoints
+from plumbline.equations.arithmetic import balls, entries, flatten, midpoints
 from plumbline.equations.tree import Tree
 from plumbline.importers.neutral_model import CanonicalState, ElementaryJoint, ModelQuantities, NeutralModel
 from plumbline.model.datatypes import KINDS, WELD, Array, Float, Kind, Model

@@ -1,17 +1,17 @@
 """Certificates of motions as files: compressed JSON with doubles as hexadecimal texts, read and validated.
 
-This file and `compressed_json` import numpy and the standard library only.  What it returns is what
+This file imports numpy and the standard library only.  What it returns is what
 `certificate_checker` proves a theorem about.
 """
 
 from __future__ import annotations
 
+import json
+import zlib
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-
-from plumbline.truth.compressed_json import MalformedCertificate, read_json
 
 FORMAT, VERSION = "plumbline enclosure certificate", 2
 MAX_BITS, MAX_BODIES, MAX_TERMS = 2000, 100, 401
@@ -135,3 +135,37 @@ def _doubles(data: dict[str, Any], field: str, shape: tuple[int, ...]) -> Array:
     sound = np.isfinite(numbers) & ((numbers == 0) | (np.abs(numbers) >= 1e-100))  # exact in any unit
     _expect(fits and np.all(sound), field, f"finite doubles as '0x1.8p+0', shape {shape}, not below 1e-100")
     return numbers
+
+
+MAX_BYTES = 256 * 2**20  # of the text: 30 s of two rods in octuple precision
+_INCOMPLETE = "not a complete gzip or JSON file"
+
+
+class MalformedCertificate(ValueError):
+    """The file is no certificate; the message names the field and what is valid."""
+
+
+def read_json(raw: bytes) -> Any:
+    """Decompress the one gzip member that the bytes may be, up to `MAX_BYTES`, and parse the JSON text.
+
+    Raises:
+        MalformedCertificate: the bytes are neither, too many, or followed by others.
+
+    """
+    stream = None
+    try:
+        if raw[:2] == b"\x1f\x8b":
+            stream = zlib.decompressobj(47)
+            raw = stream.decompress(raw, MAX_BYTES + 1)
+        if len(raw) > MAX_BYTES:
+            limit = f"{MAX_BYTES >> 20} MB, the largest size of a certificate"
+            raise MalformedCertificate(f"holds more than {limit}")
+        if stream is not None and not stream.eof:
+            raise MalformedCertificate(f"{_INCOMPLETE}: the compressed data are cut off")
+        if stream is not None and stream.unused_data:
+            raise MalformedCertificate("not one gzip file: bytes follow the end of the compressed data")
+        return json.loads(raw)
+    except MalformedCertificate:
+        raise
+    except (zlib.error, ValueError, RecursionError) as error:
+        raise MalformedCertificate(f"{_INCOMPLETE}: {error}") from None

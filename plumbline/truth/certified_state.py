@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from plumbline.equations.balls import balls as ball_arithmetic
-from plumbline.equations.balls import entries, flatten, midpoints
+from plumbline.equations.arithmetic import balls as ball_arithmetic
+from plumbline.equations.arithmetic import entries, flatten, midpoints
 from plumbline.equations.tree import Solution, Tree
 from plumbline.model.datatypes import Model, State, StateQuantities
 from plumbline.model.loops import determinate_part

@@ -20,8 +20,8 @@ from plumbline.model.kinematics import complete_state, stretched_length
 from plumbline.model.loops import MIN_MOTION_SINGULAR_VALUE, assembled
 from plumbline.model.sampling import derive_seed
 from plumbline.truth import TruthUnavailable
+from plumbline.truth.certificate_proof import ProvedMotion
 from plumbline.truth.certified_state import certify_state
-from plumbline.truth.proved_motion import ProvedMotion
 from plumbline.truth.rounding_bound import RoundingBound, rounding_bounds
 
 if TYPE_CHECKING:
@@ -168,7 +168,7 @@ def motion_truth(
 
 def _regular_times(model: Model, state: State, times: Array) -> tuple[Array, str]:
     """The sample times while the motion is regular, and why it ends before the last one."""
-    from plumbline.truth.regular_motion import regular_motion
+    from plumbline.truth.trajectory_truth import regular_motion
 
     regular = regular_motion(model, state, times)
     if not regular.is_singular:

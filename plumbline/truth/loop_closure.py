@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plumbline.equations.balls import balls as ball_arithmetic
-from plumbline.equations.balls import entries, midpoints
+from plumbline.equations.arithmetic import balls as ball_arithmetic
+from plumbline.equations.arithmetic import entries, midpoints
 from plumbline.equations.tree import Solution, Tree
 from plumbline.model.datatypes import KINDS, ZERO_INERTIA, Array, Model, State
 from plumbline.model.loops import CutMechanism, cut_open, independent_rows

@@ -26,7 +26,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from plumbline.equations import arithmetic, objects, tree
+from plumbline.equations import arithmetic, tree
 from plumbline.model.datatypes import (
     JOINT_ELEMENTS,
     KINDS,
@@ -311,7 +311,7 @@ class _PreciseTree(tree.Tree):
     def __init__(self, mp: Any, model: Model, state: State) -> None:
         self.angles: dict[int, Any] = {}
         self.mp = mp
-        super().__init__(objects.objects(mp, _exactly(mp)), model, state)
+        super().__init__(arithmetic.objects(mp, _exactly(mp)), model, state)
 
     def turn_over_sine(self, k: int, sine: Any, cosine: Any) -> Any:
         self.angles[k] = self.mp.atan2(self.mp.norm([*sine[:, 0]]), cosine)
@@ -364,7 +364,7 @@ def _compiled_integrator(structure: Structure, precision: Precision, order: int 
     It is remembered with its machine code: to read it takes a third to a quarter of the time of compiling it.
     """
     hy = load_heyoka()
-    sources = (__file__, tree.__file__, objects.__file__, arithmetic.__file__)
+    sources = (__file__, tree.__file__, arithmetic.__file__)
     code = b"".join(Path(file).read_bytes() for file in sources)
     key = content_key(
         "Taylor", code, hy.__version__, processor_features(), repr((structure, precision, order))
@@ -418,7 +418,7 @@ class _ExpressionTree(tree.Tree):
         body, springs = (np.array(x, np.intp).reshape(-1, 2) for x in (structure.body, structure.springs))
         turn = np.zeros((len(body), 2, 4), object)
         model = Model(kind=structure.kind, body=body, spring_body=springs, turn=turn, **found)
-        super().__init__(objects.objects(hy), model, None)  # type: ignore[arg-type]
+        super().__init__(arithmetic.objects(hy), model, None)  # type: ignore[arg-type]
 
     def column(self, k: int, name: str) -> Any:
         return self.num.vector(self.coordinates[k][name])

@@ -6,7 +6,7 @@ import pytest
 from plumbline.engines.registry import load_adapter
 from plumbline.model.datatypes import Unsupported
 from plumbline.model.invariants import compute_invariants, position_error
-from plumbline.truth.reference_motions import simulate_notes_form
+from plumbline.truth.trajectory_truth import simulate_notes_form
 from tests.helpers.catalogue import catalogue_scenarios
 from tests.helpers.nightly_tests import SLOW
 from tests.helpers.shared_answers import sharing

@@ -11,7 +11,7 @@ from plumbline.model.invariants import attitude_error, compute_invariants
 from plumbline.model.kinematics import complete_state
 from plumbline.model.random_mechanisms import random_tree
 from plumbline.model.sampling import random_states
-from plumbline.truth.reference_motions import simulate_notes_form
+from plumbline.truth.trajectory_truth import simulate_notes_form
 from tests.helpers.nightly_tests import SLOW
 from tests.helpers.shared_answers import sharing
 from tests.helpers.true_answers import converging_runs

@@ -13,7 +13,7 @@ from plumbline.cli.main import main
 from plumbline.execution.plan import Plan, TaskKey, TaskKind
 from plumbline.execution.scenario_verdicts import ScenarioRun
 from plumbline.scenario.loader import find_scenario_file, load_scenario
-from plumbline.truth import certificate_proof, proved_motion
+from plumbline.truth import certificate_proof
 from plumbline.truth.trajectory_truth import trajectory_truth
 
 pytestmark = pytest.mark.skipif(
@@ -204,11 +204,11 @@ def test_bad_usage_exits_with_2(words, message):
 def test_a_run_uses_the_proof_of_its_own_numbers_only():
     scenario = load_scenario(find_scenario_file("tumbling-ball"))
     times = scenario.times
-    found = proved_motion.find_proof(scenario.model, scenario.state, times)
+    found = certificate_proof.find_proof(scenario.model, scenario.state, times)
     assert found is None
     _, balls = certificate_proof.prove_motion(scenario.model, scenario.state, times)
-    proof = proved_motion.round_enclosure(balls)
-    proved_motion.store_proof(scenario.model, scenario.state, times, proof)
+    proof = certificate_proof.round_enclosure(balls)
+    certificate_proof.store_proof(scenario.model, scenario.state, times, proof)
 
     run = ScenarioRun(Plan([scenario], []), scenario, {})
     key = TaskKey(TaskKind.MOTION_TRUTH, scenario.name)
@@ -221,10 +221,10 @@ def test_a_run_uses_the_proof_of_its_own_numbers_only():
     distance = np.linalg.norm(usual.trajectory.r - proof.trajectory.r, axis=-1).max()
     assert distance <= usual.uncertainty["position"][-1] + truth.uncertainty["position"][-1]
 
-    assert proved_motion.find_proof(scenario.model, scenario.state, times[:-1]) is None
+    assert certificate_proof.find_proof(scenario.model, scenario.state, times[:-1]) is None
     mass = np.nextafter(scenario.model.mass, np.inf)
     other = scenario.model.changed(mass=mass)
-    assert proved_motion.find_proof(other, scenario.state, times) is None
+    assert certificate_proof.find_proof(other, scenario.state, times) is None
 
 
 def test_the_rounded_motion_is_within_its_radius():
@@ -232,7 +232,7 @@ def test_the_rounded_motion_is_within_its_radius():
     scenario = load_scenario(find_scenario_file("lagrange-top"))
     times = np.arange(5) * 0.02
     _, balls = certificate_proof.prove_motion(scenario.model, scenario.state, times)
-    proof = proved_motion.round_enclosure(balls)
+    proof = certificate_proof.round_enclosure(balls)
     for k in range(len(times)):
         for exact, rounded in zip(balls.r[k], proof.trajectory.r[k], strict=True):
             error = [abs(ball - float(x)) for ball, x in zip(exact, rounded, strict=True)]

@@ -6,7 +6,7 @@ import flint
 import numpy as np
 import pytest
 
-from plumbline.equations.balls import balls as ball_arithmetic
+from plumbline.equations.arithmetic import balls as ball_arithmetic
 from plumbline.equations.jets import jets, with_slopes
 from plumbline.equations.tree import Tree
 from plumbline.model.datatypes import KINDS

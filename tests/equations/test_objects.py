@@ -5,8 +5,7 @@ import mpmath
 import numpy as np
 import pytest
 
-from plumbline.equations.balls import balls
-from plumbline.equations.objects import objects
+from plumbline.equations.arithmetic import balls, objects
 from plumbline.equations.tree import Tree
 from plumbline.model.datatypes import KINDS
 from plumbline.model.random_mechanisms import ELEMENTS, random_tree

@@ -6,8 +6,8 @@ import flint
 import numpy as np
 import pytest
 
+from plumbline.equations.arithmetic import balls as ball_arithmetic
 from plumbline.equations.arithmetic import floats
-from plumbline.equations.balls import balls as ball_arithmetic
 from plumbline.equations.tree import Tree
 from plumbline.model.datatypes import KINDS, State
 from plumbline.model.loops import motion_without_inertia

@@ -11,8 +11,8 @@ from plumbline.execution.proofs import ProofSummary, prove_changed_motions
 from plumbline.processes.worker_pool import Limits
 from plumbline.scenario.loader import find_scenario_file, load_scenario
 from plumbline.truth import trajectory_truth
+from plumbline.truth.certificate_proof import find_proof
 from plumbline.truth.closed_form import exact_samples
-from plumbline.truth.proved_motion import find_proof
 
 pytestmark = pytest.mark.skipif(
     not all(map(find_spec, proofs.TRUTH_TOOLS)), reason="the truth tools are not installed"

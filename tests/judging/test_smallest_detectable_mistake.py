@@ -22,8 +22,8 @@ from plumbline.scenario import loader as scenarios
 from plumbline.studies.coverage_study import blind_spots, summarize_coverage
 from plumbline.truth.parameter_effects import effects_at_states
 from plumbline.truth.parameters import STATE_KINDS, list_parameters, perturb
-from plumbline.truth.reference_motions import accurate_runs, perturbed_motions, resolved_motions
 from plumbline.truth.rounding_bound import EPS, state_rounding_bound
+from plumbline.truth.trajectory_truth import accurate_runs, perturbed_motions, resolved_motions
 from tests.helpers.coverage_confirmation import coverage, is_reported, scenario, states
 from tests.helpers.nightly_tests import SLOW
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from plumbline.model.invariants import DEPARTURE
-from plumbline.truth.proved_motion import ProvedMotion
+from plumbline.truth.certificate_proof import ProvedMotion
 from reports import html_report
 from reports.earlier_runs import History
 from reports.report_data import PROVED

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from plumbline.truth import certificate_file, compressed_json
+from plumbline.truth import certificate_file
 from plumbline.truth.certificate_file import parse_certificate
 from tests.helpers.stored_certificates import NAMES, QUANTITIES, proved, stored_document
 
@@ -54,11 +54,10 @@ def test_the_checker_imports_numpy_flint_and_the_standard_library_only():
     standard = {"__future__", "collections.abc", "dataclasses", "fractions", "typing"}
     assert imported_modules(checker.__file__) == standard | {"numpy", "flint", certificate_file.__name__}
     standard = {"__future__", "dataclasses", "typing"}
-    assert imported_modules(certificate_file.__file__) == standard | {"numpy", compressed_json.__name__}
-    assert imported_modules(compressed_json.__file__) == {"__future__", "json", "zlib", "typing"}
+    assert imported_modules(certificate_file.__file__) == standard | {"json", "zlib", "numpy"}
 
 
-@pytest.mark.parametrize("name, most", [("certificate_checker", 300), ("certificate_file", 100)])
+@pytest.mark.parametrize("name, most", [("certificate_checker", 300), ("certificate_file", 130)])
 def test_the_checker_has_at_most_300_lines_of_code_and_its_reader_100(name, most):
     """Without docstrings, comments and blank lines."""
     source = Path(certificate_file.__file__).with_name(f"{name}.py").read_text(encoding="utf-8")

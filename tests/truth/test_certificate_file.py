@@ -7,8 +7,7 @@ from importlib.util import find_spec
 
 import pytest
 
-from plumbline.truth.certificate_file import parse_certificate
-from plumbline.truth.compressed_json import MalformedCertificate
+from plumbline.truth.certificate_file import MalformedCertificate, parse_certificate
 from tests.helpers.mutations import damaged_bytes, damaged_document, limited_time
 from tests.helpers.stored_certificates import FOLDER, many_joints, stored_document
 

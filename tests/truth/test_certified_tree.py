@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from adapters.reference_engine import Reference
-from plumbline.equations.balls import midpoints
+from plumbline.equations.arithmetic import midpoints
 from plumbline.model.datatypes import KINDS
 from plumbline.model.kinematics import complete_state, spring_vectors, state_from_minimal
 from plumbline.model.random_mechanisms import ELEMENTS, random_loop_mechanism, random_tree

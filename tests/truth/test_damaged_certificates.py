@@ -8,9 +8,8 @@ from functools import cache
 
 import pytest
 
-from plumbline.truth.certificate_file import parse_certificate
+from plumbline.truth.certificate_file import MalformedCertificate, parse_certificate
 from plumbline.truth.certificate_proof import certificate_digest
-from plumbline.truth.compressed_json import MalformedCertificate
 from tests.helpers.mutations import damaged_bytes, damaged_document, limited_time
 from tests.helpers.stored_certificates import FOLDER, NAMES, QUANTITIES, stored_document
 

@@ -12,10 +12,14 @@ from plumbline.model.loops import assembled, loop_gaps, smallest_singular_value
 from plumbline.model.random_mechanisms import random_loop_mechanism
 from plumbline.truth.ground_truth import motion_truth, perturbed_models
 from plumbline.truth.predictability_horizon import perturbation_growth, perturbed_states
-from plumbline.truth.reference_motions import simulate_notes_form
-from plumbline.truth.regular_motion import RTOL, first_doubt, regular_motion
 from plumbline.truth.taylor import simulate_taylor
-from plumbline.truth.trajectory_truth import trajectory_truth
+from plumbline.truth.trajectory_truth import (
+    REGULARITY_RTOL,
+    first_doubt,
+    regular_motion,
+    simulate_notes_form,
+    trajectory_truth,
+)
 from tests.helpers.catalogue import catalogue_scenarios
 
 pytestmark = pytest.mark.skipif(
@@ -113,7 +117,7 @@ def test_a_motion_ends_before_its_singular_pose(motions):
     times = regular.times[:5]
     run = simulate_taylor(regular.model, regular.state, times)
     value = smallest_singular_value(regular.model, state_at(regular, run, 4))
-    near = pytest.approx(value, rel=1e3 * RTOL)  # of a motion followed with this tolerance
+    near = pytest.approx(value, rel=1e3 * REGULARITY_RTOL)  # of a motion followed with this tolerance
     assert regular_motion(regular.model, regular.state, times) == (times[4], False, near)
 
 

@@ -21,7 +21,7 @@ from plumbline.truth.predictability_horizon import (
     predictability_horizon,
     project_to_manifold,
 )
-from plumbline.truth.reference_motions import simulate_notes_form
+from plumbline.truth.trajectory_truth import simulate_notes_form
 from tests.helpers import pendulums
 from tests.helpers.catalogue import catalogue_scenarios
 from tests.helpers.random_chains import random_chain

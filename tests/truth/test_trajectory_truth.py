@@ -15,9 +15,13 @@ from plumbline.truth import ground_truth
 from plumbline.truth import trajectory_truth as trajectory
 from plumbline.truth.certified_state import certify_state
 from plumbline.truth.closed_form import closed_form_motion
-from plumbline.truth.reference_motions import simulate_notes_form
 from plumbline.truth.taylor import load_heyoka, simulate_taylor
-from plumbline.truth.trajectory_truth import MAX_EXTENDED_PRECISION_BODIES, NOTES_RTOL, trajectory_truth
+from plumbline.truth.trajectory_truth import (
+    MAX_EXTENDED_PRECISION_BODIES,
+    NOTES_RTOL,
+    simulate_notes_form,
+    trajectory_truth,
+)
 from tests.helpers.catalogue import catalogue_scenarios
 from tests.helpers.nightly_tests import fast_are
 from tests.helpers.random_chains import random_chain

@@ -17,9 +17,8 @@ from plumbline.truth import trajectory_truth as trajectory
 from plumbline.truth.closed_form.tops_and_pendulums import free_top, planar_pendulum
 from plumbline.truth.ground_truth import perturbed_models
 from plumbline.truth.predictability_horizon import perturbation_growth, perturbed_states, project_to_manifold
-from plumbline.truth.reference_motions import simulate_notes_form
 from plumbline.truth.taylor import simulate_taylor
-from plumbline.truth.trajectory_truth import NOTES_RTOL, trajectory_truth
+from plumbline.truth.trajectory_truth import NOTES_RTOL, simulate_notes_form, trajectory_truth
 from reference_impl.joints import constraint_rows
 from tests.helpers.nightly_tests import SLOW
 

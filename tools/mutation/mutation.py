@@ -95,10 +95,7 @@ TARGETS = {
         *(f"plumbline/diagnosis/{name}.py" for name in ("diagnose", "fit")),
         "plumbline/model/invariants.py",
     ],
-    "checker": [
-        f"plumbline/truth/{name}.py"
-        for name in ("certificate_checker", "certificate_file", "compressed_json")
-    ],
+    "checker": [f"plumbline/truth/{name}.py" for name in ("certificate_checker", "certificate_file")],
     "prover": ["plumbline/truth/certificate_proof.py"],
     "equations": ["plumbline/equations/*.py", "plumbline/truth/definition.py"],
 }
