@@ -182,6 +182,21 @@ def _run_rows(
     ]
 
 
+def _left_out_words(found: StepDeviations, unit: str) -> tuple[str, float]:
+    """What a row says of the steps without a bound, and how many of them are off by more than one."""
+    left_out = found.is_left_out
+    reasons, numbers = np.unique(found.left_out[left_out], return_counts=True)
+    causes = [f"{number} ({why})" for why, number in zip(reasons, numbers, strict=True)]
+    off = found.ratios_of_all[left_out]
+    is_off = ~(off <= 1)
+    wrong = int(np.count_nonzero(np.any(is_off, axis=1)))
+    words = f"; {np.count_nonzero(left_out)} steps have no bound: {', '.join(causes)}"
+    if wrong:
+        size = float(np.max(found.errors[left_out][is_off]))
+        words += f", of which {wrong} differ by more than one would allow, at most by {size:.3g} {unit}"
+    return words, float(wrong)
+
+
 def _time(run: StepRun, index: int, _: int) -> str:
     return f"t = {run.trajectory.t[index]:.6g} s"
 
@@ -195,9 +210,10 @@ def _run_row(
     ratios = np.where(np.isnan(ratios), np.inf, ratios)
     worst, column = (int(x) for x in np.unravel_index(np.argmax(ratios), ratios.shape))
     ratio, wrong = float(ratios[worst, column]), np.flatnonzero(np.any(ratios > 1, axis=1))
-    has_bodies, count = quantity not in TOTALS, len(ratios)
+    has_bodies, count, left_out = quantity not in TOTALS, len(ratios), found.is_left_out
     body = column if has_bodies else 0
     sharp = (found.bounds <= MAX_STEP_BOUND * found.effects) | (found.effects == 0)
+    sharp &= ~left_out[:, None]
     extra = {"step": h, "worst_step": worst + 1.0, "comparisons": float(ratios.size)}
     what = f"{name} of {count} steps of {h:.4g} s"
     if ratio > 1:
@@ -221,22 +237,17 @@ def _run_row(
     elif np.mean(sharp) < 0.5:
         verdict = Verdict.INFORMATION  # single steps are larger, and decide
         reason = (
-            f"not compared: at {np.mean(~sharp):.0%} of the steps the rounding bound is above "
+            f"not compared: at {np.mean(~sharp):.0%} of the steps there is no bound, or it is above "
             f"{MAX_STEP_BOUND:g} of the accelerations' effect, too loose to detect an error"
         )
     else:
         verdict = Verdict.AGREES
         reason = f"{what} within {ratio:.2g} of the rounding bound, each from the sample before"
-        if left_out := int(np.count_nonzero(np.any(np.isinf(found.bounds), axis=1))):
-            size = float(np.max(found.errors[np.isinf(found.bounds)]))
-            extra["left_out_steps"] = float(left_out)
-            reason += (
-                f"; {left_out} of them are not compared, since something differs there (this quantity by up "
-                f"to {size:.3g} {unit}) and the step does not resolve the motion, a body is far away, or "
-                "angles are near their singular pose"
-            )
         if quantity == "run_mean":
             reason = f"no direction in the deviations of the steps: {ratio:.2g} of what rounding explains"
+    if quantity != "run_mean" and (number := int(np.count_nonzero(left_out))):
+        words, extra["left_out_steps"] = _left_out_words(found, unit), float(number)
+        reason, extra["left_out_wrong_steps"] = reason + words[0], words[1]
     return context.make_row(
         "step", integrator.name, quantity, verdict, reason, unit,
         value=float(found.errors[worst, column]), tolerance=float(found.bounds[worst, column]), ratio=ratio,
