@@ -40,6 +40,7 @@ NO_COORDINATES = (
     "not compared: the adapter returns no coordinates with the samples, from which the next step could start"
 )
 TOTALS = ("run_energy", "run_momentum", "run_equations")  # of the whole mechanism
+DECISIVE = ({"run_velocity", "run_rate"}, {"run_equations"})  # sets of rows
 MAX_STEP_BOUND = 1e-6  # of the accelerations' effect; a looser bound could hide a mistake
 
 
@@ -63,6 +64,23 @@ def judge_steps(
         if any(row.quantity == "all" for row in rows):  # why nothing is compared
             return JudgingResult(rows)
     return JudgingResult([*rows, *_run_rows(context, integrator, model, states[0], answer)])
+
+
+def decides_without_study(rows: Sequence[Row]) -> bool:
+    """Find out whether the steps of a run decide, so that a refinement study of low order adds nothing.
+
+    Args:
+        rows: of `judge_steps`, of one integrator.
+
+    Returns:
+        Whether no row needs attention, every step that differs has a bound, and rows agree in which every
+        number of the mechanism shows: rates of bodies, or the equations of motion.
+
+    """
+    agreeing = {row.quantity for row in rows if row.verdict == Verdict.AGREES}
+    if any(row.verdict.needs_attention or row.extra.get("left_out_wrong_steps") for row in rows):
+        return False
+    return any(agreeing >= needed for needed in DECISIVE)
 
 
 def _single_step_rows(

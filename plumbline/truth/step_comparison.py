@@ -617,6 +617,12 @@ class StepsFromSamples:
         return max(float(np.max(x / (2 * self.of_samples[name][0]))) for name, x in off.items())
 
 
+def _directions(vectors: Array) -> Array:
+    """Unit vectors (..., 3); 0 of 0."""
+    size = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.asarray(vectors / np.where(size > 0, size, 1.0))
+
+
 def _sizes_of(difference: Array) -> Array:
     """Sizes (S,) of numbers (S,) or vectors (S, 3)."""
     x = np.asarray(difference, float)
@@ -710,15 +716,17 @@ class RunSteps(StepsFromSamples):
         return np.select([where for where, _ in reasons], [why for _, why in reasons], "")
 
     def _mean(self, off: dict[str, Array], found: dict[str, StepDeviations]) -> StepDeviations:
-        """Mean over the run of the deviations of rates along what the step changes, over what explains it.
+        """Mean over the run of the deviations of rates in one direction, over what explains it.
 
-        A mistake that is smaller than the rounding of one step has one direction in all of them.  What is
-        rounded alike in all steps are constants.  In a bound of rates, 32 ε per joint: three constant
-        rotations (of the joint in both bodies, of the inertia's axes) of five roundings each, at most 16.  In
-        64 ε of each term of the equations: four constant factors (a mass, two arms, an inertia), each off by
-        at most three (stored, turned, summed), 12, at one stage of the three in `ACCELERATION_FACTOR`.
-        Chance is bounded with the probability `MEAN_ALARM` by the empirical Bernstein inequality, from the
-        sample variance and the largest deviation (Maurer and Pontil, COLT 2009, theorem 4).
+        A mistake that is smaller than the rounding of one step has one direction in all of them: that of what
+        the step changes (masses), of the rate (drag), or of an axis (of the world for velocities, as gravity
+        and forces; of the body for its rate, as moments).  What is rounded alike in all steps are constants.
+        In a bound of rates, 32 ε per joint: three constant rotations (of the joint in both bodies, of the
+        inertia's axes) of five roundings each, at most 16.  In 64 ε of each term of the equations: four
+        constant factors (a mass, two arms, an inertia), each off by at most three (stored, turned, summed),
+        12, at one stage of the three in `ACCELERATION_FACTOR`.  Chance is bounded with the probability
+        `MEAN_ALARM` by the empirical Bernstein inequality, from the sample variance and the largest deviation
+        (Maurer and Pontil, COLT 2009, theorem 4).
         """
         before, means, kept = self.here, list[Array](), ~found["run_rate"].is_left_out
         n = np.count_nonzero(kept)
@@ -729,15 +737,17 @@ class RunSteps(StepsFromSamples):
         often = np.log(4 / MEAN_ALARM)
         for name, field_name in (("rate", "omega"), ("velocity", "v")):
             change = np.asarray(getattr(self.after, field_name) - getattr(before, field_name)[:-1], float)
-            size = np.linalg.norm(change, axis=-1)
-            along = (np.sum(off[f"step_{name}"] * change, -1) / np.where(size > 0, size, 1.0))[kept]
+            own = np.asarray(getattr(before, field_name)[:-1], float)
+            deviations = off[f"step_{name}"][kept]
+            directed = [np.sum(deviations * x[kept], -1) for x in (_directions(change), _directions(own))]
+            along = np.stack([*directed, *np.moveaxis(deviations, -1, 0)], 1)  # (steps, 5, N)
             of_step = found[f"run_{name}"].bounds[kept]
             rounding = np.minimum(self.of_samples[f"step_{name}"][:-1][kept], of_step)
             constant = CONSTANT_ROUNDINGS * rounding + CONSTANT_FACTORS * (of_step - rounding)
             chance = np.std(along, axis=0, ddof=1) * np.sqrt(2 * often / n)
             chance += 7 * 2 * np.max(np.abs(along), axis=0) * often / (3 * (n - 1))
             allowed = np.mean(constant, axis=0) + chance
-            means.append(np.abs(np.mean(along, axis=0)) / np.maximum(allowed, TINY))
+            means += list(np.abs(np.mean(along, axis=0)) / np.maximum(allowed, TINY))
         mean = np.max(means, axis=0)[None]
         return StepDeviations(mean, np.ones_like(mean), np.full_like(mean, np.inf))
 
