@@ -56,8 +56,8 @@ _LEVELS: dict[TaskKind, Level] = {
 }
 LOW_ORDER = 2  # studies up to it cost most and see least: docs/coverage.md
 LEFT_TO_THE_NIGHT = (
-    "not run: every step of a run agrees with the declared formula, which sees smaller mistakes; of this "
-    "family the study of {} runs, and a nightly or `run --level trajectory` runs all"
+    "not run: every step of a run is compared with the declared formula, which sees smaller mistakes; of "
+    "this family the study of {} runs, and a nightly or `run --level trajectory` runs all"
 )
 LIFTED = ("acceleration", "angular_acceleration")  # computed here where an engine returns those of its joints
 NO_INDEPENDENT_TRUTH = "no independent truth: python-flint is not installed, and the reference is no judge"

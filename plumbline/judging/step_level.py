@@ -40,7 +40,11 @@ NO_COORDINATES = (
     "not compared: the adapter returns no coordinates with the samples, from which the next step could start"
 )
 TOTALS = ("run_energy", "run_momentum", "run_equations")  # of the whole mechanism
-DECISIVE = ({"run_velocity", "run_rate"}, {"run_equations"})  # sets of rows
+DECISIVE = {"run_velocity", "run_rate"}  # rows
+DECIDED, UNDECIDED = (
+    {Verdict.AGREES, Verdict.DISAGREES},
+    {Verdict.UNRESOLVED, Verdict.FAILED, Verdict.HARNESS_FAILED},
+)
 MAX_STEP_BOUND = 1e-6  # of the accelerations' effect; a looser bound could hide a mistake
 
 
@@ -73,14 +77,13 @@ def decides_without_study(rows: Sequence[Row]) -> bool:
         rows: of `judge_steps`, of one integrator.
 
     Returns:
-        Whether no row needs attention, every step that differs has a bound, and rows agree in which every
-        number of the mechanism shows: rates of bodies, or the equations of motion.
+        Whether the rates of all bodies, in which every number of the mechanism shows, are compared at every
+        step that differs, and no row failed or is unresolved.
 
     """
-    agreeing = {row.quantity for row in rows if row.verdict == Verdict.AGREES}
-    if any(row.verdict.needs_attention or row.extra.get("left_out_wrong_steps") for row in rows):
+    if any(row.verdict in UNDECIDED or row.extra.get("left_out_wrong_steps") for row in rows):
         return False
-    return any(agreeing >= needed for needed in DECISIVE)
+    return {row.quantity for row in rows if row.verdict in DECIDED} >= DECISIVE
 
 
 def _single_step_rows(

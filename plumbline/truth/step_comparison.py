@@ -7,10 +7,10 @@ of any link up to body k, n its place among the links, ℓ the chain's stretched
     ω′  3 h (b_α + c) + 32 ε n W        ṙ  3 h (b_a + c ℓ) + 32 ε n max(V, W ℓ)
     p   h (bound of ω′) + 32 ε n          r  h (bound of ṙ) + 32 ε n ℓ
 
-b holds the error of the accelerations, the factor 3 the stages elsewhere, the second term the roundings of
-quaternion products and of the way from joint rates to the bodies', c = h W Σ (b_α of the links before, and of
-rods about their own axes) what relative rates pass on.  Ten steps: the sum over the steps, times
-the growth of perturbations, as one.
+b holds the error of the accelerations, the engine's and the formula's own, the factor 3 the stages
+elsewhere, the second term the roundings of quaternion products and of the way from joint rates to the
+bodies', c = h W Σ (b_α of the links before, and of rods about their own axes) what relative rates pass on.
+Ten steps: the sum over the steps, times the growth of perturbations, as one.
 
 Of loops b is larger by what the roundings of gaps and of their rates (32 ε (ℓ′, 1) and 32 ε (V + W ℓ′, W) in
 length and angle, ℓ′ the mechanism's size) leave in accelerations, a² and 2 a times their sum with the
@@ -29,6 +29,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from plumbline.equations.arithmetic import floats
+from plumbline.equations.tree import Tree
 from plumbline.model.datatypes import KINDS, Array, Kind, Model, State, StepRun, Trajectory
 from plumbline.model.kinematics import (
     angular_velocity,
@@ -49,7 +51,7 @@ from plumbline.truth.rounding_bound import (
     remembered_rounding_bound,
     rounding_bounds,
 )
-from plumbline.truth.step_charts import BodyStates, StepCharts
+from plumbline.truth.step_charts import BodyStates, LongDouble, StepCharts
 from plumbline.truth.step_formulas import (
     constrained_quadrature,
     constrained_residual,
@@ -72,7 +74,8 @@ MAX_STRETCH = 2e-15  # of a joint's quaternions
 MIN_MIDDLE_COSINE = 0.1  # of the second of two or three angles: at 0 two of their axes are one
 MAX_COSINE_CHANGE = 1 / 2  # of that cosine in a step, over itself
 MAX_TURN = 1.0  # rad, step × fastest rate: beyond it explicit methods become unstable, and bounds do not hold
-RATE_STRIDE = 8  # of the samples at which the fastest rate is estimated
+SAMPLE_STRIDE = 8  # of the samples at which what changes slowly is estimated: rates, the formula's own errors
+LOST_DIGITS = 4.0  # by how much errors of one size may differ by chance
 # Roundings that are alike in all steps, of those in a bound: see `RunSteps._mean`.
 CONSTANT_ROUNDINGS, CONSTANT_FACTORS = 16 / STEP_ROUNDINGS, 12 / ROUNDING_FACTOR / ACCELERATION_FACTOR
 MEAN_ALARM = 1e-9  # how probable it is that chance alone passes the bound of a mean
@@ -290,11 +293,19 @@ class FormulaSteps:
 def acceleration_bounds(
     method: JointSpaceMethod, model: Model, states: Sequence[State]
 ) -> list[RoundingBound]:
-    """Compute the state level's bounds, and what the correction of gaps adds to its accelerations."""
+    """Compute the bounds of accelerations in steps.
+
+    Returns:
+        The state level's, and what the correction of gaps adds, or on trees the formula's own errors.
+
+    """
     bounds, rate = rounding_bounds(model, states), method.gap_correction
-    if not (model.has_loops and rate):
+    if model.has_loops and not rate:
         return bounds
-    added = _correction_roundings(model, stack_states(states), rate)
+    if model.has_loops:
+        added = _correction_roundings(model, stack_states(states), rate)
+    else:
+        added = _formula_errors(model, states)
     return [
         replace(b, acceleration=b.acceleration + a, angular_acceleration=b.angular_acceleration + alpha)
         for b, (a, alpha) in zip(bounds, added, strict=True)
@@ -388,6 +399,36 @@ def _sample_bound(method: JointSpaceMethod, model: Model, sizes: dict[str, Array
     lever = bound["step_position"] / np.maximum(bound["step_attitude"], TINY)
     bound |= {"step_rate": turned, "step_velocity": bound["step_velocity"] + turned * lever}
     return {name: np.maximum(x, TINY) for name, x in bound.items()}
+
+
+def _formula_errors(model: Model, states: Sequence[State]) -> Array:
+    """(S, 2, N) errors of r̈ and ω̇′ by the formula itself, in extended precision.
+
+    Its recursion loses digits where light bodies carry heavy ones, as in doubles, where the same loss shows
+    and is larger by the ratio of the two precisions.  Of the samples of a run, the largest loss counts.
+    """
+    some = _every_few(len(states))
+    state, found = stack_states([states[n] for n in some]), list[Any]()
+    for dtype in (np.float64, LongDouble):
+        tree = Tree(floats(dtype), model, state)
+        quantities = tree.quantities(tree.solve())
+        found.append([quantities[name] for name in ("acceleration", "angular_acceleration")])
+    size = np.linalg.norm(np.asarray(np.array(found[0]) - np.array(found[1]), float)[..., 0], axis=-1)
+    share = float(np.finfo(LongDouble).eps / np.finfo(float).eps)
+    lost = LOST_DIGITS * share * np.moveaxis(size, -1, 0)
+    return lost if len(some) == len(states) else np.tile(np.max(lost, axis=0), (len(states), 1, 1))
+
+
+def _every_few(count: int) -> NDArray[np.intp]:
+    """Indices of every `SAMPLE_STRIDE`-th of so many samples, and of the last; of few, all."""
+    stride = SAMPLE_STRIDE if count > 4 * SAMPLE_STRIDE else 1
+    return np.unique(np.append(np.arange(0, count, stride), count - 1))
+
+
+def _spread(values: Array, some: NDArray[np.intp]) -> Array:
+    """Give each sample the larger of the two values around it, of those at some samples."""
+    at = np.searchsorted(some, np.arange(some[-1] + 1))
+    return np.maximum(values[at], values[np.maximum(at - 1, 0)])
 
 
 def _correction_roundings(model: Model, states: State, rate: float) -> Array:
@@ -699,13 +740,12 @@ class RunSteps(StepsFromSamples):
 
         The step does not resolve the motion there, or angles are near the pose in which two of their axes are
         one: at a cosine below `MIN_MIDDLE_COSINE`, or that a step changes by `MAX_COSINE_CHANGE` of itself.
-        The fastest rate is estimated at every `RATE_STRIDE`-th sample and counts up to the next ones.
+        The fastest rate is estimated at every `SAMPLE_STRIDE`-th sample and counts up to the next ones.
         """
-        count = len(self.states) - 1
-        some = np.unique(np.append(np.arange(0, count, RATE_STRIDE), count))
+        some = _every_few(len(self.states))
         with np.errstate(all="ignore"):
             rates = fastest_rates(self.model, [self.states[n] for n in some])
-        fast = np.repeat(np.maximum(rates[:-1], rates[1:]), np.diff(some)) * self.h > MAX_TURN
+        fast = _spread(rates, some)[1:] * self.h > MAX_TURN
         cosine = self.middle_cosine
         change = self.h * self.fastest / np.maximum(cosine, TINY)
         singular = (cosine < 1) & ((cosine < MIN_MIDDLE_COSINE) | (change > MAX_COSINE_CHANGE * cosine))
