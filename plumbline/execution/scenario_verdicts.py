@@ -54,10 +54,11 @@ _LEVELS: dict[TaskKind, Level] = {
     TaskKind.TRAJECTORY: "trajectory",
     TaskKind.LONG_RUN: "invariants",
 }
-LOW_ORDER = 2  # studies up to it cost most and see least: docs/coverage.md
+LOW_ORDER = 2  # studies up to it cost most
 LEFT_TO_THE_NIGHT = (
-    "not run: every step of a run is compared with the declared formula, which sees smaller mistakes; of "
-    "this family the study of {} runs, and a nightly or `run --level trajectory` runs all"
+    "not run: every step of a run is compared with the declared formula, which in so fast a motion detects "
+    "smaller mistakes; of this family the study of {} runs, and a nightly or `run --level trajectory` runs "
+    "all"
 )
 LIFTED = ("acceleration", "angular_acceleration")  # computed here where an engine returns those of its joints
 NO_INDEPENDENT_TRUTH = "no independent truth: python-flint is not installed, and the reference is no judge"
@@ -298,7 +299,7 @@ class ScenarioRun:
         study = replace(steps, kind=TaskKind.TRAJECTORY)
         if study not in self._keys or self._awaited_steps(study) is None:
             return []
-        if not decides_without_study(rows):
+        if not decides_without_study(rows, self._resolutions(self._integrator(study))[0]):
             return [self._cell_task(study)] if study.needed_truth in self.truths else []
         reason = LEFT_TO_THE_NIGHT.format(self._plan.studied[self.scenario.family])
         row = self._context(study.engine).make_row(
@@ -416,14 +417,17 @@ class ScenarioRun:
         if key.kind == TaskKind.STEP:
             return run_step_study, (integrator, s.model, self._step_states)
         if key.kind == TaskKind.TRAJECTORY:
-            steps = refinement_resolutions(
-                integrator, s.model.n, s.duration, plan.extra_refinements, s.sample_interval
-            )
+            steps = self._resolutions(integrator)
             truth = self.truths.get(TaskKind.MOTION_TRUTH)  # ends before a singular pose
             times = truth.trajectory.t if isinstance(truth, MotionTruth) else s.times
             return run_refinement_study, (integrator.name, s.model, s.state, times, steps)
         length = plan_long_run(integrator, s.model.n, plan.long_run_seconds, s.sample_interval, s.duration)
         return run_long_run_study, (integrator.name, s.model, s.state, s.sample_interval, length)
+
+    def _resolutions(self, integrator: Integrator) -> list[float]:
+        """The steps or tolerances of a refinement study, coarse to fine."""
+        s, finer = self.scenario, self._plan.extra_refinements
+        return refinement_resolutions(integrator, s.model.n, s.duration, finer, s.sample_interval)
 
     def _judge(self, key: TaskKey) -> tuple[Callable[..., JudgingResult] | None, tuple[Any, ...]]:
         """The function that judges a cell's answer in the worker, and its arguments; None without a truth."""

@@ -41,6 +41,8 @@ NO_COORDINATES = (
 )
 TOTALS = ("run_energy", "run_momentum", "run_equations")  # of the whole mechanism
 DECISIVE = {"run_velocity", "run_rate"}  # rows
+# rad, coarsest step × fastest rate up to which limits may be known to rounding: measured, docs/coverage.md
+MAX_RESOLVED_TURN = 1 / 20
 DECIDED, UNDECIDED = (
     {Verdict.AGREES, Verdict.DISAGREES},
     {Verdict.UNRESOLVED, Verdict.FAILED, Verdict.HARNESS_FAILED},
@@ -70,20 +72,26 @@ def judge_steps(
     return JudgingResult([*rows, *_run_rows(context, integrator, model, states[0], answer)])
 
 
-def decides_without_study(rows: Sequence[Row]) -> bool:
+def decides_without_study(rows: Sequence[Row], coarsest: float) -> bool:
     """Find out whether the steps of a run decide, so that a refinement study of low order adds nothing.
 
     Args:
         rows: of `judge_steps`, of one integrator.
+        coarsest: step of the study [s].
 
     Returns:
         Whether the rates of all bodies, in which every number of the mechanism shows, are compared at every
-        step that differs, and no row failed or is unresolved.
+        step that differs, no row failed or is unresolved, and the motion is too fast for the study's limit
+        to be known to rounding (docs/coverage.md).
 
     """
     if any(row.verdict in UNDECIDED or row.extra.get("left_out_wrong_steps") for row in rows):
         return False
-    return {row.quantity for row in rows if row.verdict in DECIDED} >= DECISIVE
+    decided = {row.quantity: row for row in rows if row.verdict in DECIDED}
+    if not decided.keys() >= DECISIVE:
+        return False
+    turn = coarsest * max(decided[name].extra.get("fastest_mode", 0.0) for name in DECISIVE)
+    return turn > MAX_RESOLVED_TURN
 
 
 def _single_step_rows(
@@ -182,6 +190,7 @@ def _run_rows(
     if not HAS_EXTENDED_PRECISION:
         return one(Verdict.UNSUPPORTED, NO_EXTENDED_PRECISION)
     condition: Callable[[int, int], str] = partial(_time, run)
+    more = dict[str, float]()
     if isinstance(method, ConstrainedMethod):
         parts = constrained_deviations(method, model, run, h)
         found = {f"run_{name}": joined(some) for name, some in parts.items()}
@@ -196,9 +205,10 @@ def _run_rows(
         except EngineFailure as error:
             return one(Verdict.FAILED, str(error))
         found, condition = steps.compare(), steps.condition
+        more = {"fastest_mode": steps.fastest_mode} if np.isfinite(steps.fastest_mode) else {}
     alias = None if model.has_drag else integrator.alias_of
     return [
-        _run_row(context, integrator, quantity, deviations, h, condition, alias, answer.cpu_time)
+        _run_row(context, integrator, quantity, deviations, h, condition, alias, answer.cpu_time, more)
         for quantity, deviations in found.items()
     ]
 
@@ -224,7 +234,7 @@ def _time(run: StepRun, index: int, _: int) -> str:
 
 def _run_row(
     context: RowContext, integrator: Integrator, quantity: str, found: StepDeviations, h: float,
-    condition: Callable[[int, int], str], alias: str | None, cpu_time: float,
+    condition: Callable[[int, int], str], alias: str | None, cpu_time: float, more: dict[str, float],
 ) -> Row:  # fmt: skip
     """The row of one quantity at every step: the worst step decides, the first wrong one is named."""
     name, unit, ratios = quantity.removeprefix("run_"), RUN_UNITS[quantity], found.ratios
@@ -235,7 +245,7 @@ def _run_row(
     body = column if has_bodies else 0
     sharp = (found.bounds <= MAX_STEP_BOUND * found.effects) | (found.effects == 0)
     sharp &= ~left_out[:, None]
-    extra = {"step": h, "worst_step": worst + 1.0, "comparisons": float(ratios.size)}
+    extra = more | {"step": h, "worst_step": worst + 1.0, "comparisons": float(ratios.size)}
     what = f"{name} of {count} steps of {h:.4g} s"
     if ratio > 1:
         first = int(wrong[0])

@@ -72,6 +72,7 @@ DISTURBANCE = 1e-9  # of rates, to measure the growth of perturbations
 ANGLE_ROUNDINGS = 4
 MAX_STRETCH = 2e-15  # of a joint's quaternions
 MIN_MIDDLE_COSINE = 0.1  # of the second of two or three angles: at 0 two of their axes are one
+MAX_DISTANCE = 10.0  # of bodies from the origin, over the mechanism's size
 MAX_COSINE_CHANGE = 1 / 2  # of that cosine in a step, over itself
 MAX_TURN = 1.0  # rad, step × fastest rate: beyond it explicit methods become unstable, and bounds do not hold
 SAMPLE_STRIDE = 8  # of the samples at which what changes slowly is estimated: rates, the formula's own errors
@@ -381,7 +382,8 @@ def _sample_bound(method: JointSpaceMethod, model: Model, sizes: dict[str, Array
     """Bound what rounding leaves between coordinates and the bodies' motion that they map to.
 
     Places and attitudes as in a step without accelerations.  The relative rates uⱼ of the joints are added up
-    along a path, each turned by an attitude that is off by the roundings ρⱼ up to it, and at a lever ℓ ahead:
+    along a path, each turned by an attitude that is off by the roundings ρⱼ up to it, and at a lever ℓ ahead,
+    or about a common point, as the centre of the tree: as far away as the furthest body.
 
         ω′  Σ ρⱼ |uⱼ|        ṙ  ℓ Σ ρⱼ |uⱼ| + ρ max(V, W ℓ)
 
@@ -397,6 +399,7 @@ def _sample_bound(method: JointSpaceMethod, model: Model, sizes: dict[str, Array
     relative = sizes["rate"] + np.where(far >= 0, sizes["rate"][..., far], 0.0)
     turned = (bound["step_attitude"] * relative) @ path.T
     lever = bound["step_position"] / np.maximum(bound["step_attitude"], TINY)
+    lever = np.maximum(lever, np.max(sizes["place"], axis=-1, keepdims=True))
     bound |= {"step_rate": turned, "step_velocity": bound["step_velocity"] + turned * lever}
     return {name: np.maximum(x, TINY) for name, x in bound.items()}
 
@@ -411,9 +414,13 @@ def _formula_errors(model: Model, states: Sequence[State]) -> Array:
     state, found = stack_states([states[n] for n in some]), list[Any]()
     for dtype in (np.float64, LongDouble):
         tree = Tree(floats(dtype), model, state)
-        quantities = tree.quantities(tree.solve())
-        found.append([quantities[name] for name in ("acceleration", "angular_acceleration")])
-    size = np.linalg.norm(np.asarray(np.array(found[0]) - np.array(found[1]), float)[..., 0], axis=-1)
+        solution = tree.solve()
+        each = [
+            *solution.acceleration,
+            *tree.in_bodies(solution.turning),
+        ]  # of a held body one for all states
+        found.append(np.stack([np.broadcast_to(x, (len(some), 3, 1)) for x in each]))
+    size = np.linalg.norm(np.asarray(found[0] - found[1], float)[..., 0], axis=-1).reshape(2, model.n, -1)
     share = float(np.finfo(LongDouble).eps / np.finfo(float).eps)
     lost = LOST_DIGITS * share * np.moveaxis(size, -1, 0)
     return lost if len(some) == len(states) else np.tile(np.max(lost, axis=0), (len(states), 1, 1))
@@ -604,25 +611,40 @@ class StepsFromSamples:
         between = {name: np.maximum(x[:count], x[-count:]) for name, x in sizes.items()}
         of_torques = np.maximum(converted[:count], converted[-count:]) ** 4
         self.of_step = {name: x * of_torques for name, x in step_bound(method, model, between, h, 1).items()}
-        self.of_totals = self._total_bounds()
+        self.of_totals = self._total_bounds(count)
 
-    def _total_bounds(self) -> dict[str, Array]:
-        """Bound the errors (samples,) of energy [J] and angular momentum about the origin [kg m²/s].
+    def _total_bounds(self, count: int) -> dict[str, Array]:
+        """Bound the errors (count,) of energy [J] and angular momentum about the origin [kg m²/s].
 
         Each is that of its sum, and what the moments do that rounding leaves in the equations of the joints,
-        as often as in a rate's bound: their power is that of relative rates, 2 W at most, and inner forces
-        change no momentum.  The rates of all bodies, whose momentum this is, are rounded as those of samples.
+        as often as in a rate's bound: by their power; inner forces change no momentum, so that it is off by
+        these moments and the roundings of all bodies' rates.  Where a joint to the world has a moment about
+        the origin, it is off as all rates together.
         """
-        kinetic, potential, sums, joint_terms = (
+        kinetic, potential, sums, joint_terms, power = (
             np.array([getattr(b, name) for b in self.bounds])
-            for name in ("kinetic_energy", "potential_energy", "angular_momentum", "joint_terms")
+            for name in (
+                "kinetic_energy",
+                "potential_energy",
+                "angular_momentum",
+                "joint_terms",
+                "joint_power",
+            )
         )
+
+        def of_both_ends(x: Array) -> Array:
+            return np.asarray(np.maximum(x[:count], x[-count:]))
+
         model, reach = self.model, np.linalg.norm(self.states_r, axis=-1)
-        rounded = (model.mass * reach * self.of_samples["step_velocity"]).sum(-1)
-        rounded += self.of_samples["step_rate"] @ np.linalg.norm(model.inertia, axis=(1, 2))
-        left = ACCELERATION_FACTOR * self.h * joint_terms / np.maximum(self.middle_cosine, TINY) ** 4
-        energy, momentum = kinetic + potential + 2 * self.fastest * left, sums + left + rounded
-        return {"energy": np.asarray(energy), "momentum": np.asarray(momentum)}
+        share = ACCELERATION_FACTOR * self.h / np.maximum(self.middle_cosine, TINY) ** 4
+        energy, left = kinetic + potential + share * power, share * joint_terms
+        rates, own = self.of_step, 0.0
+        if _is_momentum_free(model):
+            rates = {name: of_both_ends(x) for name, x in self.of_samples.items()}
+            own = of_both_ends(left)
+        off = (model.mass * of_both_ends(reach) * rates["step_velocity"]).sum(-1)
+        off += rates["step_rate"] @ np.linalg.norm(model.inertia, axis=(1, 2))
+        return {"energy": of_both_ends(energy), "momentum": of_both_ends(sums) + own + off}
 
     def mistake_ratios(self, model: Model, states: Sequence[State]) -> dict[str, float]:
         """Compute what an engine with another mechanism would be off by, over what rounding explains.
@@ -664,6 +686,15 @@ def _directions(vectors: Array) -> Array:
     return np.asarray(vectors / np.where(size > 0, size, 1.0))
 
 
+def _is_momentum_free(model: Model) -> bool:
+    """Whether no joint to the world has a moment about the origin: balls and rods there, free bodies."""
+    roots = np.flatnonzero(model.body[: model.n, 0] < 0)
+    return not model.has_loops and all(
+        KINDS[model.kind[k]].holds_nothing or (model.kinds[k].is_spherical and not np.any(model.point[k, 0]))
+        for k in roots
+    )
+
+
 def _sizes_of(difference: Array) -> Array:
     """Sizes (S,) of numbers (S,) or vectors (S, 3)."""
     x = np.asarray(difference, float)
@@ -694,6 +725,7 @@ class RunSteps(StepsFromSamples):
         motion = run.trajectory
         assert motion.coordinates is not None and motion.velocities is not None
         self.state, self.motion = state, motion
+        self.fastest_mode = np.nan  # 1/s, of the linearised equations along the run; of `compare`
         charts = StepCharts(model, method, [state], [run.angle_axes])
         count = len(motion.velocities) - 1
         super().__init__(method, model, charts, motion.coordinates, motion.velocities, h, count)
@@ -721,12 +753,11 @@ class RunSteps(StepsFromSamples):
             )
         for name in ("energy", "momentum"):
             error = _sizes_of(getattr(self.here, name)[1:] - getattr(self.after, name))
-            size = self.of_totals[name]
             parts = ("kinetic_energy", "potential_energy") if name == "energy" else ("angular_momentum",)
             scale_of = np.array([sum(getattr(b, part) for part in parts) for b in bounds])
             found[f"run_{name}"] = StepDeviations(
                 error[:, None],
-                np.maximum(size[:-1], size[1:])[:, None],
+                self.of_totals[name][:, None],
                 scale_of[1:, None] / (EPS * SUM_ROUNDING_FACTOR),
             )
         left_out = self._left_out_steps()
@@ -738,19 +769,27 @@ class RunSteps(StepsFromSamples):
     def _left_out_steps(self) -> NDArray[np.str_]:
         """Find the steps (steps,) for which no bound is given, and why; whether they agree plays no part.
 
-        The step does not resolve the motion there, or angles are near the pose in which two of their axes are
-        one: at a cosine below `MIN_MIDDLE_COSINE`, or that a step changes by `MAX_COSINE_CHANGE` of itself.
+        The step does not resolve the motion there, or bodies are far away against the mechanism's size, whose
+        positions are rounded, or angles are near the pose in which two of their axes are one: at a cosine
+        below `MIN_MIDDLE_COSINE`, or that a step changes by `MAX_COSINE_CHANGE` of itself.
         The fastest rate is estimated at every `SAMPLE_STRIDE`-th sample and counts up to the next ones.
         """
         some = _every_few(len(self.states))
         with np.errstate(all="ignore"):
             rates = fastest_rates(self.model, [self.states[n] for n in some])
-        fast = _spread(rates, some)[1:] * self.h > MAX_TURN
+        self.fastest_mode = float(np.max(rates))
+        # implicit steps divide by 1 − step × rate, and the rates may change between these samples
+        most = MAX_TURN / 2 if self.method.implicit_forces == "all" else MAX_TURN
+        fast = _spread(rates, some)[1:] * self.h > most
+        fast |= np.maximum(self.fastest[:-1], self.fastest[1:]) * self.h > most
+        size = np.sum(stretched_length(self.model)) + np.max(np.linalg.norm(self.model.point, axis=2))
+        far = np.max(np.linalg.norm(self.states_r, axis=-1), axis=-1) > MAX_DISTANCE * size
         cosine = self.middle_cosine
         change = self.h * self.fastest / np.maximum(cosine, TINY)
         singular = (cosine < 1) & ((cosine < MIN_MIDDLE_COSINE) | (change > MAX_COSINE_CHANGE * cosine))
         reasons = (
-            (fast, f"step × fastest rate is above {MAX_TURN:g}"),
+            (fast, f"step × fastest rate is above {most:g}"),
+            (far[:-1] | far[1:], f"a body is beyond {MAX_DISTANCE:g} sizes of the mechanism"),
             (singular[:-1] | singular[1:], "an angle is too near its singular pose"),
         )
         return np.select([where for where, _ in reasons], [why for _, why in reasons], "")
