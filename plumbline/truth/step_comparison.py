@@ -638,7 +638,7 @@ class StepsFromSamples:
         model, reach = self.model, np.linalg.norm(self.states_r, axis=-1)
         share = ACCELERATION_FACTOR * self.h / np.maximum(self.middle_cosine, TINY) ** 4
         energy, left = kinetic + potential + share * power, share * joint_terms
-        rates, own = self.of_step, 0.0
+        rates, own = self.of_step, np.zeros(count)
         if _is_momentum_free(model):
             rates = {name: of_both_ends(x) for name, x in self.of_samples.items()}
             own = of_both_ends(left)
