@@ -82,7 +82,6 @@ class RoundingBound:
     scale: dict[str, Array | float]
     rod_torque: Array  # (N,) N m, of the torques at both ends of the rod that body k hangs by; 0 for a ball
     joint_terms: float  # N m about the origin, of the terms of all joints
-    joint_power: float  # W, of the same with the joints' rates
 
     def tolerance(self, quantity: str) -> Array | float:
         """Look up a tolerance by the name of its quantity.
@@ -183,8 +182,8 @@ def rounding_bounds(
 
 
 def _of_tree(terms: _Terms) -> list[RoundingBound]:
-    total, scale, sums, rods, joints = terms.bounds()
-    return [_bound(total[s], _at(scale, s), _at(sums, s), rods[s], joints[s]) for s in range(len(total))]
+    total, scale, sums, rods, moments = terms.bounds()
+    return [_bound(total[s], _at(scale, s), _at(sums, s), rods[s], moments[s]) for s in range(len(total))]
 
 
 def _of_loops(model: Model, states: Sequence[State]) -> list[RoundingBound]:
@@ -192,7 +191,7 @@ def _of_loops(model: Model, states: Sequence[State]) -> list[RoundingBound]:
     cut, found = cut_open(model), list[RoundingBound]()
     there = cut.state(stack_states(states))
     terms = _Terms(cut.model, there, None, cut.ends, cut.row_scale)
-    totals, scales, sums, _, joints = terms.bounds()
+    totals, scales, sums, _, moments = terms.bounds()
     of_welds, rank = terms.weld_errors(), regular_rank(model, states[0])
     scaled = cut.jacobian(there) * cut.row_scale[:, None]
     spreads = 1 + 1 / np.linalg.svd(scaled, compute_uv=False)[:, rank - 1]  # as `smallest_singular_value`
@@ -208,7 +207,7 @@ def _of_loops(model: Model, states: Sequence[State]) -> list[RoundingBound]:
             for name, value in largest.items()
         }
         spread_sums = {name: size * spread for name, size in _at(sums, s).items()}
-        found.append(_bound(total[cut.place], scale, spread_sums, np.zeros(model.n), spread * joints[s]))
+        found.append(_bound(total[cut.place], scale, spread_sums, np.zeros(model.n), spread * moments[s]))
     return found
 
 
@@ -217,7 +216,7 @@ def _at(values: dict[str, Array], s: int) -> dict[str, Array]:
 
 
 def _bound(
-    total: Array, scale: dict[str, Array], sums: dict[str, Array], rods: Array, joints: Array
+    total: Array, scale: dict[str, Array], sums: dict[str, Array], rods: Array, moments: float
 ) -> RoundingBound:
     """Tolerances by the sums of all sizes: (J, 4) of joints, of which the first hold the bodies."""
     total, sizes = ROUNDING_FACTOR * EPS * total, {name: float(size) for name, size in sums.items()}
@@ -228,8 +227,7 @@ def _bound(
         joint_moment=total[:, 3],
         scale=scale | sizes,
         rod_torque=ROUNDING_FACTOR * EPS * rods,
-        joint_terms=float(ROUNDING_FACTOR * EPS * joints[0]),
-        joint_power=float(ROUNDING_FACTOR * EPS * joints[1]),
+        joint_terms=float(ROUNDING_FACTOR * EPS * moments),
         **{name: SUM_ROUNDING_FACTOR * EPS * size for name, size in sizes.items()},
     )
 
@@ -362,7 +360,7 @@ class _Terms:
         Returns:
             tB + tS + tJ + d (S, N, 4) of r̈ [m/s²], α [rad/s²], F [N] and M [N m]; the scales of vectors; the
             sums (S,) behind the energies [J], the angular momentum and the mass matrix; torques of rods
-            (S, N) [N m]; of all joints (S, 2) the moments [N m] and their power [W].
+            (S, N) [N m]; moments (S,) of all joints [N m].
 
         """
         t, model, state, joints = self, self.model, self.state, _JointSpace(self)
@@ -413,13 +411,12 @@ class _Terms:
                 [t.moment, t.arm * t.F, t.J * t.alpha, np.sum(t.element_size, -1), (lever @ (t.m * t.g))], 0
             ),
         }
-        rods, of_joints = np.zeros(t.a.shape), np.zeros((len(total), 2))
+        rods, moments = np.zeros(t.a.shape), np.zeros(len(total))
         for at, (what, k) in enumerate(joints.pairs):
             load = joints.load[:, at]
             rods[:, k] += load * (what in ("upper", "lower"))
-            of_joints[:, 0] += load * (np.linalg.norm(tip[:, k], axis=-1) if what == "slide" else 1.0)
-            of_joints[:, 1] += load * joints.rate[:, at]
-        return total, scale, sums, rods, of_joints
+            moments += load * (np.linalg.norm(tip[:, k], axis=-1) if what == "slide" else 1.0)
+        return total, scale, sums, rods, moments
 
 
 def _norms(responses: Array) -> Array:
