@@ -45,6 +45,7 @@ from adapters.exudyn_common import (
     set_linear_solver,
     silence_engine,
 )
+from adapters.exudyn_surface import Probes
 from plumbline.model.datatypes import (
     Array,
     Float,
@@ -54,6 +55,7 @@ from plumbline.model.datatypes import (
     State,
     StateQuantities,
     StepRun,
+    SurfaceAnswer,
     Trajectory,
 )
 from plumbline.model.kinematics import (
@@ -93,6 +95,7 @@ class ExudynChain:
         state: State,
         parts: BodyParts | None = None,
         left_out: frozenset[tuple[int, int]] = frozenset(),
+        has_probes: bool = False,
     ) -> None:
         self.model, self.state, self.left_out = model, state, left_out
         self.mbs, self.container = make_system()
@@ -131,6 +134,7 @@ class ExudynChain:
             )
         for k in range(model.n, len(model.kind)):
             self._add_joint(k)
+        self.probes = Probes(mbs, model, self.piece_bodies, self.nodes) if has_probes else None
         mbs.Assemble()
 
     def _add_piece(self, k: int, part: RigidPart, attitude: Array, pdot: Array) -> None:
@@ -319,6 +323,16 @@ class Exudyn(ExudynAdapter):
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
         with silence_engine():
             return [_evaluate_state(ExudynChain(model, at, self.body_pieces(model))) for at in states]
+
+    def _surface(self, model: Model, states: Sequence[State]) -> list[SurfaceAnswer]:
+        found = list[SurfaceAnswer]()
+        with silence_engine():
+            for state in states:
+                chain = ExudynChain(model, state, has_probes=True)
+                _evaluate_state(chain)
+                assert chain.probes is not None
+                found.append(chain.probes.answer())
+        return found
 
     def _simulate(
         self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float

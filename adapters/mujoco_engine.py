@@ -56,6 +56,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from adapters.mujoco_surface import add_probes, surface_answer
 from plumbline.engines.metamorphic_hooks import MetamorphicHooks
 from plumbline.model import kinematics
 from plumbline.model.datatypes import (
@@ -69,6 +70,7 @@ from plumbline.model.datatypes import (
     Model,
     State,
     StateQuantities,
+    SurfaceAnswer,
     Trajectory,
     Unsupported,
 )
@@ -177,9 +179,16 @@ class Mujoco(MetamorphicHooks):
             soft = _SoftMechanism(model, self.option)
             with _raise_on_warnings(soft.tree.d):
                 return [_rigid_limit(soft, state) for state in states]
-        chain = _MujocoChain(model, self.body_pieces(model), dense=self.option == DENSE)
+        chain = MujocoChain(model, self.body_pieces(model), dense=self.option == DENSE)
         with _raise_on_warnings(chain.d):
             return [chain.quantities(state) for state in states]
+
+    def _surface(self, model: Model, states: Sequence[State]) -> list[SurfaceAnswer]:
+        chain = MujocoChain(model, has_probes=True)
+        with _raise_on_warnings(chain.d):
+            return [
+                surface_answer(chain.m, chain.d, chain.link_ids, chain.evaluate_forward(s)) for s in states
+            ]
 
     def _simulate(
         self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
@@ -188,7 +197,7 @@ class Mujoco(MetamorphicHooks):
             raise Unsupported(TENDON_MOTIONS)
         if model.has_loops or self.option == HELD:
             return self._rigid_run(model, state, times, integrator, resolution)
-        return self._sampled_run(_MujocoChain(model), state, times, integrator, resolution)
+        return self._sampled_run(MujocoChain(model), state, times, integrator, resolution)
 
     def _rigid_run(
         self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
@@ -219,7 +228,7 @@ class Mujoco(MetamorphicHooks):
         return replace(runs[-1], **limit, limit_error=error)
 
     def _sampled_run(
-        self, chain: _MujocoChain, state: State, times: Array, integrator: Integrator, resolution: float
+        self, chain: MujocoChain, state: State, times: Array, integrator: Integrator, resolution: float
     ) -> Trajectory:
         chain.m.opt.timestep = resolution
         chain.m.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.name.upper()}")
@@ -259,7 +268,7 @@ class _Constraints:
     ties: tuple[_Tie, ...] = ()
 
 
-class _MujocoChain:
+class MujocoChain:
     """A compiled chain and its data.
 
     Engine body ids: ``link_ids[k]`` of link k, ``ball_ids`` of all bodies on ball joints.
@@ -271,6 +280,7 @@ class _MujocoChain:
         parts: BodyParts | None = None,
         dense: bool = False,
         constraints: _Constraints | None = None,
+        has_probes: bool = False,
     ) -> None:
         spec = mujoco.MjSpec()
         _compiler_options(spec).autolimits = False
@@ -292,6 +302,8 @@ class _MujocoChain:
         _add_tendons(spec, links, model)
         constraints = constraints or _Constraints()
         _add_equalities(spec, links, constraints)
+        if has_probes:
+            add_probes(spec, links, model)
         m = self.m = spec.compile()
         m.opt.gravity = model.gravity
         m.opt.disableflags = mujoco.mjtDisableBit.mjDSBL_CONTACT | _autoreset_flag()
@@ -420,21 +432,27 @@ class _MujocoChain:
         d.xfrc_applied, d.qfrc_applied = self.applied_wrenches, self.effort
         return np.asarray(T)
 
-    def quantities(self, state: State) -> StateQuantities:
-        """Evaluate all state quantities at one state."""
+    def evaluate_forward(self, state: State) -> Array:
+        """Evaluate the engine's forward dynamics, then declare its loads as applied ones; returns T."""
         m, d, link = self.m, self.d, self.link_ids
         T = self.set_state(state)
         m.opt.enableflags = mujoco.mjtEnableBit.mjENBL_ENERGY
         mujoco.mj_forward(m, d)
         mujoco.mj_subtreeVel(m, d)
-        M = _full_mass_matrix(m, d)
         if self.use_dense_solve:
-            d.qacc = np.linalg.solve(M, d.qfrc_smooth + d.qfrc_constraint)
+            d.qacc = np.linalg.solve(_full_mass_matrix(m, d), d.qfrc_smooth + d.qfrc_constraint)
         velocity = self._spatial_motion(mujoco.mj_objectVelocity, d)
         d.xfrc_applied[link, :3] -= self.model.drag_force[:, None] * velocity[:, 3:]
         moment = np.matvec(d.xmat[link].reshape(-1, 3, 3), self.model.moment)
         d.xfrc_applied[link, 3:] = moment - self.model.drag_moment[:, None] * velocity[:, :3]
         mujoco.mj_rnePostConstraint(m, d)
+        return T
+
+    def quantities(self, state: State) -> StateQuantities:
+        """Evaluate all state quantities at one state."""
+        m, d, link = self.m, self.d, self.link_ids
+        T = self.evaluate_forward(state)
+        M = _full_mass_matrix(m, d)
         acceleration = self._spatial_motion(mujoco.mj_objectAcceleration, d)
         com, momentum = d.subtree_com[0], m.body_subtreemass[0] * d.subtree_linvel[0]
         return StateQuantities(
@@ -512,7 +530,7 @@ class _SoftMechanism:
         held = joints_as_cylinders(self.opened) if option == HELD else self.opened
         added = added_motions(self.opened) if option == HELD else [() for _ in self.opened.kind]
         constraints = _Constraints(self.cut.ends if self.cut else (), tuple(added), tuple(ties))
-        self.tree = _MujocoChain(held, dense=option == DENSE, constraints=constraints)
+        self.tree = MujocoChain(held, dense=option == DENSE, constraints=constraints)
 
     def state(self, state: State) -> State:
         """The state of the tree."""

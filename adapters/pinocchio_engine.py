@@ -57,8 +57,18 @@ from adapters.pinocchio_common import (
     set_corrector,
     translation,
 )
+from adapters.pinocchio_surface import add_probe_frames, surface_answer
 from plumbline.engines.integrators import dop853, rkmk4, sample_steps, semi_implicit_euler
-from plumbline.model.datatypes import Array, Float, Integrator, Model, State, StateQuantities, Trajectory
+from plumbline.model.datatypes import (
+    Array,
+    Float,
+    Integrator,
+    Model,
+    State,
+    StateQuantities,
+    SurfaceAnswer,
+    Trajectory,
+)
 from plumbline.model.kinematics import (
     elastic_energy,
     own_rates,
@@ -452,19 +462,24 @@ class PinocchioChain:
         wrench = self._joint_wrenches()
         reaction = [r @ f.linear for r, f in zip(turn, wrench, strict=True)]
         moment = [r @ f.angular for r, f in zip(turn, wrench, strict=True)]
+        rates = self.rate_map(state, q)
         return StateQuantities(
             acceleration=np.array(acceleration),
             angular_acceleration=np.array(angular),
             joint_reaction=np.array(reaction),
             joint_moment=np.array(moment),
             **energies_and_momentum(engine, data, q, v, elastic_energy(self.source_model, state)),
-            mass_matrix=self._mass_matrix(state, q),
+            mass_matrix=rates.T @ pin.crba(engine, data, q) @ rates,
         )
 
-    def _mass_matrix(self, state: State, q: Array) -> Array:
-        """Return the mass matrix (nu, nu) of ν = (udot of rods, ω′ of bodies): (T S)ᵀ M (T S).
+    def rate_map(self, state: State, q: Float[Array, "nq"]) -> Float[Array, "nv nu"]:
+        """Map ν = (udot of rods, ω′ of bodies or rates of joints) to the engine's velocity.
 
-        v = T W takes absolute rates W to joint rates, W = S ν takes ν to absolute rates.
+        It is T S: v = T W takes absolute rates W to joint rates, W = S ν takes ν to absolute rates.
+
+        Args:
+            q: configuration, in Pinocchio's convention.
+
         """
         model, nj = self.source_model, self.joint_count
         jacobian, rods = (
@@ -497,7 +512,7 @@ class PinocchioChain:
                 rates[joint.idx_v + 3 :][:3, own][:, 3:] = np.eye(3)
             elif kind.motions:
                 rates[joint.idx_v : joint.idx_v + joint.nv, own] = np.eye(joint.nv)
-        return np.asarray(rates.T @ pin.crba(self.pin_model, self.data, q) @ rates)
+        return rates
 
     def _joint_wrenches(self) -> list[pin.Force]:
         """Return each body's joint wrench after `rnea`, in its joint's axes and about its near point.
@@ -654,6 +669,17 @@ class Pinocchio(PinocchioAdapter):
         chain = PinocchioChain(model, self.option or self.usual_algorithm, self.body_pieces(model))
         return [chain.quantities(state) for state in states]
 
+    def _surface(self, model: Model, states: Sequence[State]) -> list[SurfaceAnswer]:
+        chain = PinocchioChain(model, self.usual_algorithm)
+        frames = add_probe_frames(chain.pin_model, chain.body_joints, chain.placements, model)
+        chain.data = chain.pin_model.createData()
+        found = list[SurfaceAnswer]()
+        for state in states:
+            q, v = chain.coordinates(state)
+            motion = q, v, chain.acceleration(q, v)
+            found.append(surface_answer(chain.pin_model, frames, motion, chain.rate_map(state, q)))
+        return found
+
     def _simulate(
         self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
     ) -> Trajectory:
@@ -693,3 +719,6 @@ class PinocchioAba(Pinocchio):
     options = ("crba",)
     usual_algorithm = "aba"
     loops_unsupported_reason = "aba has no constraints; the column pinocchio closes loops"
+
+    def _surface(self, model: Model, states: Sequence[State]) -> list[SurfaceAnswer]:
+        return []  # the column pinocchio has it

@@ -32,7 +32,13 @@ CURVE_COLUMNS = (
     "norm_drift",
 )
 STUDY_COLUMNS = ("resolution", "error", "cost", "order")
-CLI_LEVEL = {"state": "state", "step": "step", "trajectory": "trajectory", "invariants": "trajectory"}
+CLI_LEVEL = {
+    "state": "state",
+    "surface": "state",
+    "step": "step",
+    "trajectory": "trajectory",
+    "invariants": "trajectory",
+}
 DEFAULT_LONG_RUN_SECONDS = 100.0  # s: the default of the nightly's --long-run-seconds
 CATALOGUE_FOLDER = Path(__file__).parent.parent / "scenarios"
 RERUN_FOLDER = "repeated"

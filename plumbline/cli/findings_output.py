@@ -136,6 +136,7 @@ def explain(
         yield from wrap(smallest.diagnosis, width, "")
     yield ""
     level = f" --level {smallest.level}" if smallest.level in ("state", "step", "trajectory") else ""
+    level = " --level state" if smallest.level == "surface" else level
     catalogue = f"plumbline run {smallest.scenario} --engine {smallest.engine}{level}"
     yield f"again:  {own_command or catalogue}"
     script = next((scripts[row.key] for row in finding.rows if row.key in scripts), None)

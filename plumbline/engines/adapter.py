@@ -17,7 +17,13 @@ from typing import ClassVar
 
 import numpy as np
 
-from plumbline.engines.answers import check_declarations, check_evaluation, check_record, check_version
+from plumbline.engines.answers import (
+    check_declarations,
+    check_evaluation,
+    check_numbers,
+    check_record,
+    check_version,
+)
 from plumbline.model.datatypes import (
     Array,
     BadInput,
@@ -29,6 +35,7 @@ from plumbline.model.datatypes import (
     State,
     StateQuantities,
     StepRun,
+    SurfaceAnswer,
     Trajectory,
     Unsupported,
 )
@@ -126,6 +133,10 @@ class Adapter(ABC):
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
         """Return the state quantities at each state; raise Unsupported with a sentence to refuse."""
 
+    def _surface(self, model: Model, states: Sequence[State]) -> list[SurfaceAnswer]:
+        """Return what the engine reports besides the state quantities, at each state; none where nothing."""
+        return []
+
     def _simulate(
         self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
     ) -> Trajectory:
@@ -190,6 +201,27 @@ class Adapter(ABC):
             answers = [determinate_part(model, state, answer) for state, answer in pairs]
         if not model.has_joint_moments:
             answers = [replace(answer, joint_moment=None) for answer in answers]
+        return answers
+
+    def surface(self, model: Model, states: Sequence[State]) -> list[SurfaceAnswer]:
+        """Evaluate what the engine reports besides the state quantities; errors are those of `evaluate`.
+
+        Args:
+            states: as of `evaluate`.
+
+        Returns:
+            One record per state; none where the adapter offers nothing of the mechanism.
+
+        """
+        self._check_mechanism(model, self.builds_elements)
+        if model.has_loops:  # there is no truth of it yet
+            return []
+        with self._checked_refusals(model):
+            answers = self._surface(model, states)
+        for answer in answers:
+            for quantity, by_call in answer.items():
+                for call, value in by_call.items():
+                    check_numbers(value, "R D", {}, f"{self.name}._surface: {quantity} by {call}")
         return answers
 
     def simulate(

@@ -9,9 +9,11 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from importlib import metadata
 from io import StringIO
+
+import numpy as np
 
 from plumbline.engines.adapter import EngineInfo
 from plumbline.engines.environments import BASE_REQUIREMENTS, declared_attribute
@@ -24,11 +26,13 @@ from plumbline.model.datatypes import (
     State,
     StateQuantities,
     StepRun,
+    SurfaceAnswer,
     Trajectory,
     Unsupported,
 )
 from plumbline.processes.exceptions import describe_exception
 
+SURFACE_STATES = 8  # of a scenario, at which what engines report besides the state quantities is compared
 # What every environment has: where one of these is missing, the checkout or the environment is broken.
 _OWN_PACKAGES = {"plumbline", "adapters", "reference_impl", *BASE_REQUIREMENTS, ""}
 
@@ -43,6 +47,9 @@ class Evaluation:
     cpu_time: float  # CPU s inside the engine's calls
     gap: str = ""  # the declared gap that the refusal follows from
     declared: tuple[str, ...] = ()  # all gaps that the adapter declares
+    # what the engine reports besides: `SurfaceAnswer` with all of the first states in one array
+    surface: SurfaceAnswer = field(default_factory=dict)
+    surface_failure: str = ""  # what it did instead
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +158,31 @@ def evaluate_states(engine: str, model: Model, states: Sequence[State]) -> Evalu
         raise
     except Exception as error:  # an engine may raise anything: its message belongs in the results
         failure = describe_exception(error)
-    return Evaluation(quantities, unsupported, failure, time.process_time() - begin, gap, declared)
+    surface, surface_failure = dict[str, dict[str, Array]](), ""
+    if quantities and not failure:
+        try:
+            surface = stack_answers(adapter.surface(model, states[:SURFACE_STATES]))
+        except Unsupported:
+            pass  # the adapter offers nothing of the mechanism
+        except MemoryError:
+            raise
+        except Exception as error:  # as above
+            surface_failure = describe_exception(error)
+    cpu_time = time.process_time() - begin
+    return Evaluation(quantities, unsupported, failure, cpu_time, gap, declared, surface, surface_failure)
+
+
+def stack_answers(answers: Sequence[SurfaceAnswer]) -> dict[str, dict[str, Array]]:
+    """Put the answers at all states into one array per call.
+
+    Args:
+        answers: of the surface, one per state, of the same calls.
+
+    """
+    return {
+        quantity: {call: np.array([one[quantity][call] for one in answers]) for call in calls}
+        for quantity, calls in (answers[0] if answers else {}).items()
+    }
 
 
 def run_refinement(

@@ -13,6 +13,7 @@ There are no patterns, so a name that a new version adds is undeclared whatever 
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -24,6 +25,10 @@ from plumbline.layout import ROOT
 from plumbline.model.datatypes import EngineFailure
 from plumbline.scenario.yaml_reader import read_yaml
 
+EXERCISED = (
+    "exercised.json"  # beside the files of engines: by engine and name the rows that a change turns red
+)
+SURFACE_ROWS = "rows of the level surface"  # the names of these are exercised
 SURFACES = ("mujoco", "pinocchio", "exudyn")  # columns whose engines are read
 COMPARED, OUTSIDE_STATUS, NOT_YET, NOT_MOTION = "compared", "outside", "not yet", "not about motion"
 STATUSES = (COMPARED, OUTSIDE_STATUS, NOT_YET, NOT_MOTION)
@@ -34,6 +39,19 @@ _KINDS: Mapping[str, Callable[[Any, Any], bool]] = {
     "members": lambda owner, x: isinstance(x, owner),
     "attributes": lambda _, x: True,
 }
+
+
+@cache
+def exercised_rows(engine: str) -> Mapping[str, Sequence[str]]:
+    """Read which names are exercised, as `plumbline.studies.exercised_names` found.
+
+    Returns:
+        By name the quantities whose rows turn red where what it returns changes by 1e-6.
+
+    """
+    text = (ROOT / "adapters" / "surface" / EXERCISED).read_text(encoding="utf-8")
+    found: dict[str, dict[str, list[str]]] = json.loads(text)
+    return found[engine]
 
 
 @dataclass(frozen=True)

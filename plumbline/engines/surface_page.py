@@ -7,7 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from plumbline.engines.surface import COMPARED, SURFACES, Surface, declared_surface
+from plumbline.engines.surface import (
+    COMPARED,
+    SURFACE_ROWS,
+    SURFACES,
+    Surface,
+    declared_surface,
+    exercised_rows,
+)
 
 _HEAD = """# The engines' surface
 
@@ -16,6 +23,11 @@ compares with the installed engines: every public name that could be about rigid
 by rows of a run, outside for one of five reasons (contact, rendering, input and output, memory, another
 physics), or not compared yet, with the reason. `plumbline list surface` counts the names and lists those
 that the installed version has besides, as a night does.
+A name is exercised where a relative change of 1e-6 in what it returns turns a row red
+(`python -m plumbline.studies.exercised_names > adapters/surface/exercised.json` computes it). Wrong so far
+are Pinocchio's rates of Jacobians, Coriolis matrix and rate of the centroidal map where a composite joint is
+universal or planar ([script](surface/pinocchio_composite_rates.py)), and its `computeMinverse` on long
+chains.
 
 Written by `python -m plumbline.engines.surface_page > docs/surface.md`.
 """
@@ -29,11 +41,16 @@ def surface_page() -> str:
 
     """
     surfaces = [declared_surface(name) for name in SURFACES]
-    lines = [_HEAD, "| engine | version | compared | not yet | outside |", "|---|---|---|---|---|"]
+    lines = [
+        _HEAD,
+        "| engine | version | compared | exercised | not yet | outside | exercised of all not outside |",
+        "|---|---|---|---|---|---|---|",
+    ]
     for one in surfaces:
-        count = one.counts()
-        numbers = (str(count[status]) for status in (COMPARED, "not yet", "outside"))
-        lines.append(f"| {one.engine} | {one.version} | {' | '.join(numbers)} |")
+        count, exercised = one.counts(), len(exercised_rows(one.engine))
+        inside = count[COMPARED] + count["not yet"]
+        cells = one.engine, one.version, count[COMPARED], exercised, count["not yet"], count["outside"]
+        lines.append(f"| {' | '.join(map(str, cells))} | {100 * exercised / inside:.0f} % |")
     for one in surfaces:
         lines += _section(one)
     return "\n".join(lines) + "\n"
@@ -48,6 +65,12 @@ def _section(surface: Surface) -> Iterator[str]:
         for one in surface.names:
             if one.status == status:
                 details.setdefault(one.detail, []).append(one.name)
+        if names := details.pop(SURFACE_ROWS, []):
+            yield from ("| exercised name | rows that a change of 1e-6 turns red |", "|---|---|")
+            rows = exercised_rows(surface.engine)
+            for name in names:
+                yield f"| `{name}` | {', '.join(rows[name])} |"
+            yield ""
         for detail, names in sorted(details.items()):
             yield f"- {detail}: {', '.join(f'`{name}`' for name in names)}"
 

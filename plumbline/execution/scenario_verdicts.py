@@ -440,7 +440,8 @@ class ScenarioRun:
 
         A mechanism that is on record is not searched again: the scatter is measured, by which it is checked.
         """
-        disputed = [row for row in found.rows if row.verdict == Verdict.DISAGREES]
+        level = _LEVELS[answer.key.kind]  # rows of the surface name the call that is wrong
+        disputed = [row for row in found.rows if row.verdict == Verdict.DISAGREES and row.level == level]
         model, marked = self.scenario.model, disputed
         if self._known and disputed:
             marked = self._known.mark_known(disputed, model.n, inertia_ratio(model))
@@ -473,7 +474,7 @@ class ScenarioRun:
         causes = tuple(asdict(cause) for cause in diagnosis.causes)
         cell.rows = [
             replace(row, diagnosis=diagnosis.text or None, causes=causes, extra=row.extra | extra)
-            if row.verdict == Verdict.DISAGREES
+            if row.verdict == Verdict.DISAGREES and row.level == _LEVELS[kind]
             else row
             for row in cell.rows
         ]

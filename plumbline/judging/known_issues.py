@@ -53,11 +53,12 @@ from plumbline.scenario.validation_messages import problems_from_validation
 from plumbline.scenario.yaml_reader import read_yaml
 from plumbline.scenario.yaml_source import PathKey, YamlSource, dotted_path
 from plumbline.truth.step_comparison import CONSTRAINED_UNITS, RUN_UNITS, STEP_UNITS
+from plumbline.truth.surface_truth import SURFACE_QUANTITIES
 
 RowKind = tuple[str, str, str, str, str]  # of a row: engine, its version, level, integrator, quantity
 KNOWN_ISSUES_FILE = Path(__file__).with_name("known_issues.yaml")
 DIAGNOSED_LEVELS = ("state", "step")  # whose rows have causes
-LEVELS: tuple[Level, ...] = ("state", "step", "invariants", "trajectory", "relations", "model")
+LEVELS: tuple[Level, ...] = ("state", "surface", "step", "invariants", "trajectory", "relations", "model")
 ANY_LENGTH = 10**9  # bodies
 # Bounds are 64 roundings of the largest term and more: an answer that is off by a million times the quantity
 # is 1e20 bounds off.
@@ -512,6 +513,7 @@ def _quantities() -> set[str]:
         "all",
         *STATE_UNITS,
         SINGULAR_POSE,
+        *SURFACE_QUANTITIES,
         *MODEL_UNITS,
         *steps,
         *trajectory,

@@ -12,7 +12,7 @@ import numpy as np
 
 from plumbline.model.datatypes import Array, Float
 
-Level = Literal["state", "step", "invariants", "trajectory", "relations", "model"]
+Level = Literal["state", "surface", "step", "invariants", "trajectory", "relations", "model"]
 # hash of an answer's bits, by integrator ("-" at states), quantity and resolution ("" at states)
 Fingerprints = dict[tuple[str, str, str], bytes]
 Columns = dict[str, Any]  # column name → its values (n,), or the one value of all n records

@@ -12,6 +12,7 @@ import numpy as np
 from plumbline.engines.engine_calls import Evaluation
 from plumbline.judging.identity import state_fingerprints
 from plumbline.judging.rows import Columns, Deviation, JudgingResult, Row, RowContext, Verdict
+from plumbline.judging.surface_rows import judge_surface
 from plumbline.model.datatypes import Array
 from plumbline.model.loops import MIN_SINGULAR_VALUE
 from plumbline.truth.ground_truth import StateTruth
@@ -72,6 +73,7 @@ def judge_states(context: RowContext, truth: StateTruth, evaluation: Evaluation)
         result.rows.append(row)
         if row.verdict == Verdict.DISAGREES:
             result.deviations[row.key] = deviation
+    result.rows += judge_surface(context, truth, evaluation)
     return result
 
 

@@ -116,6 +116,12 @@ class StateQuantities:
     limit_error: Mapping[str, float] | None = None
 
 
+# What an engine reports at one state besides the `StateQuantities`: by quantity (of
+# `plumbline.truth.surface_truth`) and by call, the names of the engine's functions, sensors and options that
+# it comes from, with commas between; vectors of bodies or of the mechanism, or a number per entry of ν.
+SurfaceAnswer = Mapping[str, Mapping[str, Float[Array, "*states rows d"]]]
+
+
 @dataclass(frozen=True, eq=False)
 class Trajectory:
     """Samples of one run at the requested times; row 0 is the initial state.

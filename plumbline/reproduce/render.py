@@ -124,6 +124,8 @@ def no_script_reason(engine: str, row: dict[str, Any]) -> str:
     for name in (engine, other or engine):
         if not declared_attribute(name, "reproduction_template"):
             return f"engine {name} has no template of scripts"
+    if row["level"] == "surface":
+        return "rows of the surface have no script: their reason names the call that is wrong"
     if row["level"] == "step" and row["quantity"] in CONSTRAINED_UNITS:
         return "rows of single steps with constraints have no script"
     if row["level"] == "step" and row["quantity"] in RUN_UNITS:

@@ -259,7 +259,9 @@ def _ask_reading(plan: ModelPlan, name: str) -> VersionAnswer:
 
 
 def _ask_verdict(plan: Plan, name: str, row: Mapping[str, Any]) -> VersionAnswer:
-    level = {"invariants": "trajectory", "relations": "all"}.get(row["level"], row["level"])
+    level = {"invariants": "trajectory", "surface": "state", "relations": "all"}.get(
+        row["level"], row["level"]
+    )
     run = run_plan(replace(plan, engines=[name], level=level), _silent)
     if reason := run.engines[name].missing:
         raise VersionUnusable(reason)

@@ -8,11 +8,12 @@ the difference from a method of another kind (`trajectory_truth`).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from plumbline.engines.engine_calls import SURFACE_STATES
 from plumbline.engines.registry import load_adapter
 from plumbline.model.datatypes import KINDS, Array, EngineFailure, Model, State, StateQuantities, Trajectory
 from plumbline.model.invariants import MOTION_UNITS, motion_errors, motion_scales
@@ -23,6 +24,7 @@ from plumbline.truth import TruthUnavailable
 from plumbline.truth.certificate_proof import ProvedMotion
 from plumbline.truth.certified_state import certify_state
 from plumbline.truth.rounding_bound import RoundingBound, rounding_bounds
+from plumbline.truth.surface_truth import SurfaceTruth, surface_truth
 
 if TYPE_CHECKING:
     from plumbline.truth.trajectory_truth import ClosedFormSamples
@@ -43,6 +45,8 @@ class StateTruth:
     bounds: list[RoundingBound]
     method: str
     is_certified: bool = True  # else the answers of the reference are the truth
+    # at the first states, by quantity; none of mechanisms with loops
+    surface: Mapping[str, SurfaceTruth] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +102,10 @@ def state_truth(model: Model, states: Sequence[State]) -> StateTruth:
         return StateTruth(list(states), quantities, bounds, method, is_certified=False)
     bits = max(answer.bits for answer in certified)
     method = f"certified: enclosed in ball arithmetic of {bits} bits"
-    return StateTruth(list(states), [answer.quantities for answer in certified], bounds, method)
+    quantities = [answer.quantities for answer in certified]
+    count = 0 if model.has_loops else SURFACE_STATES
+    surface = surface_truth(model, states[:count], quantities, bounds)
+    return StateTruth(list(states), quantities, bounds, method, surface=surface)
 
 
 def motion_truth(

@@ -80,6 +80,7 @@ class RoundingBound:
     angular_momentum: float  # kg m²/s
     mass_matrix: float  # kg m², of each entry
     scale: dict[str, Array | float]
+    kinematics: Array  # (4, N): of r [m], v [m/s], attitudes [rad] and ω [rad/s] that follow from coordinates
     rod_torque: Array  # (N,) N m, of the torques at both ends of the rod that body k hangs by; 0 for a ball
     joint_terms: float  # N m about the origin, of the terms of all joints
 
@@ -182,8 +183,11 @@ def rounding_bounds(
 
 
 def _of_tree(terms: _Terms) -> list[RoundingBound]:
-    total, scale, sums, rods, moments = terms.bounds()
-    return [_bound(total[s], _at(scale, s), _at(sums, s), rods[s], moments[s]) for s in range(len(total))]
+    total, scale, sums, rods, moments, motion = terms.bounds()
+    return [
+        _bound(total[s], _at(scale, s), _at(sums, s), rods[s], moments[s], motion[:, s])
+        for s in range(len(total))
+    ]
 
 
 def _of_loops(model: Model, states: Sequence[State]) -> list[RoundingBound]:
@@ -191,7 +195,7 @@ def _of_loops(model: Model, states: Sequence[State]) -> list[RoundingBound]:
     cut, found = cut_open(model), list[RoundingBound]()
     there = cut.state(stack_states(states))
     terms = _Terms(cut.model, there, None, cut.ends, cut.row_scale)
-    totals, scales, sums, _, moments = terms.bounds()
+    totals, scales, sums, _, moments, motion = terms.bounds()
     of_welds, rank = terms.weld_errors(), regular_rank(model, states[0])
     scaled = cut.jacobian(there) * cut.row_scale[:, None]
     spreads = 1 + 1 / np.linalg.svd(scaled, compute_uv=False)[:, rank - 1]  # as `smallest_singular_value`
@@ -207,7 +211,9 @@ def _of_loops(model: Model, states: Sequence[State]) -> list[RoundingBound]:
             for name, value in largest.items()
         }
         spread_sums = {name: size * spread for name, size in _at(sums, s).items()}
-        found.append(_bound(total[cut.place], scale, spread_sums, np.zeros(model.n), spread * moments[s]))
+        largest_motion = np.repeat(np.max(motion[:, s], axis=-1, keepdims=True), model.n, axis=-1)
+        of_joints = np.zeros(model.n), spread * moments[s], spread * largest_motion
+        found.append(_bound(total[cut.place], scale, spread_sums, *of_joints))
     return found
 
 
@@ -216,7 +222,7 @@ def _at(values: dict[str, Array], s: int) -> dict[str, Array]:
 
 
 def _bound(
-    total: Array, scale: dict[str, Array], sums: dict[str, Array], rods: Array, moments: float
+    total: Array, scale: dict[str, Array], sums: dict[str, Array], rods: Array, moments: float, motion: Array
 ) -> RoundingBound:
     """Tolerances by the sums of all sizes: (J, 4) of joints, of which the first hold the bodies."""
     total, sizes = ROUNDING_FACTOR * EPS * total, {name: float(size) for name, size in sums.items()}
@@ -226,6 +232,7 @@ def _bound(
         joint_reaction=total[:, 2],
         joint_moment=total[:, 3],
         scale=scale | sizes,
+        kinematics=ROUNDING_FACTOR * EPS * motion,
         rod_torque=ROUNDING_FACTOR * EPS * rods,
         joint_terms=float(ROUNDING_FACTOR * EPS * moments),
         **{name: SUM_ROUNDING_FACTOR * EPS * size for name, size in sizes.items()},
@@ -354,13 +361,13 @@ class _Terms:
             first = last
         return np.asarray(np.sqrt(found))
 
-    def bounds(self) -> tuple[Array, dict[str, Array], dict[str, Array], Array, Array]:
+    def bounds(self) -> tuple[Array, dict[str, Array], dict[str, Array], Array, Array, Array]:
         """Sum the sizes of all roundings.
 
         Returns:
             tB + tS + tJ + d (S, N, 4) of r̈ [m/s²], α [rad/s²], F [N] and M [N m]; the scales of vectors; the
             sums (S,) behind the energies [J], the angular momentum and the mass matrix; torques of rods
-            (S, N) [N m]; moments (S,) of all joints [N m].
+            (S, N) [N m]; moments (S,) of all joints [N m]; sizes (4, S, N) behind r, v, attitudes and ω.
 
         """
         t, model, state, joints = self, self.model, self.state, _JointSpace(self)
@@ -416,7 +423,8 @@ class _Terms:
             load = joints.load[:, at]
             rods[:, k] += load * (what in ("upper", "lower"))
             moments += load * (np.linalg.norm(tip[:, k], axis=-1) if what == "slide" else 1.0)
-        return total, scale, sums, rods, moments
+        depth = np.broadcast_to(np.sum(t.below, axis=0), height.shape)
+        return total, scale, sums, rods, moments, np.stack([height, with_place, depth, rate])
 
 
 def _norms(responses: Array) -> Array:

@@ -117,7 +117,7 @@ function loopFacts({ loops }) {
   return [fact("Closed by", loops.closing.join(", ")), fact("Rows that close", `${loops.rows}, ${loops.independent} of them independent; ${wrench}`)];
 }
 
-const LEVELS = ["state", "step", "trajectory", "invariants", "relations"];
+const LEVELS = ["state", "surface", "step", "trajectory", "invariants", "relations"];
 
 /** The name of a row within its cell. @param {Index} index @param {number} i */
 const placeOf = ({ rows, levels, integrators, quantitys }, i) => [levels[rows.level[i]], integrators[rows.integrator[i]], quantitys[rows.quantity[i]]].join("/");
@@ -198,7 +198,7 @@ function chosenRow(index, row, i) {
 
 /** Label and unit of a row's further numbers; "row" for the unit of its error. @type {Record<string, [string, string]>} */
 const EXTRA = {
-  relative: ["Error over scale", ""], bound_relative: ["Tolerance over scale, largest", ""], states: ["States compared", ""], compared_states: ["With a tolerance tight enough", ""], comparisons: ["Comparisons", ""], scenarios: ["Scenarios", ""], state: ["Worst state", ""], body: ["Worst body", ""],
+  calls: ["Calls compared", ""], relative: ["Error over scale", ""], bound_relative: ["Tolerance over scale, largest", ""], states: ["States compared", ""], compared_states: ["With a tolerance tight enough", ""], comparisons: ["Comparisons", ""], scenarios: ["Scenarios", ""], state: ["Worst state", ""], body: ["Worst body", ""],
   visible: ["Effect of a detectable mistake", "row"], growth: ["Growth of a perturbation", ""], resolution: ["Finest step or tolerance", ""], scale: ["Scale", "row"],
   whole: ["Drift at the end", "row"], limit: ["Drift of the limit", "row"], limit_tolerance: ["Tolerance of the limit", "row"], limit_error: ["Uncertainty of the limit", "row"], asked: ["Requested duration", "s"], end: ["End", "s"], step: ["Step size", "s"], steps: ["Steps", ""], worst_step: ["Worst step", ""], first_step: ["First wrong step", ""], wrong_steps: ["Wrong steps", ""], left_out_steps: ["Steps not compared", ""], scatter: ["Scatter of the error over the tolerance", ""],
 };

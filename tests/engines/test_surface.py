@@ -7,9 +7,11 @@ from types import ModuleType
 import pytest
 
 from plumbline.engines.surface import (
+    SURFACE_ROWS,
     SURFACES,
     SurfaceChanges,
     declared_surface,
+    exercised_rows,
     installed_names,
 )
 from plumbline.engines.surface_page import surface_page
@@ -26,6 +28,12 @@ def test_every_public_name_of_the_installed_engines_is_declared():
     assert [one.engine for one in found] == list(SURFACES)
     for one in found:
         assert (one.version, one.new, one.vanished) == (declared_surface(one.engine).version, (), ())
+
+
+@pytest.mark.parametrize("engine", SURFACES)
+def test_what_is_compared_by_rows_of_the_surface_is_exercised(engine):
+    names = {one.name for one in declared_surface(engine).names if one.detail == SURFACE_ROWS}
+    assert names == set(exercised_rows(engine)) and len(names) >= 10
 
 
 def test_new_and_vanished_names_are_found(monkeypatch):

@@ -1,0 +1,79 @@
+"""Rows of the level "surface": what an engine's functions and sensors report besides the state quantities.
+
+One row per quantity, whichever calls of the engine give it; the worst of them is named.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from plumbline.engines.engine_calls import Evaluation
+from plumbline.judging.rows import Row, RowContext, Verdict
+from plumbline.model.datatypes import Array
+from plumbline.truth.ground_truth import StateTruth
+from plumbline.truth.rounding_bound import MAX_RELATIVE_BOUND
+from plumbline.truth.surface_truth import SURFACE_QUANTITIES, SurfaceTruth
+
+TINY = float(np.finfo(float).tiny)
+
+
+def judge_surface(context: RowContext, truth: StateTruth, evaluation: Evaluation) -> list[Row]:
+    """Judge each quantity that the engine offers, by the worst of all calls, states and bodies.
+
+    Args:
+        truth: with the truth of the surface at the first states.
+        evaluation: with the engine's answers at the same states, or why there are none.
+
+    Returns:
+        One row per quantity, with the number of calls in ``extra``; one row where the engine failed.
+
+    """
+    if evaluation.surface_failure and truth.surface:
+        return [context.make_row("surface", "-", "all", Verdict.FAILED, evaluation.surface_failure)]
+    return [
+        _row(context, name, truth.surface[name], evaluation)
+        for name in SURFACE_QUANTITIES
+        if name in truth.surface and name in evaluation.surface
+    ]
+
+
+def _row(context: RowContext, quantity: str, true: SurfaceTruth, evaluation: Evaluation) -> Row:
+    unit, name = SURFACE_QUANTITIES[quantity][0], quantity.replace("_", " ")
+    found = [(*_worst(value, true), call) for call, value in evaluation.surface[quantity].items()]
+    ratio, error, tolerance, state, call = max(found)
+    others = sorted(one[-1] for one in found if one[0] > 1 and one[-1] != call)
+    # single entries may have no scale
+    scale, loose = np.max(true.scale, axis=1), np.max(true.tolerance, axis=1)
+    looseness = np.where(scale > 0, loose / np.where(scale > 0, scale, 1.0), 0.0)
+    sharp, count, loosest = int(np.sum(looseness <= MAX_RELATIVE_BOUND)), len(scale), float(np.max(looseness))
+    if ratio > 1:
+        verdict = Verdict.DISAGREES
+        reason = f"{context.title}: the {name} by {call} is off by {error:.3g} {unit} at state {state}, "
+        reason += f"{ratio:.3g} times the rounding bound"
+        reason += f"; by {', '.join(others)} too" if others else ""
+    elif 2 * sharp >= count:
+        verdict = Verdict.AGREES
+        reason = f"{name} within {ratio:.2g} of the rounding bound at {sharp} states, by {len(found)} calls"
+    else:
+        verdict = Verdict.UNRESOLVED
+        reason = (
+            f"inconclusive: the rounding bound is up to {loosest:.1g} of the {name} (limit "
+            f"{MAX_RELATIVE_BOUND:g}) at {count - sharp} of {count} states, too loose to detect an error"
+        )
+    return context.make_row(
+        "surface", "-", quantity, verdict, reason, unit, value=error, tolerance=tolerance, ratio=ratio,
+        derivation="a formula on the certified motion; errors of its inputs are propagated to first order, "
+        f"its terms are rounded once each; at most {loosest:.1g} of the scale at {count} states",
+        cpu_time=evaluation.cpu_time,
+        extra={"states": float(count), "state": float(state), "calls": float(len(found))},
+    )  # fmt: skip
+
+
+def _worst(value: Array, true: SurfaceTruth) -> tuple[float, float, float, int]:
+    """The largest ratio of error and tolerance, with both and the state; infinite where shapes differ."""
+    if value.shape != true.value.shape:
+        return np.inf, np.inf, 0.0, 0
+    error = np.linalg.norm(value - true.value, axis=-1)
+    ratio = error / np.maximum(true.tolerance, TINY)
+    at = np.unravel_index(int(np.argmax(ratio)), ratio.shape)
+    return float(ratio[at]), float(error[at]), float(true.tolerance[at]), int(at[0])

@@ -1,0 +1,319 @@
+"""The truth of what engines report besides the state quantities: formulas on the certified motion.
+
+A quantity is an entry of `SURFACE_QUANTITIES`: its unit and a formula on `Motion`.  The formulas are written
+in `Rounded` vectors, which carry with each value a bound of what an engine's rounding can change:
+
+    error    of the inputs, propagated to first order: r, v, attitudes and ω by `RoundingBound.kinematics`,
+             r̈ and ω̇ by their own tolerances, forces by theirs
+    size     the sum of the magnitudes of the terms, each of which is rounded: 64 ε of it are tolerated
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from plumbline.model.datatypes import Array, Float, Model, State, StateQuantities
+from plumbline.model.kinematics import (
+    cross,
+    minimal_rates,
+    rotate_vectors,
+    rotation_matrix,
+    velocity_jacobian,
+)
+from plumbline.model.probe_frames import PROBE_ATTITUDE, probe_points
+from plumbline.truth.rounding_bound import EPS, ROUNDING_FACTOR, RoundingBound
+
+
+class Rounded(NamedTuple):
+    """Vectors with the first-order bounds of their errors."""
+
+    value: Float[Array, "... d"]
+    error: Float[Array, "..."]
+    size: Float[Array, "..."]
+
+    def plus(self, other: Rounded, sign: float = 1.0) -> Rounded:
+        """Add other vectors, or subtract them."""
+        return Rounded(self.value + sign * other.value, self.error + other.error, self.size + other.size)
+
+    def minus(self, other: Rounded) -> Rounded:
+        """Subtract other vectors."""
+        return self.plus(other, -1.0)
+
+    def times(self, factor: Float[Array, "..."]) -> Rounded:
+        """Multiply by exact factors, one per vector."""
+        size = np.abs(factor)
+        return Rounded(factor[..., None] * self.value, size * self.error, size * self.size)
+
+    def cross(self, other: Rounded) -> Rounded:
+        """Multiply by other vectors."""
+        a, b = np.linalg.norm(self.value, axis=-1), np.linalg.norm(other.value, axis=-1)
+        return Rounded(
+            cross(self.value, other.value), a * other.error + b * self.error, self.size * other.size
+        )
+
+    def mapped(self, matrix: Float[Array, "... 3 3"], norm: Array, error: Array) -> Rounded:
+        """Multiply by matrices of a norm, that are off by an error."""
+        length = np.linalg.norm(self.value, axis=-1)
+        value = rotate_vectors(matrix, self.value)
+        return Rounded(value, norm * self.error + error * length, norm * self.size)
+
+    def summed(self, weights: Float[Array, "sums bodies"]) -> Rounded:
+        """Add up with weights: (N, 3) → (sums, 3)."""
+        return Rounded(weights @ self.value, weights @ self.error, weights @ self.size)
+
+    @property
+    def tolerance(self) -> Array:
+        """What an engine may be off by."""
+        return np.asarray(self.error + ROUNDING_FACTOR * EPS * self.size)
+
+
+class Motion:
+    """The certified motion of all bodies and of their probe frames, in the world frame."""
+
+    def __init__(self, model: Model, state: State, quantities: StateQuantities, bound: RoundingBound) -> None:
+        """Take the motion from the state and its certified accelerations."""
+        of_r, of_v, self.of_turn, of_w = bound.kinematics
+        norm, self.model, self.state = np.linalg.norm, model, state
+        A = self.attitude = rotation_matrix(state.p)
+        self.mass, self.inertia = model.mass, np.asarray(model.inertia)
+        self.inertia_norm = norm(self.inertia, axis=(1, 2))
+        self.exact = np.zeros(model.n)
+        spin = rotate_vectors(A, state.omega)
+        scale = bound.scale
+
+        def given(value: Array, error: Array, size: Array) -> Rounded:
+            return Rounded(value, error, np.maximum(size, norm(value, axis=-1)))
+
+        roundings = ROUNDING_FACTOR * EPS
+        self.r, self.v = given(state.r, of_r, of_r / roundings), given(state.v, of_v, of_v / roundings)
+        self.w = given(spin, of_w, of_w / roundings)
+        self.a = given(quantities.acceleration, bound.acceleration, np.asarray(scale["acceleration"]))
+        turning, of_turning = bound.angular_acceleration, np.asarray(scale["angular_acceleration"])
+        self.alpha = given(rotate_vectors(A, quantities.angular_acceleration), turning, of_turning)
+        gravity = np.broadcast_to(model.gravity, (model.n, 3))
+        self.gravity = given(gravity, self.exact, self.exact)
+        points = probe_points(model)
+        length = norm(points, axis=-1)
+        self.arm = given(rotate_vectors(A, points), self.of_turn * length, length)
+        near = norm(model.proximal, axis=-1)
+        self.near = given(rotate_vectors(A, model.proximal), self.of_turn * near, near)
+        force, moment = quantities.joint_reaction, quantities.joint_moment
+        none = np.zeros((model.n, 3))
+        self.force, self.moment = (
+            given(none if value is None else value, np.asarray(getattr(bound, name)), np.asarray(scale[name]))
+            for name, value in (("joint_reaction", force), ("joint_moment", moment))
+        )
+        assert quantities.mass_matrix is not None  # of mechanisms without loops
+        self.mass_matrix, self.mass_matrix_error = quantities.mass_matrix, bound.mass_matrix
+        self.axes = A @ rotation_matrix(PROBE_ATTITUDE)  # of the probe frames
+        self.point = self.r.plus(self.arm)
+        self.point_velocity = self.v.plus(self.w.cross(self.arm))
+        swing = self.alpha.cross(self.arm).plus(self.w.cross(self.w.cross(self.arm)))
+        self.point_acceleration = self.a.plus(swing)
+        far, n = model.tree.body[:, 0], model.n
+        self.below = np.eye(n)  # [k, b]: body b is k or beyond it
+        for k in reversed(range(n)):
+            if far[k] >= 0:
+                self.below[far[k]] = np.maximum(self.below[far[k]], self.below[k])
+
+    def local(self, vectors: Rounded) -> Rounded:
+        """Vectors in the axes of the probe frames."""
+        return vectors.mapped(self.axes.mT, np.ones(self.model.n), self.of_turn)
+
+    def centre(self, vectors: Rounded) -> Rounded:
+        """Mean of all bodies by mass, (1, 3)."""
+        return vectors.summed(self.mass[None] / np.sum(self.mass))
+
+    def spin_momentum(self) -> Rounded:
+        """A J ω′ of each body."""
+        return self._of_inertia(self.w)
+
+    def spin_momentum_rate(self) -> Rounded:
+        """A (J ω̇′ + ω′ × J ω′) of each body."""
+        return self._of_inertia(self.alpha).plus(self.w.cross(self.spin_momentum()))
+
+    def _of_inertia(self, vectors: Rounded) -> Rounded:
+        turned = self.attitude @ self.inertia @ self.attitude.mT
+        return vectors.mapped(turned, self.inertia_norm, 2 * self.of_turn * self.inertia_norm)
+
+    def generalized(self, force: Rounded, moment: Rounded | None) -> Rounded:
+        """Forces at the centres and moments of all bodies as forces on ν, (nu, 1)."""
+        jacobian = velocity_jacobian(self.model, self.state).reshape(self.model.n, 6, -1)
+        maps = [(jacobian[:, :3], force, self.r.error)]
+        if moment is not None:
+            maps.append((self.attitude @ jacobian[:, 3:], moment, self.exact))
+        found = list[Rounded]()
+        for columns, given, off in maps:  # arms are off by as much as positions, axes by as much as attitudes
+            norm, length = np.linalg.norm(columns, axis=1), np.linalg.norm(given.value, axis=-1)
+            error = norm.T @ (given.error + self.of_turn * length) + np.sum(off * length)
+            found.append(
+                Rounded(np.einsum("kij,ki->j", columns, given.value)[:, None], error, norm.T @ given.size)
+            )
+        return found[0].plus(found[1]) if moment is not None else found[0]
+
+
+def _about_centre(motion: Motion, weights: Array, moving: Rounded, spin: Rounded) -> Rounded:
+    """Σ (r − c) × moving + spin with the weights (sums, N) of bodies, about their centre of mass c."""
+    found = list[Rounded]()
+    for row in weights:
+        share = np.repeat((row * motion.mass / np.sum(row * motion.mass))[None], motion.model.n, axis=0)
+        arm = motion.r.minus(motion.r.summed(share))
+        found.append(arm.cross(moving).plus(spin).summed(row[None]))
+    return Rounded(*(np.concatenate(some) for some in zip(*found, strict=True)))
+
+
+def _subtree(motion: Motion, vectors: Rounded) -> Rounded:
+    weights = motion.below * motion.mass
+    return vectors.summed(weights / np.sum(weights, axis=1, keepdims=True))
+
+
+def _momenta(motion: Motion) -> Rounded:
+    return motion.v.times(motion.mass)
+
+
+def _frame_axes(motion: Motion) -> Rounded:
+    columns = motion.axes.mT.reshape(-1, 3)
+    ones = np.ones(len(columns))
+    return Rounded(columns, np.repeat(motion.of_turn, 3), ones)
+
+
+def _weights(motion: Motion) -> Array:
+    return np.ones((1, motion.model.n))
+
+
+def _at_origin(motion: Motion, linear: Rounded, angular: Rounded) -> Rounded:
+    """Move a spatial vector from the probe point to the world's origin."""
+    return linear.minus(angular.cross(motion.point))
+
+
+def _spatial(motion: Motion) -> Rounded:
+    return motion.point_acceleration.minus(motion.w.cross(motion.point_velocity))
+
+
+def _total_mass(m: Motion) -> Rounded:
+    total = np.sum(m.mass)
+    return Rounded(np.full((1, 1), total), np.zeros(1), np.full(1, total))
+
+
+def _inverse_dynamics(m: Motion) -> Rounded:
+    return m.generalized(m.a.minus(m.gravity).times(m.mass), m.spin_momentum_rate())
+
+
+def _generalized_momentum(m: Motion) -> Rounded:
+    """M ν, with the rotors, which the bodies' momenta lack."""
+    of_bodies, rates = m.generalized(_momenta(m), m.spin_momentum()), minimal_rates(m.model, m.state)
+    total = np.sum(np.abs(rates))
+    error = of_bodies.error + m.mass_matrix_error * total
+    return Rounded((m.mass_matrix @ rates)[:, None], error, of_bodies.size)
+
+
+def _momentum_through_inverse(m: Motion) -> Rounded:
+    """M M⁻¹ M ν: what is rounded in M ν and in the inverse is multiplied by M⁻¹ and by M."""
+    once = _generalized_momentum(m)
+    through = np.abs(m.mass_matrix) @ np.abs(np.linalg.pinv(m.mass_matrix, hermitian=True))
+    return once._replace(error=once.error + 2 * through @ once.tolerance)
+
+
+def _probe_moment(m: Motion) -> Rounded:
+    """Moments of the joints about the probe points."""
+    return m.moment.plus(m.near.minus(m.arm).cross(m.force))
+
+
+# By name the unit and the formula: vectors of bodies, of the whole mechanism, or one number per entry of ν.
+_FORMULAS: Mapping[str, tuple[str, Callable[[Motion], Rounded]]] = {
+    "body_position": ("m", lambda m: m.r),
+    "body_velocity": ("m/s", lambda m: m.v),
+    "body_acceleration": ("m/s²", lambda m: m.a),
+    "frame_position": ("m", lambda m: m.point),
+    "frame_axes": ("1", _frame_axes),
+    "frame_velocity": ("m/s", lambda m: m.point_velocity),
+    "frame_velocity_local": ("m/s", lambda m: m.local(m.point_velocity)),
+    "frame_velocity_at_origin": ("m/s", lambda m: _at_origin(m, m.point_velocity, m.w)),
+    "frame_angular_velocity": ("rad/s", lambda m: m.w),
+    "frame_angular_velocity_local": ("rad/s", lambda m: m.local(m.w)),
+    "frame_acceleration": ("m/s²", lambda m: m.point_acceleration),
+    "frame_acceleration_local": ("m/s²", lambda m: m.local(m.point_acceleration)),
+    "frame_proper_acceleration": ("m/s²", lambda m: m.point_acceleration.minus(m.gravity)),
+    "frame_proper_acceleration_local": (
+        "m/s²", lambda m: m.local(m.point_acceleration.minus(m.gravity)),
+    ),
+    "frame_spatial_acceleration": ("m/s²", _spatial),
+    "frame_spatial_acceleration_local": ("m/s²", lambda m: m.local(_spatial(m))),
+    "frame_spatial_acceleration_at_origin": ("m/s²", lambda m: _at_origin(m, _spatial(m), m.alpha)),
+    "frame_angular_acceleration": ("rad/s²", lambda m: m.alpha),
+    "frame_angular_acceleration_local": ("rad/s²", lambda m: m.local(m.alpha)),
+    "centre_of_mass": ("m", lambda m: m.centre(m.r)),
+    "centre_of_mass_velocity": ("m/s", lambda m: m.centre(m.v)),
+    "centre_of_mass_acceleration": ("m/s²", lambda m: m.centre(m.a)),
+    "total_mass": ("kg", _total_mass),
+    "momentum": ("kg m/s", lambda m: _momenta(m).summed(_weights(m))),
+    "momentum_rate": ("N", lambda m: m.a.times(m.mass).summed(_weights(m))),
+    "centroidal_angular_momentum": (
+        "kg m²/s", lambda m: _about_centre(m, _weights(m), _momenta(m), m.spin_momentum()),
+    ),
+    "centroidal_angular_momentum_rate": (
+        "N m", lambda m: _about_centre(m, _weights(m), m.a.times(m.mass), m.spin_momentum_rate()),
+    ),
+    "subtree_centre": ("m", lambda m: _subtree(m, m.r)),
+    "subtree_velocity": ("m/s", lambda m: _subtree(m, m.v)),
+    "subtree_acceleration": ("m/s²", lambda m: _subtree(m, m.a)),
+    "subtree_angular_momentum": (
+        "kg m²/s", lambda m: _about_centre(m, m.below, _momenta(m), m.spin_momentum()),
+    ),
+    "joint_force_local": ("N", lambda m: m.local(m.force)),
+    "joint_moment_local": ("N m", lambda m: m.local(_probe_moment(m))),
+    "generalized_momentum": ("kg m²/s", _generalized_momentum),
+    "momentum_through_inverse": ("kg m²/s", _momentum_through_inverse),
+    "generalized_gravity": ("N m", lambda m: m.generalized(m.gravity.times(-m.mass), None)),
+    "inverse_dynamics": ("N m", _inverse_dynamics),
+}  # fmt: skip
+# The same by an algorithm that is compared by itself, because it can be wrong where others are right.
+_BY_ALGORITHM = {
+    "by_jacobian_rate": (
+        "frame_acceleration", "frame_spatial_acceleration_local", "frame_spatial_acceleration_at_origin",
+        "frame_angular_acceleration", "frame_angular_acceleration_local",
+    ),
+    "by_map_rate": ("momentum_rate", "centroidal_angular_momentum_rate"),
+    "by_coriolis_matrix": ("inverse_dynamics",),
+    "by_aba": ("inverse_dynamics", "momentum_through_inverse"),
+}  # fmt: skip
+SURFACE_QUANTITIES: Mapping[str, tuple[str, Callable[[Motion], Rounded]]] = {
+    **_FORMULAS,
+    **{f"{name}_{by}": _FORMULAS[name] for by, names in _BY_ALGORITHM.items() for name in names},
+}
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceTruth:
+    """The true values of one quantity at S states, and what an engine may be off by."""
+
+    value: Float[Array, "states rows d"]
+    tolerance: Float[Array, "states rows"]
+    scale: Float[Array, "states rows"]
+
+
+def surface_truth(
+    model: Model,
+    states: Sequence[State],
+    quantities: Sequence[StateQuantities],
+    bounds: Sequence[RoundingBound],
+) -> dict[str, SurfaceTruth]:
+    """Compute all quantities of `SURFACE_QUANTITIES`.
+
+    Args:
+        states: S states of a mechanism without loops; without any there is no quantity.
+        quantities: certified, at these states or more.
+        bounds: of an engine's rounding, at the same.
+
+    """
+    motions = [Motion(model, *one) for one in zip(states, quantities, bounds, strict=False)]
+    found = dict[str, SurfaceTruth]()
+    for name, (_, formula) in SURFACE_QUANTITIES.items() if motions else ():
+        results = [formula(motion) for motion in motions]
+        parts = ([x.value for x in results], [x.tolerance for x in results], [x.size for x in results])
+        found[name] = SurfaceTruth(*map(np.array, parts))
+    return found

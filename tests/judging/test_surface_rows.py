@@ -1,0 +1,89 @@
+"""Rows of the surface: what engines report besides the state quantities, against the certified motion."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from plumbline.engines.engine_calls import Evaluation, evaluate_states, stack_answers
+from plumbline.engines.registry import load_adapter
+from plumbline.engines.surface import SURFACES
+from plumbline.judging.rows import RowContext, Verdict
+from plumbline.judging.surface_rows import judge_surface
+from plumbline.model.random_mechanisms import random_tree
+from plumbline.model.sampling import random_states
+from plumbline.studies.exercised_names import exercised_names
+from plumbline.truth.ground_truth import state_truth
+from plumbline.truth.surface_truth import SURFACE_QUANTITIES
+
+WHO = RowContext("s", "f", "e", "The engine", "0")
+KINDS = ("rod", "ball", "hinge", "slide", "cylindrical", "free", "weld")
+RECORDED = {  # by pinocchio, of composite joints: known_issues.yaml
+    name
+    for name in SURFACE_QUANTITIES
+    if name.endswith(("_by_jacobian_rate", "_by_map_rate", "_by_coriolis_matrix"))
+}  # fmt: skip
+
+
+def mechanism(kinds, seed=5, bodies=4):
+    model = random_tree(np.random.default_rng(seed), bodies, kinds)
+    return model, random_states(model, 3, seed)
+
+
+@pytest.fixture(scope="module")
+def tree():
+    model, states = mechanism(KINDS, bodies=7)
+    return model, states, state_truth(model, states)
+
+
+def answers_of(engine, model, states):
+    return stack_answers(load_adapter(engine).surface(model, states))
+
+
+def verdicts(truth, answers):
+    rows = judge_surface(WHO, truth, Evaluation([], None, None, 0.0, surface=answers))
+    return {row.quantity: row.verdict for row in rows}
+
+
+@pytest.mark.parametrize("engine", SURFACES)
+def test_every_call_agrees_and_a_relative_change_of_1e_6_is_seen(engine, tree):
+    model, states, truth = tree
+    answers = answers_of(engine, model, states)
+    found = verdicts(truth, answers)
+    assert len(found) >= 10 and set(found.values()) == {Verdict.AGREES}, found
+    calls = {name for by_call in answers.values() for call in by_call for name in call.split(", ")}
+    assert set(exercised_names(truth, answers)) == calls
+
+
+def test_pinocchios_rates_of_composite_joints_disagree_and_nothing_else():
+    model, states = mechanism(("universal",))
+    truth = state_truth(model, states)
+    found = verdicts(truth, answers_of("pinocchio", model, states))
+    wrong = {name for name, verdict in found.items() if verdict == Verdict.DISAGREES}
+    assert wrong and wrong <= RECORDED
+    assert set(verdicts(truth, answers_of("mujoco", model, states)).values()) == {Verdict.AGREES}
+
+
+def test_an_answer_of_another_shape_disagrees_and_a_failure_is_a_row(tree):
+    _, _, truth = tree
+    short = {"frame_position": {"f": truth.surface["frame_position"].value[:, :1]}}
+    assert verdicts(truth, short) == {"frame_position": Verdict.DISAGREES}
+    (row,) = judge_surface(WHO, truth, Evaluation([], None, None, 0.0, surface_failure="it crashed"))
+    assert (row.verdict, row.quantity, row.reason) == (Verdict.FAILED, "all", "it crashed")
+
+
+def test_a_loose_bound_is_no_agreement(tree):
+    _, _, truth = tree
+    mass = truth.surface["total_mass"]
+    loose = replace(truth, surface={"total_mass": replace(mass, tolerance=mass.scale)})
+    assert verdicts(loose, {"total_mass": {"f": mass.value}}) == {"total_mass": Verdict.UNRESOLVED}
+
+
+def test_a_wrong_call_is_named(tree):
+    model, states, truth = tree
+    answers = evaluate_states("mujoco", model, states).surface["frame_angular_velocity_local"]
+    wrong = {call: value * (call != "mjtSensor.mjSENS_GYRO") for call, value in answers.items()}
+    evaluation = Evaluation([], None, None, 0.0, surface={"frame_angular_velocity_local": wrong})
+    (row,) = judge_surface(WHO, truth, evaluation)
+    assert row.verdict == Verdict.DISAGREES
+    assert "by mjtSensor.mjSENS_GYRO is off by" in row.reason and "too" not in row.reason
