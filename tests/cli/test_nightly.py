@@ -184,7 +184,7 @@ def test_a_night_is_whole_and_remembered(tmp_path):
     counted = result.random_batch.counts_by_verdict
     random = [r for r in read_table(place, "summary").to_pylist() if r["family"] == RANDOM_FAMILY]
     assert {r["scenario"] for r in random} == {"random-11-0", "random-mechanism-11-0"}
-    assert {r["level"] for r in random} == {"state", "step"}
+    assert {r["level"] for r in random} == {"state", "step", "surface"}
     assert counted.total() + len(kept) == len(random)
     assert stored["random_batch"]["scenarios"] == 2
     keys = {row.key for row in kept}

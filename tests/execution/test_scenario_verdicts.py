@@ -53,7 +53,7 @@ def test_states_follow_their_truth_and_are_judged_by_the_worker(engines):
     for task in cells:
         assert not bench.is_done
         found = outcome_of(task)
-        assert len(found.judge_result.rows) == 7
+        assert "state" in {row.level for row in found.judge_result.rows}
         bench.on_outcome(found)
     assert bench.is_done and len(bench.findings().rows) == 14
 
