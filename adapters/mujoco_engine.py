@@ -179,12 +179,12 @@ class Mujoco(MetamorphicHooks):
             soft = _SoftMechanism(model, self.option)
             with _raise_on_warnings(soft.tree.d):
                 return [_rigid_limit(soft, state) for state in states]
-        chain = MujocoChain(model, self.body_pieces(model), dense=self.option == DENSE)
+        chain = _MujocoChain(model, self.body_pieces(model), dense=self.option == DENSE)
         with _raise_on_warnings(chain.d):
             return [chain.quantities(state) for state in states]
 
     def _surface(self, model: Model, states: Sequence[State]) -> list[SurfaceAnswer]:
-        chain = MujocoChain(model, has_probes=True)
+        chain = _MujocoChain(model, has_probes=True)
         with _raise_on_warnings(chain.d):
             return [
                 surface_answer(chain.m, chain.d, chain.link_ids, chain.evaluate_forward(s)) for s in states
@@ -197,7 +197,7 @@ class Mujoco(MetamorphicHooks):
             raise Unsupported(TENDON_MOTIONS)
         if model.has_loops or self.option == HELD:
             return self._rigid_run(model, state, times, integrator, resolution)
-        return self._sampled_run(MujocoChain(model), state, times, integrator, resolution)
+        return self._sampled_run(_MujocoChain(model), state, times, integrator, resolution)
 
     def _rigid_run(
         self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
@@ -228,7 +228,7 @@ class Mujoco(MetamorphicHooks):
         return replace(runs[-1], **limit, limit_error=error)
 
     def _sampled_run(
-        self, chain: MujocoChain, state: State, times: Array, integrator: Integrator, resolution: float
+        self, chain: _MujocoChain, state: State, times: Array, integrator: Integrator, resolution: float
     ) -> Trajectory:
         chain.m.opt.timestep = resolution
         chain.m.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.name.upper()}")
@@ -268,7 +268,7 @@ class _Constraints:
     ties: tuple[_Tie, ...] = ()
 
 
-class MujocoChain:
+class _MujocoChain:
     """A compiled chain and its data.
 
     Engine body ids: ``link_ids[k]`` of link k, ``ball_ids`` of all bodies on ball joints.
@@ -530,7 +530,7 @@ class _SoftMechanism:
         held = joints_as_cylinders(self.opened) if option == HELD else self.opened
         added = added_motions(self.opened) if option == HELD else [() for _ in self.opened.kind]
         constraints = _Constraints(self.cut.ends if self.cut else (), tuple(added), tuple(ties))
-        self.tree = MujocoChain(held, dense=option == DENSE, constraints=constraints)
+        self.tree = _MujocoChain(held, dense=option == DENSE, constraints=constraints)
 
     def state(self, state: State) -> State:
         """The state of the tree."""

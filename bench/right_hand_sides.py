@@ -175,7 +175,7 @@ def mujoco_forward_call(model: Model, state: State) -> Call:
         The call that computes MuJoCo's accelerations.
 
     """
-    held = mujoco_engine.MujocoChain(model)
+    held = mujoco_engine._MujocoChain(model)
     held.set_state(state)
     return lambda: mujoco.mj_forward(held.m, held.d)
 

@@ -227,7 +227,7 @@ def proximal_gamma(k: int) -> Callable[[Model, State], Array]:
 
 
 M, P, E, R = "mujoco", "pinocchio", "exudyn", "reference"
-MUJOCO = "adapters.mujoco_engine:MujocoChain"
+MUJOCO = "adapters.mujoco_engine:_MujocoChain"
 X = np.array([1.0, 0.0, 0.0])
 
 STATE_DEFECTS = (

@@ -226,7 +226,7 @@ def _mujoco_run(step: Step) -> Callable[..., Trajectory]:
     """The run of MuJoCo's model by another step."""
 
     def run(_: Any, model: Model, state: State, times: Array, __: Integrator, h: float) -> Trajectory:
-        chain = mujoco_engine.MujocoChain(model)
+        chain = mujoco_engine._MujocoChain(model)
         chain.set_state(state)
         system, rows = MujocoSystem(chain), [chain.sample()]
         q, v = np.array(chain.d.qpos), np.array(chain.d.qvel)

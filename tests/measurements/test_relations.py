@@ -281,7 +281,7 @@ def test_mujoco_s_solvers_have_nothing_to_do(joints):
     usual = load_adapter("mujoco").evaluate(model, random_states_of(model))
     kinds, jacobians = ("PGS", "CG", "NEWTON"), ("DENSE", "SPARSE")
     for kind, jacobian in product(kinds, jacobians):
-        chain = engine.MujocoChain(model)
+        chain = engine._MujocoChain(model)
         chain.m.opt.solver = getattr(mujoco.mjtSolver, f"mjSOL_{kind}")
         chain.m.opt.jacobian = getattr(mujoco.mjtJacobian, f"mjJAC_{jacobian}")
         for at, right in zip(random_states_of(model), usual, strict=True):
