@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from plumbline.judging.rows import RUN_FAMILY, is_declared
+from plumbline.judging.rows import RUN_FAMILY
 from plumbline.model.datatypes import Model
 from plumbline.model.kinematics import state_from_minimal
 from reports import robot_drawing
@@ -52,7 +52,7 @@ def declared_gaps(results: Results) -> list[Record]:
     """Group what engines declare not to do, by engine and sentence."""
     gaps: dict[tuple[str, str, str], Record] = {}
     for row in results.rows:
-        if row["verdict"] == "unsupported" and is_declared(row["known_issue"]):
+        if row["is_declared"]:
             key = row["engine"], row["known_issue"], row["reason"]
             gap = gaps.setdefault(key, {"row": row, "count": 0, "scenarios": {}})
             gap["count"] += 1

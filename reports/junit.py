@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 
-from plumbline.judging.rows import is_declared
 from plumbline.storage.results_store import write_atomically
 from reports.stored_results import Record, Results
 from reports.verdicts import finding_by_row, format_number, needs_attention, shown_verdict
@@ -91,8 +90,8 @@ def _add_test_case(suite: ET.Element, row: Record, finding: str) -> str | None:
         return "errors" if kind == "error" else "failures"
     if row["verdict"] != "agrees":
         entry = row.get("known_issue")
-        is_recorded = entry and entry != OWN and not is_declared(entry)
-        expected = f"known issue {entry}; " if is_recorded else f"{entry}; " if entry else ""
+        kind = "declared: " if row.get("is_declared") else "known issue " if entry != OWN else ""
+        expected = f"{kind}{entry}; " if entry else ""
         ET.SubElement(case, "skipped", message=expected + message, type=shown_verdict(row))
         return "skipped"
     return None

@@ -45,13 +45,13 @@ RERUN_FOLDER = "repeated"
 MAX_MOTION_BYTES = 90_000  # of one scenario's motion, before compression
 POSE_LEVELS, DIFFERENCE_LEVELS = 1000, 24  # either side of 0: a pixel, and of magnified differences two
 SCALE_BITS = np.uint32(0xFFFE0000)  # of float32: 7 binary digits
-PROVED = "proved: "  # how a truth that is a certificate's midpoints begins
 _NUMBER_FIELDS = ("value", "tolerance", "uncertainty", "compared_until", "order", "user_rtol", "cpu_time")
 _TEXT_FIELDS = (
     "unit",
     "declared_order",
     "alias_of",
     "known_issue",
+    "is_declared",
     "diagnosis",
     "derivation",
     "engine_version",
@@ -170,7 +170,7 @@ def scenario_chunk(
     commands: dict[str, str] = {}
     for index in results.row_indices[name]:
         row = results.rows[index]
-        detail: Record = {k: row[k] for k in _TEXT_FIELDS if row.get(k) not in (None, "")}
+        detail: Record = {k: row[k] for k in _TEXT_FIELDS if row.get(k) not in (None, "", False)}
         detail |= {k: row[k] for k in _NUMBER_FIELDS if row.get(k) is not None}
         details.append(detail | {"extra": row.get("extra"), "script": results.scripts.get(row["key"])})
         level = "long" if row["quantity"] in LONG_RUN_QUANTITIES else row["level"]
@@ -253,7 +253,7 @@ def _departures(name: str, results: Results, tables: ScenarioTables) -> Record |
     """Find when each run leaves a motion that is proved; None where the truth is not proved."""
     scenario, curves = results.scenarios[name], tables["curves"].get(name, {})
     radius = scenario.get("truth_uncertainty")
-    if not curves or radius is None or not (scenario.get("truth") or "").startswith(PROVED):
+    if not curves or radius is None or not scenario["is_proved"]:
         return None
     found: list[Record] = []
     for (engine, integrator), rows in group_rows(curves, "engine", "integrator"):

@@ -135,9 +135,9 @@ def explain(
     if smallest.diagnosis and smallest.diagnosis != finding.sentence:
         yield from wrap(smallest.diagnosis, width, "")
     yield ""
-    level = f" --level {smallest.level}" if smallest.level in ("state", "step", "trajectory") else ""
-    level = " --level state" if smallest.level == "surface" else level
-    catalogue = f"plumbline run {smallest.scenario} --engine {smallest.engine}{level}"
+    level = "state" if smallest.level == "surface" else smallest.level
+    option = f" --level {level}" if level in ("state", "step", "trajectory") else ""
+    catalogue = f"plumbline run {smallest.scenario} --engine {smallest.engine}{option}"
     yield f"again:  {own_command or catalogue}"
     script = next((scripts[row.key] for row in finding.rows if row.key in scripts), None)
     if script:

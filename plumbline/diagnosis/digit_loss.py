@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import ParamSpec, TypeVar
 
 import numpy as np
 
 from plumbline.diagnosis.cause import Cause, CauseKind
 from plumbline.diagnosis.outputs import error_ratio
 from plumbline.diagnosis.prediction import QUANTITIES, Answers, Predictor, View
-from plumbline.model.datatypes import Array, Model, State, StateQuantities, StepRun
+from plumbline.model.datatypes import Array, EngineFailure, Model, State, StateQuantities, StepRun
 from plumbline.model.equivalent import (
     BODY_VECTORS,
     WORLD_VECTORS,
@@ -25,6 +26,7 @@ from plumbline.model.equivalent import (
     unrotate,
 )
 from plumbline.model.step_methods import JointSpaceMethod
+from plumbline.processes.exceptions import PlumblineError, describe_exception
 from plumbline.truth.ground_truth import StateTruth
 from plumbline.truth.rounding_bound import RoundingBound, state_rounding_bound
 from plumbline.truth.step_comparison import FormulaSteps
@@ -35,7 +37,20 @@ MIN_SCATTER = 0.3  # of the error; 0.5 to 1 where its digits are lost, about TUR
 MIN_COPY_ERROR = 0.02  # of the error; an engine that keeps the call before is off by about TURN in a copy
 MIN_GROWTH = 4.0  # of the error in rounding bounds, from half of the bodies to all
 
+# what `ask`, the equations and their bounds raise of problems that they refuse
+REFUSALS = (PlumblineError, ArithmeticError, np.linalg.LinAlgError)
+
 Evaluate = Callable[[Model, list[State]], list[StateQuantities]]
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
+
+
+def ask(engine: Callable[_P, _T], *given: _P.args, **named: _P.kwargs) -> _T:
+    """Call an engine; whatever it raises becomes an error of the project."""
+    try:
+        return engine(*given, **named)
+    except Exception as error:  # an engine may raise anything
+        raise EngineFailure(describe_exception(error)) from error
 
 
 def scatter_cause(quantities: Sequence[str], scatter: float) -> Cause:
@@ -130,7 +145,7 @@ def find_digit_loss(problem: Problem, evaluate: Evaluate) -> DigitLoss | None:
     try:
         scatter = _measure_scatter(problem, evaluate)
         return DigitLoss(scatter, _ratios(problem, evaluate)) if scatter >= MIN_SCATTER else None
-    except Exception:  # an engine may raise anything; then nothing is known about its digits
+    except REFUSALS:
         return None
 
 
@@ -143,7 +158,7 @@ def measure_scatter(problem: Problem, evaluate: Evaluate) -> float | None:
     """
     try:
         return _measure_scatter(problem, evaluate)
-    except Exception:  # as above
+    except REFUSALS:
         return None
 
 
@@ -170,11 +185,11 @@ def measure_step_scatter(
         # turning an error back would change it by the angle only
         errors = []
         for turned, turned_state in problems:
-            run = step(turned, turned_state)
+            run = ask(step, turned, turned_state)
             formula = FormulaSteps(method, turned, [turned_state], [(0, h, run.angle_axes)])
             errors.append(formula.residuals(method, [run]))
         return _scatter(np.array(errors[1:]), errors[0])
-    except Exception:  # as above
+    except REFUSALS:
         return None
 
 
@@ -182,11 +197,11 @@ def _measure_scatter(problem: Problem, evaluate: Evaluate) -> float:
     model, state = problem.model, problem.state
     rng = np.random.default_rng(0)
     errors = []
-    evaluate(model, [state])  # an engine that keeps something of the call before keeps it of this problem
+    ask(evaluate, model, [state])  # what an engine keeps of the call before is then of this problem
     for _ in range(COPIES):
         world, body = (_tiny_rotation(rng) for _ in range(2))
         turned, turned_state = rotate_body_frames(*rotate_world(model, state, world), body)
-        (answer,) = evaluate(turned, [turned_state])
+        (answer,) = ask(evaluate, turned, [turned_state])
         values = {name: np.asarray(getattr(answer, name), float)[None] for name in problem.right}
         values = unrotate(unrotate(values, WORLD_VECTORS, world), BODY_VECTORS, body)
         errors.append(problem.weighted({name: x[0] - problem.right[name] for name, x in values.items()}))
@@ -220,9 +235,9 @@ def _ratios(problem: Problem, evaluate: Evaluate) -> dict[int, float]:
     for n in sorted({-(-model.n // 2), -(-model.n // 4)} - {model.n}, reverse=True):
         short, at = bodies_between(model, problem.state, 0, n)
         try:
-            right, (answer,) = Predictor(short, [at], View()).right, evaluate(short, [at])
+            right, (answer,) = Predictor(short, [at], View()).right, ask(evaluate, short, [at])
             bound = state_rounding_bound(short, at)
-        except Exception:  # the engine or the equations may refuse a part of the mechanism
+        except REFUSALS:  # of a part of the mechanism
             continue
         ratios[n] = max(
             _ratio(np.asarray(getattr(answer, q), float) - right[q][0], q, bound) for q in problem.right

@@ -13,7 +13,7 @@ from itertools import combinations, islice
 
 import numpy as np
 
-from plumbline.diagnosis.digit_loss import Evaluate
+from plumbline.diagnosis.digit_loss import REFUSALS, Evaluate, ask
 from plumbline.diagnosis.outputs import error_ratio
 from plumbline.diagnosis.prediction import Predictor, View
 from plumbline.model.datatypes import BODY_FIELDS, JOINT_ELEMENTS, JOINT_FIELDS, KINDS, Flags, Model, State
@@ -93,7 +93,7 @@ def _vanished(ways: Iterable[Problem], quantities: Collection[str], evaluate: Ev
         try:
             left -= _wrong(model, states, left, evaluate)
             is_answered = True
-        except Exception:  # an engine may raise anything
+        except REFUSALS:
             continue
         if not left:
             break
@@ -227,7 +227,7 @@ def _reduced(model: Model, states: list[State], kept: list[int]) -> Problem:
 
 def _wrong(model: Model, states: list[State], quantities: Collection[str], evaluate: Evaluate) -> set[str]:
     """Those of the quantities that differ from what is right at one of the states."""
-    answers, right = evaluate(model, states), Predictor(model, states, View()).right
+    answers, right = ask(evaluate, model, states), Predictor(model, states, View()).right
     bounds = rounding_bounds(model, states)
     wrong = set()
     for q in quantities:

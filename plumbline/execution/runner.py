@@ -36,7 +36,7 @@ from plumbline.execution.scenario_verdicts import ScenarioRun
 from plumbline.judging import known_issues
 from plumbline.judging.findings import Finding, find_findings
 from plumbline.judging.identity import RUN_SCENARIO, IdentityCheck
-from plumbline.judging.rows import RUN_FAMILY, Row, Verdict, is_declared
+from plumbline.judging.rows import RUN_FAMILY, Row, Verdict
 from plumbline.layout import IS_INSTALLED
 from plumbline.processes.cpu_time import CpuTimes
 from plumbline.processes.processor import processor_name
@@ -363,7 +363,7 @@ def summarize_verdicts(result: RunResult) -> str:
             part += f" ({'; '.join(named[:3])}{more})"
         # rows of random scenarios that are only counted are expected, except where there is nothing to expect
         if verdict.needs_attention and count > len(new):
-            declared = sum(is_declared(row.known_issue) for row in rows)
+            declared = sum(row.is_declared for row in rows)
             expected = {"as declared": declared, "as recorded": count - len(new) - declared}
             part += _share(expected, count)
         parts.append(part)

@@ -325,6 +325,7 @@ class ScenarioRun:
                 "horizon": truth.horizon,
                 "growth": float(truth.growth[-1]),
                 "truth": truth.method,
+                "is_proved": truth.is_proved,
                 "truth_uncertainty": float(truth.uncertainty["position"][-1]),
             }
         return about

@@ -20,7 +20,7 @@ from typing import Any
 from packaging.version import InvalidVersion, Version
 
 from plumbline.diagnosis.cause import Cause, describe, join_words
-from plumbline.judging.rows import VERDICT_STYLES, Row, Verdict, is_declared
+from plumbline.judging.rows import VERDICT_STYLES, Row, Verdict
 
 CLASSES = {  # of quantities, in the order in which one follows from another
     "accelerations": ("acceleration", "angular_acceleration"),
@@ -136,8 +136,7 @@ def find_findings(rows: Iterable[Row], bodies: Mapping[str, int]) -> list[Findin
 
     """
     every = list(rows)
-    wrong = [row for row in every if Verdict(row.verdict).needs_attention]
-    wrong = [row for row in wrong if not is_declared(row.known_issue)]
+    wrong = [row for row in every if Verdict(row.verdict).needs_attention and not row.is_declared]
     groups = _Groups()
     for row in wrong:
         if row.known_issue is not None:

@@ -39,7 +39,7 @@ from plumbline.diagnosis.cause import CauseKind
 from plumbline.engines.declared_names import declared_integrators, declared_texts
 from plumbline.engines.registry import ENGINES, IMPORTERS, USER_ENGINES
 from plumbline.importers.neutral_model import MODEL_UNITS
-from plumbline.judging.rows import DECLARED_PREFIX, Level, Row, Verdict
+from plumbline.judging.rows import Level, Row, Verdict
 from plumbline.judging.state_level import SINGULAR_POSE, STATE_UNITS
 from plumbline.measurements.relation_result import OTHER_FORMULATIONS, REPEATABILITY, UNEXPLAINED
 from plumbline.measurements.run_relations import REVERSED_IN_TIME
@@ -343,8 +343,6 @@ class _Entry(_Selector):
     @field_validator("id")
     @classmethod
     def _check_id(cls, text: str) -> str:
-        if text.startswith(DECLARED_PREFIX):
-            raise invalid_value_error(f"is {shorten(repr(text))}", f"an id without {DECLARED_PREFIX!r}")
         if not text or not text.isprintable():
             raise invalid_value_error(f"is {shorten(repr(text))}", "one line of printable text")
         return text
@@ -602,7 +600,7 @@ class KnownIssues:
                 diagnosis = (
                     f"{diagnosis} Checked: without it {row.extra[UNEXPLAINED]:.2g} tolerances are left."
                 )
-            return replace(row, known_issue=match.name, diagnosis=diagnosis)
+            return replace(row, known_issue=match.name, is_declared=False, diagnosis=diagnosis)
         return replace(row, reason=f"{row.reason}; {objections[0]}") if objections else row
 
     def wide_issues(self) -> list[str]:

@@ -72,7 +72,6 @@ VERDICT_STYLES = {
         "i", "are information", "implied by other rows, or not compared: not a check", 0, 0
     ),
 }
-DECLARED_PREFIX = "declared: "
 RUN_FAMILY = "run"  # of a row that is about the whole run, in place of a scenario's family
 RECORDED = "recorded"  # what terminal and report show for a disagreement or failure that is recorded
 SHOWN_STYLES: dict[str, VerdictStyle] = {
@@ -82,16 +81,6 @@ SHOWN_STYLES: dict[str, VerdictStyle] = {
     ),
 }
 ATTENTION_SEVERITY = 6  # from here on a verdict needs attention
-
-
-def is_declared(known_issue: str | None) -> bool:
-    """Return whether a gap is expected because the engine's column declares it.
-
-    Returns:
-        Whether it names a declared gap.
-
-    """
-    return known_issue is not None and known_issue.startswith(DECLARED_PREFIX)
 
 
 def shown_verdict(verdict: str, known_issue: str | None) -> str:
@@ -179,9 +168,9 @@ class Row:
     order: float | None = None  # observed order
     declared_order: int | None = None
     alias_of: str | None = None
-    # id of the entry of known_issues.yaml that expects this verdict, or `DECLARED_PREFIX` and a gap that the
-    # engine's column declares
+    # what expects this verdict: id of an entry of known_issues.yaml, or a gap that the column declares
     known_issue: str | None = None
+    is_declared: bool = False  # whether it is such a gap
     diagnosis: str | None = None  # the wrong term, in a sentence
     causes: tuple[dict[str, Any], ...] = ()  # the same as data: of each cause its fields
     user_rtol: float | None = None  # the user's own tolerance, shown beside the verdict
@@ -239,7 +228,7 @@ class RowContext:
         """
         more = {"value": None, "tolerance": None} | more
         if gap and verdict == Verdict.UNSUPPORTED:
-            more["known_issue"] = DECLARED_PREFIX + gap
+            more |= {"known_issue": gap, "is_declared": True}
         if more.get("ratio") is None:
             more["ratio"] = error_ratio(more["value"], more["tolerance"])
         return Row(

@@ -149,7 +149,7 @@ def feature_words(features: Sequence[Feature], shown: str) -> str:
     for what, count in counted.items():
         source = first[what].source
         place = f"line {source.line}" if source.file == shown else str(source)
-        place = ", ".join(filter(None, (first[what].name, place)))  # an element of no body has no name
+        place = ", ".join(filter(None, (first[what].name, place)))  # elements outside of bodies have no name
         words.append(f"{count} × {what} ({place}{' …' if count > 1 else ''})")
     return ", ".join(words)
 

@@ -73,6 +73,7 @@ class _Scenario(_Part):
     growth: float | None = None
     truth: str | None = None
     truth_uncertainty: float | None = None
+    is_proved: bool = False
     model: dict[str, Any] | None = None
     state: dict[str, Any] | None = None
 
@@ -209,6 +210,7 @@ class _Row(_Part):
     declared_order: _Count | None
     alias_of: str | None
     known_issue: str | None
+    is_declared: bool
     diagnosis: str | None
     causes: list[_Cause]
     user_rtol: float | None

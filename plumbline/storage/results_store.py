@@ -28,8 +28,8 @@ from plumbline.storage.results_schema import DamagedResults, check_results
 from plumbline.storage.schema_upgrade import upgrade_document, upgrade_summary
 
 Record = dict[str, Any]
-SCHEMA_VERSION = 5
-READABLE_VERSIONS = (1, 2, 3, 4, 5)
+SCHEMA_VERSION = 6
+READABLE_VERSIONS = (1, 2, 3, 4, 5, 6)
 TEXT = pa.string()
 REAL = pa.float64()
 INTEGER = pa.int32()
@@ -47,8 +47,8 @@ TABLES: dict[str, pa.Schema] = {
         key=TEXT, scenario=TEXT, family=TEXT, engine=TEXT, engine_version=TEXT, level=TEXT, integrator=TEXT,
         quantity=TEXT, unit=TEXT, value=REAL, tolerance=REAL, verdict=TEXT, reason=TEXT, ratio=REAL,
         derivation=TEXT, uncertainty=REAL, compared_until=REAL, order=REAL, declared_order=INTEGER,
-        alias_of=TEXT, known_issue=TEXT, diagnosis=TEXT, causes=TEXT, user_rtol=REAL, cpu_time=REAL,
-        extra=TEXT,
+        alias_of=TEXT, known_issue=TEXT, is_declared=pa.bool_(), diagnosis=TEXT, causes=TEXT, user_rtol=REAL,
+        cpu_time=REAL, extra=TEXT,
     ),
     "states": _schema(
         **_CELL_COLUMNS, quantity=TEXT, state=INTEGER, body=INTEGER, error=REAL, bound=REAL, scale=REAL,

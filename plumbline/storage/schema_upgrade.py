@@ -30,6 +30,7 @@ _INTEGRATOR_NAMES = {
     "solver": "solver_rtol",
     "tightest": "min_rtol",
 }
+_DECLARED, _PROVED = "declared: ", "proved: "  # how gaps and truths of certificates began before version 6
 _RUN_NAMES = {"probes": "random_batch", "instrument": "self_test", "stale": "stale_issues"}
 _RANDOM_BATCH_NAMES = {"folded": "counts_by_verdict", "worst": "worst_ratios"}
 
@@ -40,7 +41,8 @@ def upgrade_document(document: Record) -> Record:
     Returns:
         The document with the present names.  In version 1 the ratio of a row was in its ``extra``, or
         followed from its value and tolerance; before version 3 causes were sentences only, before 4 nothing
-        was grouped by cause, and before 5 chains had fields of their own.
+        was grouped by cause, before 5 chains had fields of their own, and before 6 the beginnings of texts
+        told declared gaps and proved motions.
 
     """
     if document["schema_version"] == 1:
@@ -48,13 +50,29 @@ def upgrade_document(document: Record) -> Record:
     if document["schema_version"] == 2:
         rows = [row | {"causes": []} for row in document["rows"]]
         document = document | {"schema_version": 3, "rows": rows}
+    if document["schema_version"] < 6:
+        rows = [row | _expected_by(row["known_issue"]) for row in document["rows"]]
+        document = document | {"rows": rows}
     if document["schema_version"] == 3:
         found = findings_of_records(document["rows"], document["scenarios"])
         document = document | {"schema_version": 4, "findings": [finding.record() for finding in found]}
     if document["schema_version"] == 4:
         scenarios = {name: _with_joints(about) for name, about in document["scenarios"].items()}
         document = document | {"schema_version": 5, "scenarios": scenarios}
+    if document["schema_version"] == 5:
+        scenarios = {
+            name: about | {"is_proved": (about.get("truth") or "").startswith(_PROVED)}
+            for name, about in document["scenarios"].items()
+        }
+        document = document | {"schema_version": 6, "scenarios": scenarios}
     return document
+
+
+def _expected_by(known_issue: str | None) -> Record:
+    """What expects a verdict, and whether it is a gap that the engine's column declares."""
+    text = known_issue or ""
+    is_declared = text.startswith(_DECLARED)
+    return {"known_issue": text.removeprefix(_DECLARED) or None, "is_declared": is_declared}
 
 
 def _with_joints(about: Record) -> Record:
@@ -111,13 +129,19 @@ def upgrade_summary(table: pa.Table) -> pa.Table:
         table: the content of summary.parquet, all columns.
 
     Returns:
-        The table with the present names and the columns ``ratio`` and ``causes``.
+        The table with the present names and the columns ``ratio``, ``causes`` and ``is_declared``.
 
     """
     if "ratio" not in table.column_names:
         table = _upgrade_first_summary(table)
     if "causes" not in table.column_names:
         table = table.append_column("causes", pa.array(["[]"] * len(table), pa.string()))
+    if "is_declared" not in table.column_names:
+        split = [_expected_by(text) for text in table.column("known_issue").to_pylist()]
+        names = pa.array([one["known_issue"] for one in split], pa.string())
+        table = table.set_column(table.column_names.index("known_issue"), "known_issue", names)
+        are_declared = pa.array([one["is_declared"] for one in split], pa.bool_())
+        table = table.append_column("is_declared", are_declared)
     return table
 
 

@@ -205,7 +205,7 @@ def _smaller(document: Document) -> Iterator[Document]:
     for k, closing in enumerate(document.get("closes") or ()):
         changed = _without(document, "closes", k)
         for body in changed["bodies"]:
-            if body.get("name") == closing["body"]:  # it hangs on the closing joint alone
+            if body.get("name") == closing["body"]:  # the closing joint becomes its own
                 kept = {name: body[name] for name in CONTENT if name in body}
                 body.clear()
                 body |= kept | {name: x for name, x in closing.items() if name != "body"}

@@ -62,6 +62,7 @@ class MotionTruth:
     method: str
     conflict: str = ""  # how the two methods differ by more than rounding explains; empty where they do not
     singular: str = ""  # why the motion ends before the scenario does: a pose that is singular, or nearly so
+    is_proved: bool = False  # whether a certificate encloses it
 
     @property
     def horizon(self) -> float:
@@ -170,6 +171,7 @@ def motion_truth(
         if differ
         else "",
         singular=singular,
+        is_proved=proof is not None,
     )
 
 

@@ -215,7 +215,7 @@ function derivation(row) {
   entry("Horizon", row.compared_until === undefined ? null : `${number(row.compared_until, 3)} s, up to which positions were compared`);
   entry("Order", row.order === undefined ? null : `observed ${number(row.order, 4)}${row.declared_order ? `, declared ${row.declared_order}` : ""}`);
   entry("Alias", row.alias_of ? `equals ${row.alias_of} here, so it is not independent evidence` : null);
-  entry("Known issue", row.known_issue);
+  entry(row.is_declared ? "Declared gap" : "Known issue", row.known_issue);
   entry("Your tolerance", row.user_rtol === undefined ? null : `${number(row.user_rtol)} ${unitOf(row.unit)}: the error is ${(row.value ?? Infinity) <= row.user_rtol ? "within" : "above"} the tolerance given on the command line; the verdict does not depend on it`);
   for (const [name, value] of Object.entries(row.extra ?? {})) {
     const [label, unit] = EXTRA[name] ?? [name.replaceAll("_", " "), ""];

@@ -13,7 +13,7 @@ export interface Index {
 
 export interface RowDetail {
   unit?: string; value?: number | null; tolerance?: number | null; uncertainty?: number | null; compared_until?: number | null;
-  order?: number | null; declared_order?: number; alias_of?: string; known_issue?: string; diagnosis?: string; user_rtol?: number;
+  order?: number | null; declared_order?: number; alias_of?: string; known_issue?: string; is_declared?: boolean; diagnosis?: string; user_rtol?: number;
   cpu_time?: number; derivation?: string; extra?: Record<string, number | null>; script?: string; engine_version?: string;
 }
 

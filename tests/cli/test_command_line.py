@@ -160,8 +160,8 @@ def test_numbers_agree_with_their_nouns():
     assert count_noun(2, "body", "bodies") == "2 bodies"
 
 
-def row(verdict, known_issue=None, quantity="q"):
-    return CONTEXT.make_row("state", "-", quantity, Verdict(verdict), "why", known_issue=known_issue)
+def row(verdict, known_issue=None, quantity="q", **more):
+    return CONTEXT.make_row("state", "-", quantity, Verdict(verdict), "why", known_issue=known_issue, **more)
 
 
 def result_of(rows, stale=0, own=frozenset()):
@@ -206,7 +206,7 @@ def test_information_is_counted_apart_and_changes_no_exit_code():
 
 def test_the_summary_says_why_rows_were_expected():
     known = [row("disagrees", "entry"), row("unsupported", "entry"), *2 * [row("unresolved", "entry")]]
-    declared = 2 * [row("unsupported", "declared: loops")]
+    declared = 2 * [row("unsupported", "loops", is_declared=True)]
     assert summarize_verdicts(result_of([*known, *declared, row("unresolved")])) == (
         "4 independent checks: 1 disagrees as recorded, 3 unresolved (2 as recorded), "
         "3 unsupported (2 as declared, 1 as recorded)"

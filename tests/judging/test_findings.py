@@ -149,7 +149,7 @@ def test_a_cause_is_about_its_own_quantities():
 def test_recorded_rows_are_one_finding_by_entry_and_declared_gaps_are_none():
     rows = [
         row("small", known_issue="known"), row("large", known_issue="known", quantity="acceleration"),
-        row("small", verdict=Verdict.UNSUPPORTED, known_issue="declared: joints", quantity="all"),
+        row("small", verdict=Verdict.UNSUPPORTED, known_issue="joints", is_declared=True, quantity="all"),
         row("small", verdict=Verdict.UNSUPPORTED, quantity="order"),
     ]  # fmt: skip
     new, known = find_findings(rows, BODIES)

@@ -491,15 +491,6 @@ def test_a_ratio_that_no_cause_explains_is_refused(field, tmp_path):
         known_issues.load_known_issues(path)
 
 
-def test_an_id_cannot_look_like_a_declared_gap(tmp_path):
-    path = tmp_path / "known.yaml"
-    path.write_text(
-        "- {id: 'declared: rods', scenario: rest, engine: mujoco, verdict: failed, evidence: e, reason: r}\n"
-    )
-    with pytest.raises(ScenarioError, match="an id without 'declared: '"):
-        known_issues.load_known_issues(path)
-
-
 CAUSE = {"kind": "output", "term": "joint reaction", "change": "without the springs between points"}
 
 

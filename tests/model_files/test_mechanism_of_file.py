@@ -203,7 +203,7 @@ def test_a_robot_runs_and_what_is_left_out_comes_first(robot, tmp_path):
     first = found.stderr.splitlines()[0]
     assert "1 × limit (shoulder, line" in first
     assert "1 × mimic (grip, line" in first
-    assert "1 × gazebo (line" in first  # an element of no link
+    assert "1 × gazebo (line" in first  # an element outside of the links
     assert "contacts" in first
 
 

@@ -477,9 +477,12 @@ def test_gaps_of_one_reason_are_one_finding_and_declared_ones_have_a_page(out):
     results = Results.load(out)
     gap = next(row for row in results.rows if row["verdict"] == "unsupported")
     names = list(results.scenarios)
-    rows = [{**gap, "known_issue": None, "scenario": name, "key": f"{name}/a"} for name in names]
-    rows += [{**gap, "known_issue": None, "reason": "another"}]
-    declared = [{**gap, "known_issue": "declared: x", "scenario": n, "key": f"{n}/b"} for n in names]
+    gap |= {"known_issue": None, "is_declared": False}
+    rows = [{**gap, "scenario": name, "key": f"{name}/a"} for name in names]
+    rows += [{**gap, "reason": "another"}]
+    declared = [
+        {**gap, "known_issue": "x", "is_declared": True, "scenario": n, "key": f"{n}/b"} for n in names
+    ]
     shown = replace(results, rows=[*rows, *declared])
     first, second = findings_for_page(shown, History())
     assert {len(first["scenarios"]), len(second["scenarios"])} == {len(names), 1}

@@ -151,7 +151,7 @@ SPOILED = {
     truncate_json: "results.json: not a results file",
     truncate_parquet: "summary.parquet: is damaged",
     delete_parquet: "summary.parquet",
-    change_schema_version: "results.json: schema_version 99, this version reads 5",
+    change_schema_version: "results.json: schema_version 99, this version reads 6",
     change_verdict: "results.json: rows[0].verdict: is 'accords'; valid would be one of agrees, disagrees",
     change_verdict_of_the_table: "summary.parquet has the verdict 'accords', which no run gives",
     replace_by_a_pipe: "results.json: not a results file of plumbline (ValueError: it is not a regular file)",
