@@ -7,32 +7,57 @@ here into those of the probe frame.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from adapters.exudyn_common import Output, items
-from plumbline.model.datatypes import Array, Model, SurfaceAnswer
+from plumbline.model.datatypes import Array, Call, Model, SurfaceAnswer
 from plumbline.model.kinematics import rotation_matrix
 from plumbline.model.probe_frames import PROBE_ATTITUDE, probe_points
 
-# By output of a body the quantity; nodes and markers have some of them.
-OUTPUTS = {
-    "Position": "frame_position",
-    "RotationMatrix": "frame_axes",
-    "Velocity": "frame_velocity",
-    "VelocityLocal": "frame_velocity_local",
-    "AngularVelocity": "frame_angular_velocity",
-    "AngularVelocityLocal": "frame_angular_velocity_local",
-    "Acceleration": "frame_acceleration",
-    "AccelerationLocal": "frame_acceleration_local",
-    "AngularAcceleration": "frame_angular_acceleration",
-    "AngularAccelerationLocal": "frame_angular_acceleration_local",
-}
-MARKER_OUTPUTS = ("Position", "RotationMatrix", "Velocity", "AngularVelocity", "AngularVelocityLocal")
-NODE_OUTPUTS = (*MARKER_OUTPUTS, "Acceleration", "AngularAcceleration")
 TURN = rotation_matrix(PROBE_ATTITUDE)
+
+
+def _as_given(values: Array) -> Array:
+    return values
+
+
+def _in_probe_axes(values: Array) -> Array:
+    return values @ TURN
+
+
+def _axes(values: Array) -> Array:
+    return (values.reshape(-1, 3, 3) @ TURN).mT.reshape(-1, 3)
+
+
+class _Output(NamedTuple):
+    """What an output of bodies, nodes and markers is."""
+
+    quantity: str  # at a point
+    of_node: str = ""  # the same at a centre of mass, where nodes are; empty: nodes have no such output
+    has_marker: bool = False  # whether markers have it
+    read: Callable[[Array], Array] = _as_given
+
+
+OUTPUTS = {
+    "Position": _Output("frame_position", "body_position", True),
+    "RotationMatrix": _Output("frame_axes", "frame_axes", True, _axes),
+    "Velocity": _Output("frame_velocity", "body_velocity", True),
+    "VelocityLocal": _Output("frame_velocity_local", read=_in_probe_axes),
+    "AngularVelocity": _Output("frame_angular_velocity", "frame_angular_velocity", True),
+    "AngularVelocityLocal": _Output(
+        "frame_angular_velocity_local", "frame_angular_velocity_local", True, _in_probe_axes
+    ),
+    "Acceleration": _Output("frame_acceleration", "body_acceleration"),
+    "AccelerationLocal": _Output("frame_acceleration_local", read=_in_probe_axes),
+    "AngularAcceleration": _Output("frame_angular_acceleration", "frame_angular_acceleration"),
+    "AngularAccelerationLocal": _Output("frame_angular_acceleration_local", read=_in_probe_axes),
+}
+OF_BODIES = {name: output.quantity for name, output in OUTPUTS.items()}
+OF_NODES = {name: output.of_node for name, output in OUTPUTS.items() if output.of_node}
+OF_MARKERS = {name: output.quantity for name, output in OUTPUTS.items() if output.has_marker}
 
 
 class Probes:
@@ -47,45 +72,37 @@ class Probes:
             for body, point in zip(bodies, self.points, strict=True)
         ]
         silent = {"writeToFile": False, "storeInternal": False}
-        self.sensors: dict[tuple[str, str], list[Any]] = defaultdict(list)
+        self.sensors: dict[tuple[str, str, str], list[Any]] = defaultdict(list)  # by kind, output, quantity
         for body, point, node, marker in zip(bodies, self.points, nodes, self.markers, strict=True):
-            places = {
-                "SensorBody": (OUTPUTS, {"bodyNumber": body, "localPosition": point}),
-                "SensorNode": (NODE_OUTPUTS, {"nodeNumber": node}),
-                "SensorMarker": (MARKER_OUTPUTS, {"markerNumber": marker}),
+            places: Mapping[str, tuple[Mapping[str, str], Mapping[str, Any]]] = {
+                "SensorBody": (OF_BODIES, {"bodyNumber": body, "localPosition": point}),
+                "SensorNode": (OF_NODES, {"nodeNumber": node}),
+                "SensorMarker": (OF_MARKERS, {"markerNumber": marker}),
             }
-            for kind, (names, place) in places.items():
-                for name in names:
+            for kind, (quantities, place) in places.items():
+                for name, quantity in quantities.items():
                     item = getattr(items, kind)(**place, outputVariableType=getattr(Output, name), **silent)
-                    self.sensors[kind, name].append(mbs.AddSensor(item))
+                    self.sensors[kind, name, quantity].append(mbs.AddSensor(item))
 
     def answer(self) -> SurfaceAnswer:
         """Read all at the current state."""
-        mbs, found = self.mbs, dict[str, dict[str, Array]]()
-        bodies = list(zip(self.bodies, self.points, strict=True))
-        for name in OUTPUTS:
-            values = [mbs.GetObjectOutputBody(body, getattr(Output, name), point) for body, point in bodies]
-            self._add(found, name, "MainSystem.GetObjectOutputBody", values)
-        for function, names, numbers in (
-            ("GetNodeOutput", NODE_OUTPUTS, self.nodes),
-            ("GetMarkerOutput", MARKER_OUTPUTS, self.markers),
-        ):
-            for name in names:
-                values = [getattr(mbs, function)(item, getattr(Output, name)) for item in numbers]
-                self._add(found, name, f"MainSystem.{function}", values)
-        for (kind, name), sensors in self.sensors.items():
-            call = f"MainSystem.GetSensorValues, itemInterface.{kind}"
-            self._add(found, name, call, [mbs.GetSensorValues(sensor) for sensor in sensors])
+        mbs, found = self.mbs, defaultdict[str, dict[Call, Array]](dict)
+        places = (
+            ("GetObjectOutputBody", OF_BODIES, list(zip(self.bodies, self.points, strict=True))),
+            ("GetNodeOutput", OF_NODES, [(node,) for node in self.nodes]),
+            ("GetMarkerOutput", OF_MARKERS, [(marker,) for marker in self.markers]),
+        )
+        read: list[tuple[str, str, Call, list[Any]]] = [
+            (quantity, name, (f"MainSystem.{function}",),
+             [getattr(mbs, function)(item, getattr(Output, name), *point) for item, *point in given])
+            for function, quantities, given in places
+            for name, quantity in quantities.items()
+        ]  # fmt: skip
+        read += [
+            (quantity, name, ("MainSystem.GetSensorValues", f"itemInterface.{kind}"),
+             [mbs.GetSensorValues(sensor) for sensor in sensors])
+            for (kind, name, quantity), sensors in self.sensors.items()
+        ]  # fmt: skip
+        for quantity, name, call, values in read:
+            found[quantity][*call, f"OutputVariableType.{name}"] = OUTPUTS[name].read(np.array(values))
         return found
-
-    @staticmethod
-    def _add(found: dict[str, dict[str, Array]], name: str, call: str, values: list[Any]) -> None:
-        quantity, vectors = OUTPUTS[name], np.array(values)
-        if "Node" in call:  # nodes are at the centres of mass
-            for what in ("position", "velocity", "acceleration"):
-                quantity = quantity.replace(f"frame_{what}", f"body_{what}")
-        if name == "RotationMatrix":
-            vectors = (vectors.reshape(-1, 3, 3) @ TURN).mT.reshape(-1, 3)
-        if name.endswith("Local"):
-            vectors = vectors @ TURN
-        found.setdefault(quantity, {})[f"{call}, OutputVariableType.{name}"] = vectors

@@ -14,7 +14,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from plumbline.model.datatypes import Array, Float, Model, SurfaceAnswer
+from plumbline.model.datatypes import Array, Call, Float, Model, SurfaceAnswer
 from plumbline.model.kinematics import rotation_matrix
 from plumbline.model.probe_frames import PROBE_ATTITUDE, probe_points
 
@@ -40,7 +40,22 @@ SENSORS = {
     "SUBTREEANGMOM": (BODY, "subtree_angular_momentum"),
 }
 AXES = ("FRAMEXAXIS", "FRAMEYAXIS", "FRAMEZAXIS")
-Found = dict[str, dict[str, Array]]
+# By function of an object's motion the quantities of its two halves, rotation and point.
+OBJECT_MOTIONS = {
+    "mj_objectVelocity": ("frame_angular_velocity", "frame_velocity"),
+    "mj_objectAcceleration": ("frame_angular_acceleration", "frame_proper_acceleration"),
+}
+# By function of a Jacobian the quantities of its two parts, point and rotation.
+JACOBIANS = {
+    "mj_jac": ("frame_velocity", "frame_angular_velocity"),
+    "mj_jacSite": ("frame_velocity", "frame_angular_velocity"),
+    "mj_jacBody": ("body_velocity", "frame_angular_velocity"),
+    "mj_jacBodyCom": ("body_velocity", "frame_angular_velocity"),
+    "mj_jacDot": ("frame_acceleration", "frame_angular_acceleration"),
+    "mj_jacSubtreeCom": ("subtree_velocity",),
+    "mj_angmomMat": ("subtree_angular_momentum",),
+}
+Found = dict[str, dict[Call, Array]]
 
 
 def add_probes(spec: Any, links: Sequence[Any], model: Model) -> None:
@@ -82,70 +97,63 @@ def _add_sensors(found: Found, m: Any, d: Any, count: int) -> None:
     turn = rotation_matrix(read.pop("FRAMEQUAT"))
     axes = [read.pop(name) for name in AXES]
     found["frame_axes"] |= {
-        "mjtSensor.mjSENS_FRAMEQUAT": turn.mT.reshape(-1, 3),
-        ", ".join(f"mjtSensor.mjSENS_{name}" for name in AXES): np.stack(axes, 1).reshape(-1, 3),
+        ("mjtSensor.mjSENS_FRAMEQUAT",): turn.mT.reshape(-1, 3),
+        tuple(f"mjtSensor.mjSENS_{name}" for name in AXES): np.stack(axes, 1).reshape(-1, 3),
     }
     for name, value in read.items():
-        found[SENSORS[name][1]][f"mjtSensor.mjSENS_{name}"] = value
+        found[SENSORS[name][1]][f"mjtSensor.mjSENS_{name}",] = value
 
 
 def _add_frames(found: Found, m: Any, d: Any, links: Sequence[int], sites: Sequence[int]) -> None:
-    found["frame_position"]["MjData.site_xpos"] = d.site_xpos[sites].copy()
-    found["frame_axes"]["MjData.site_xmat"] = d.site_xmat[sites].reshape(-1, 3, 3).mT.reshape(-1, 3).copy()
-    found["body_position"] |= {"MjData.xpos": d.xpos[links].copy(), "MjData.xipos": d.xipos[links].copy()}
-    spatial: dict[tuple[str, str, bool], list[Array]] = defaultdict(list)
-    for site in sites:
-        for is_local in (False, True):
-            for what, function in (
-                ("velocity", "mj_objectVelocity"),
-                ("acceleration", "mj_objectAcceleration"),
-            ):
-                out = np.empty(6)
-                getattr(mujoco, function)(m, d, mujoco.mjtObj.mjOBJ_SITE, site, out, int(is_local))
-                spatial[what, function, is_local].append(out)
-    for (what, function, is_local), values in spatial.items():
-        suffix, vectors = "_local" * is_local, np.array(values)
-        proper = "proper_" * (what == "acceleration")
-        found[f"frame_{proper}{what}{suffix}"][function] = vectors[:, 3:].copy()
-        found[f"frame_angular_{what}{suffix}"][function] = vectors[:, :3].copy()
+    found["frame_position"]["MjData.site_xpos",] = d.site_xpos[sites].copy()
+    found["frame_axes"]["MjData.site_xmat",] = d.site_xmat[sites].reshape(-1, 3, 3).mT.reshape(-1, 3).copy()
+    found["body_position"] |= {
+        ("MjData.xpos",): d.xpos[links].copy(),
+        ("MjData.xipos",): d.xipos[links].copy(),
+    }
+    for function, quantities in OBJECT_MOTIONS.items():
+        for is_local, suffix in enumerate(("", "_local")):
+            vectors = np.empty((len(sites), 6))
+            for site, out in zip(sites, vectors, strict=True):
+                getattr(mujoco, function)(m, d, mujoco.mjtObj.mjOBJ_SITE, site, out, is_local)
+            for quantity, half in zip(quantities, np.split(vectors, 2, axis=1), strict=True):
+                found[quantity + suffix][function,] = half.copy()
     _add_jacobians(found, m, d, links, sites)
 
 
 def _add_jacobians(found: Found, m: Any, d: Any, links: Sequence[int], sites: Sequence[int]) -> None:
-    rows: dict[str, list[Array]] = defaultdict(list)
+    rows: dict[tuple[str, str], list[Array]] = defaultdict(list)
+
+    def add(call: str, *values: Array) -> None:
+        for quantity, value in zip(JACOBIANS[call], values, strict=True):
+            rows[quantity, call].append(value)
+
     for b, site in zip(links, sites, strict=True):
-        p, r = np.zeros((2, 3, m.nv))
+        (p, r), (dp, dr) = np.zeros((2, 2, 3, m.nv))
         mujoco.mj_jac(m, d, p, r, d.site_xpos[site], b)
-        rows["mj_jac"].append(np.concatenate([p @ d.qvel, r @ d.qvel]))
-        for call, number in (("mj_jacSite", site), ("mj_jacBody", b), ("mj_jacBodyCom", b)):
+        add("mj_jac", p @ d.qvel, r @ d.qvel)
+        for call, number in (("mj_jacBody", b), ("mj_jacBodyCom", b), ("mj_jacSite", site)):
             getattr(mujoco, call)(m, d, p, r, number)
-            rows[call].append(np.concatenate([p @ d.qvel, r @ d.qvel]))
-        dp, dr = np.zeros((2, 3, m.nv))
-        mujoco.mj_jacSite(m, d, p, r, site)
+            add(call, p @ d.qvel, r @ d.qvel)
         mujoco.mj_jacDot(m, d, dp, dr, d.site_xpos[site], b)
-        rows["mj_jacDot"].append(np.concatenate([dp @ d.qvel + p @ d.qacc, dr @ d.qvel + r @ d.qacc]))
-        mujoco.mj_jacSubtreeCom(m, d, p, b)
-        rows["mj_jacSubtreeCom"].append(p @ d.qvel)
-        mujoco.mj_angmomMat(m, d, p, b)
-        rows["mj_angmomMat"].append(p @ d.qvel)
-    found["subtree_velocity"]["mj_jacSubtreeCom"] = np.array(rows.pop("mj_jacSubtreeCom"))
-    found["subtree_angular_momentum"]["mj_angmomMat"] = np.array(rows.pop("mj_angmomMat"))
-    for call, values in rows.items():
-        vectors = np.array(values)
-        what = "acceleration" if call == "mj_jacDot" else "velocity"
-        place = "body" if call in ("mj_jacBody", "mj_jacBodyCom") else "frame"
-        found[f"{place}_{what}"][call] = vectors[:, :3].copy()
-        found[f"frame_angular_{what}"][call] = vectors[:, 3:].copy()
+        add("mj_jacDot", dp @ d.qvel + p @ d.qacc, dr @ d.qvel + r @ d.qacc)
+        for call in ("mj_jacSubtreeCom", "mj_angmomMat"):
+            getattr(mujoco, call)(m, d, p, b)
+            add(call, p @ d.qvel)
+    for (quantity, call), vectors in rows.items():
+        found[quantity][call,] = np.array(vectors)
 
 
 def _add_momenta(found: Found, m: Any, d: Any, links: Sequence[int]) -> None:
-    found["subtree_centre"]["MjData.subtree_com"] = d.subtree_com[links].copy()
-    found["subtree_velocity"]["MjData.subtree_linvel, mj_subtreeVel"] = d.subtree_linvel[links].copy()
-    found["subtree_angular_momentum"]["MjData.subtree_angmom, mj_subtreeVel"] = d.subtree_angmom[links].copy()
-    found["total_mass"] |= {"mj_getTotalmass": np.array([[mujoco.mj_getTotalmass(m)]])}
-    found["centre_of_mass"]["MjData.subtree_com"] = d.subtree_com[:1].copy()
-    found["centre_of_mass_velocity"]["MjData.subtree_linvel"] = d.subtree_linvel[:1].copy()
-    found["centroidal_angular_momentum"]["MjData.subtree_angmom"] = d.subtree_angmom[:1].copy()
+    found["subtree_centre"]["MjData.subtree_com",] = d.subtree_com[links].copy()
+    found["subtree_velocity"]["MjData.subtree_linvel", "mj_subtreeVel"] = d.subtree_linvel[links].copy()
+    found["subtree_angular_momentum"]["MjData.subtree_angmom", "mj_subtreeVel"] = d.subtree_angmom[
+        links
+    ].copy()
+    found["total_mass"]["mj_getTotalmass",] = np.array([[mujoco.mj_getTotalmass(m)]])
+    found["centre_of_mass"]["MjData.subtree_com",] = d.subtree_com[:1].copy()
+    found["centre_of_mass_velocity"]["MjData.subtree_linvel",] = d.subtree_linvel[:1].copy()
+    found["centroidal_angular_momentum"]["MjData.subtree_angmom",] = d.subtree_angmom[:1].copy()
 
 
 def _add_torques(found: Found, m: Any, d: Any, rates: Array) -> None:
@@ -157,16 +165,20 @@ def _add_torques(found: Found, m: Any, d: Any, rates: Array) -> None:
     mujoco.mj_mulM(m, d, through, through.copy())
     mujoco.mj_mulM(m, d, force, a)
     mujoco.mj_rne(m, d, 1, tau)
-    dynamics = {"mj_rne": tau.copy(), "MjData.qfrc_bias": d.qfrc_bias + force - rotors}
+    dynamics: dict[Call, Array] = {
+        ("mj_rne",): tau.copy(),
+        ("MjData.qfrc_bias",): d.qfrc_bias + force - rotors,
+    }
     mujoco.mj_inverse(m, d)
-    dynamics["mj_inverse, MjData.qfrc_inverse"] = d.qfrc_inverse + d.qfrc_passive - rotors
+    dynamics["mj_inverse", "MjData.qfrc_inverse"] = d.qfrc_inverse + d.qfrc_passive - rotors
     d.qvel[:] = 0.0
     mujoco.mj_fwdVelocity(m, d)
     mujoco.mj_rne(m, d, 0, gravity)
+    of_gravity = {("mj_rne",): gravity, ("MjData.qfrc_bias", "mj_fwdVelocity"): d.qfrc_bias}
     for quantity, values in (
-        ("generalized_momentum", {"mj_mulM": momentum}),
-        ("momentum_through_inverse", {"mj_solveM": through}),
-        ("generalized_gravity", {"mj_rne": gravity, "MjData.qfrc_bias, mj_fwdVelocity": d.qfrc_bias}),
+        ("generalized_momentum", {("mj_mulM",): momentum}),
+        ("momentum_through_inverse", {("mj_solveM",): through}),
+        ("generalized_gravity", of_gravity),
         ("inverse_dynamics", dynamics),
     ):
         found[quantity] |= {call: (rates.T @ value)[:, None] for call, value in values.items()}

@@ -10,17 +10,31 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
-from plumbline.model.datatypes import Array, Float, Model, SurfaceAnswer
+from plumbline.model.datatypes import Array, Call, Float, Model, SurfaceAnswer
 from plumbline.model.kinematics import rotation_matrix
 from plumbline.model.probe_frames import PROBE_ATTITUDE, probe_points
 
-SUFFIXES = {"LOCAL_WORLD_ALIGNED": "", "LOCAL": "_local", "WORLD": "_at_origin"}  # of quantities of points
-Found = dict[str, dict[str, Array]]
+
+class _Frame(NamedTuple):
+    """What vectors in a reference frame are."""
+
+    of_point: str = ""  # suffix of quantities of points
+    of_rotation: str = ""  # … of rotations
+    of_rate: str = "spatial_acceleration"  # what J̇ q̇ + J q̈ is
+
+
+FRAMES = {
+    "LOCAL_WORLD_ALIGNED": _Frame(of_rate="acceleration"),
+    "LOCAL": _Frame("_local", "_local"),
+    "WORLD": _Frame("_at_origin"),
+}
+ANGULAR = {"velocity": "velocity", "acceleration": "acceleration", "spatial_acceleration": "acceleration"}
+Found = dict[str, dict[Call, Array]]
 
 
 def add_probe_frames(
@@ -76,51 +90,53 @@ def _add_frames(
         "updateFramePlacements": [data.oMf[f].copy() for f in frames],
         "updateFramePlacement": [pin.updateFramePlacement(m, data, f).copy() for f in frames],
     }
-    for call, poses in places.items():
-        found["frame_position"][call] = np.array([pose.translation for pose in poses])
-        found["frame_axes"][call] = np.concatenate([pose.rotation.T for pose in poses])
+    for function, poses in places.items():
+        found["frame_position"][function,] = np.array([pose.translation for pose in poses])
+        found["frame_axes"][function,] = np.concatenate([pose.rotation.T for pose in poses])
     pin.computeJointJacobiansTimeVariation(m, data, q, v)
     other = m.createData()
-    for name, suffix in SUFFIXES.items():
-        frame = getattr(pin.ReferenceFrame, name)
-        by_rate = "frame_spatial_acceleration" if suffix else "frame_acceleration"
-        twists: dict[tuple[str, str], list[Any]] = defaultdict(list)
+    for name, frame in FRAMES.items():
+        reference = getattr(pin.ReferenceFrame, name)
+        # by function, what its vectors are, by which algorithm
+        twists: dict[tuple[str, str, str], list[Array]] = defaultdict(list)
         for f in frames:
-            J, dJ = (
-                function(m, data, f, frame)
-                for function in (pin.getFrameJacobian, pin.getFrameJacobianTimeVariation)
-            )
-            twists["frame_velocity", "getFrameVelocity"].append(
-                pin.getFrameVelocity(m, data, f, frame).vector
-            )
-            twists["frame_velocity", "getFrameJacobian"].append(_product(J, v))
-            twists["frame_spatial_acceleration", "getFrameAcceleration"].append(
-                pin.getFrameAcceleration(m, data, f, frame).vector
-            )
-            twists[by_rate, "getFrameJacobianTimeVariation"].append(_product(dJ, v) + _product(J, a))
-            if name != "WORLD":
-                classical = pin.getFrameClassicalAcceleration(m, data, f, frame)
-                twists["frame_acceleration", "getFrameClassicalAcceleration"].append(classical.vector)
-            J = np.array(pin.computeFrameJacobian(m, other, q, f, frame))
-            dJ = pin.frameJacobianTimeVariation(m, other, q, v, f, frame)
-            twists["frame_velocity", "computeFrameJacobian"].append(_product(J, v))
-            twists[by_rate, "frameJacobianTimeVariation"].append(_product(dJ, v) + _product(J, a))
-        for (quantity, function), values in twists.items():
-            call, vectors = f"{function}, ReferenceFrame.{name}", np.array(values)
-            by = "_by_jacobian_rate" if function.endswith("TimeVariation") else ""
-            angular = f"frame_angular_{quantity.rpartition('_')[2]}" + suffix * (suffix == "_local")
-            found[quantity + suffix + by][call] = vectors[:, :3].copy()
-            found[angular + by][call] = vectors[:, 3:].copy()
+
+            def read(function: str, f: int = f, reference: Any = reference) -> Any:
+                return getattr(pin, function)(m, data, f, reference)
+
+            J, dJ = read("getFrameJacobian"), read("getFrameJacobianTimeVariation")
+            rates = {"getFrameJacobianTimeVariation": _product(dJ, v) + _product(J, a)}
+            velocities = {
+                "getFrameVelocity": read("getFrameVelocity").vector,
+                "getFrameJacobian": _product(J, v),
+            }
+            J = np.array(pin.computeFrameJacobian(m, other, q, f, reference))
+            dJ = pin.frameJacobianTimeVariation(m, other, q, v, f, reference)
+            velocities["computeFrameJacobian"] = _product(J, v)
+            rates["frameJacobianTimeVariation"] = _product(dJ, v) + _product(J, a)
+            for function, twist in velocities.items():
+                twists[function, "velocity", ""].append(twist)
+            for function, twist in rates.items():
+                twists[function, frame.of_rate, "_by_jacobian_rate"].append(twist)
+            function = "getFrameAcceleration"
+            twists[function, "spatial_acceleration", ""].append(read(function).vector)
+            if reference != pin.ReferenceFrame.WORLD:
+                function = "getFrameClassicalAcceleration"
+                twists[function, "acceleration", ""].append(read(function).vector)
+        for (function, what, by), values in twists.items():
+            call, (linear, angular) = (function, f"ReferenceFrame.{name}"), np.split(np.array(values), 2, 1)
+            found[f"frame_{what}{frame.of_point}{by}"][call] = linear
+            found[f"frame_angular_{ANGULAR[what]}{frame.of_rotation}{by}"][call] = angular
 
 
 def _add_centres(found: Found, m: pin.Model, motion: tuple[Array, Array, Array]) -> None:
     (q, v, a), data = motion, m.createData()
-    found["total_mass"]["computeTotalMass"] = np.array([[pin.computeTotalMass(m)]])
+    found["total_mass"]["computeTotalMass",] = np.array([[pin.computeTotalMass(m)]])
     pin.centerOfMass(m, data, q, v, a)
     for quantity, values in (("", data.com), ("_velocity", data.vcom), ("_acceleration", data.acom)):
-        found[f"centre_of_mass{quantity}"]["centerOfMass"] = values[0][None].copy()
+        found[f"centre_of_mass{quantity}"]["centerOfMass",] = values[0][None].copy()
     jacobian = pin.jacobianCenterOfMass(m, data, q)
-    found["centre_of_mass_velocity"]["jacobianCenterOfMass"] = _product(jacobian, v)[None]
+    found["centre_of_mass_velocity"]["jacobianCenterOfMass",] = _product(jacobian, v)[None]
     momenta = {
         "computeCentroidalMomentum": pin.computeCentroidalMomentum(m, data, q, v).vector.copy(),
         "computeCentroidalMap": _product(pin.computeCentroidalMap(m, data, q), v),
@@ -137,9 +153,9 @@ def _add_centres(found: Found, m: pin.Model, motion: tuple[Array, Array, Array])
         "dccrba": _product(pin.dccrba(m, data, q, v), v) + _product(data.Ag, a),
     }
     for suffix, twists in (("", momenta), ("_rate", rates), ("_rate_by_map_rate", by_map)):
-        for call, twist in twists.items():
-            found[f"momentum{suffix}"][call] = twist[None, :3].copy()
-            found[f"centroidal_angular_momentum{suffix}"][call] = twist[None, 3:].copy()
+        for function, twist in twists.items():
+            found[f"momentum{suffix}"][function,] = twist[None, :3].copy()
+            found[f"centroidal_angular_momentum{suffix}"][function,] = twist[None, 3:].copy()
 
 
 def _add_torques(found: Found, m: pin.Model, motion: tuple[Array, Array, Array], rates: Array) -> None:
@@ -150,13 +166,13 @@ def _add_torques(found: Found, m: pin.Model, motion: tuple[Array, Array, Array],
     momentum = M @ v
     pin.cholesky.decompose(m, data)
     through = {
-        "cholesky.decompose, cholesky.solve": np.ravel(pin.cholesky.solve(m, data, momentum)),
-        "cholesky.computeMinv": _product(pin.cholesky.computeMinv(m, data), momentum),
+        ("cholesky.decompose", "cholesky.solve"): np.ravel(pin.cholesky.solve(m, data, momentum)),
+        ("cholesky.computeMinv",): _product(pin.cholesky.computeMinv(m, data), momentum),
     }
-    by_aba = {"computeMinverse": _product(pin.computeMinverse(m, data, q), momentum)}
+    by_aba = {("computeMinverse",): _product(pin.computeMinverse(m, data, q), momentum)}
     gravity = {
-        "computeGeneralizedGravity": pin.computeGeneralizedGravity(m, data, q).copy(),
-        "computeStaticTorque": pin.computeStaticTorque(m, data, q, none).copy(),
+        ("computeGeneralizedGravity",): pin.computeGeneralizedGravity(m, data, q).copy(),
+        ("computeStaticTorque",): pin.computeStaticTorque(m, data, q, none).copy(),
     }
     tau = pin.rnea(m, data, q, v, a).copy()
     parameters = np.concatenate([inertia.toDynamicParameters() for inertia in m.inertias[1:]])
@@ -165,19 +181,19 @@ def _add_torques(found: Found, m: pin.Model, motion: tuple[Array, Array, Array],
     rest = pin.rnea(m, data, q, zero, a) - rotors  # without the terms of velocities
     coriolis = _product(pin.computeCoriolisMatrix(m, data, q, v), v) + rest
     dynamics = {
-        "rnea": tau - rotors,
-        "nonLinearEffects": pin.nonLinearEffects(m, data, q, v) + M @ a - rotors,
-        "computeJointTorqueRegressor": _product(
+        ("rnea",): tau - rotors,
+        ("nonLinearEffects",): pin.nonLinearEffects(m, data, q, v) + M @ a - rotors,
+        ("computeJointTorqueRegressor",): _product(
             pin.computeJointTorqueRegressor(m, data, q, v, a), parameters
         ),
     }
     for quantity, values in (
-        ("generalized_momentum", {"crba": momentum}),
+        ("generalized_momentum", {("crba",): momentum}),
         ("momentum_through_inverse", {call: M @ x for call, x in through.items()}),
         ("momentum_through_inverse_by_aba", {call: M @ x for call, x in by_aba.items()}),
         ("generalized_gravity", gravity),
         ("inverse_dynamics", dynamics),
-        ("inverse_dynamics_by_aba", {"aba": again}),
-        ("inverse_dynamics_by_coriolis_matrix", {"computeCoriolisMatrix": coriolis}),
+        ("inverse_dynamics_by_aba", {("aba",): again}),
+        ("inverse_dynamics_by_coriolis_matrix", {("computeCoriolisMatrix",): coriolis}),
     ):
         found[quantity] |= {call: (rates.T @ value)[:, None] for call, value in values.items()}

@@ -221,7 +221,7 @@ class Adapter(ABC):
         for answer in answers:
             for quantity, by_call in answer.items():
                 for call, value in by_call.items():
-                    check_numbers(value, "R D", {}, f"{self.name}._surface: {quantity} by {call}")
+                    check_numbers(value, "R D", {}, f"{self.name}._surface: {quantity} by {', '.join(call)}")
         return answers
 
     def simulate(

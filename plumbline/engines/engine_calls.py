@@ -20,6 +20,7 @@ from plumbline.engines.environments import BASE_REQUIREMENTS, declared_attribute
 from plumbline.engines.registry import load_adapter
 from plumbline.model.datatypes import (
     Array,
+    Call,
     Float,
     Integrator,
     Model,
@@ -158,7 +159,7 @@ def evaluate_states(engine: str, model: Model, states: Sequence[State]) -> Evalu
         raise
     except Exception as error:  # an engine may raise anything: its message belongs in the results
         failure = describe_exception(error)
-    surface, surface_failure = dict[str, dict[str, Array]](), ""
+    surface, surface_failure = dict[str, dict[Call, Array]](), ""
     if quantities and not failure:
         try:
             surface = stack_answers(adapter.surface(model, states[:SURFACE_STATES]))
@@ -172,7 +173,7 @@ def evaluate_states(engine: str, model: Model, states: Sequence[State]) -> Evalu
     return Evaluation(quantities, unsupported, failure, cpu_time, gap, declared, surface, surface_failure)
 
 
-def stack_answers(answers: Sequence[SurfaceAnswer]) -> dict[str, dict[str, Array]]:
+def stack_answers(answers: Sequence[SurfaceAnswer]) -> dict[str, dict[Call, Array]]:
     """Put the answers at all states into one array per call.
 
     Args:

@@ -25,9 +25,8 @@ from plumbline.layout import ROOT
 from plumbline.model.datatypes import EngineFailure
 from plumbline.scenario.yaml_reader import read_yaml
 
-EXERCISED = (
-    "exercised.json"  # beside the files of engines: by engine and name the rows that a change turns red
-)
+# Beside the files of engines: by engine and name the rows that a change turns red.
+EXERCISED = "exercised.json"
 SURFACE_ROWS = "rows of the level surface"  # the names of these are exercised
 SURFACES = ("mujoco", "pinocchio", "exudyn")  # columns whose engines are read
 COMPARED, OUTSIDE_STATUS, NOT_YET, NOT_MOTION = "compared", "outside", "not yet", "not about motion"

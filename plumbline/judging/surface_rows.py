@@ -39,7 +39,7 @@ def judge_surface(context: RowContext, truth: StateTruth, evaluation: Evaluation
 
 def _row(context: RowContext, quantity: str, true: SurfaceTruth, evaluation: Evaluation) -> Row:
     unit, name = SURFACE_QUANTITIES[quantity][0], quantity.replace("_", " ")
-    found = [(*_worst(value, true), call) for call, value in evaluation.surface[quantity].items()]
+    found = [(*_worst(value, true), ", ".join(call)) for call, value in evaluation.surface[quantity].items()]
     ratio, error, tolerance, state, call = max(found)
     others = sorted(one[-1] for one in found if one[0] > 1 and one[-1] != call)
     # single entries may have no scale

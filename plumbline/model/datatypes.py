@@ -116,10 +116,12 @@ class StateQuantities:
     limit_error: Mapping[str, float] | None = None
 
 
+# The names of the engine's functions, sensors and options that an answer comes from.
+Call = tuple[str, ...]
 # What an engine reports at one state besides the `StateQuantities`: by quantity (of
-# `plumbline.truth.surface_truth`) and by call, the names of the engine's functions, sensors and options that
-# it comes from, with commas between; vectors of bodies or of the mechanism, or a number per entry of ν.
-SurfaceAnswer = Mapping[str, Mapping[str, Float[Array, "*states rows d"]]]
+# `plumbline.truth.surface_truth`) and by call vectors of bodies or of the mechanism, or a number per entry of
+# ν.
+SurfaceAnswer = Mapping[str, Mapping[Call, Float[Array, "*states rows d"]]]
 
 
 @dataclass(frozen=True, eq=False)

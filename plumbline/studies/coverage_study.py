@@ -23,7 +23,8 @@ FILE = "coverage.parquet"
 PARAMETERS_PER_TASK = (
     160  # those of a chain of 100 bodies take minutes, and no worker has them all at the end
 )
-_OF_SOME = (*JOINT_ELEMENTS, "anchor", "frame", "body_frame")  # that not every scenario has of a first body
+# Kinds of parameters that few scenarios have: those of first and of later bodies are looked for together.
+_RARE_KINDS = (*JOINT_ELEMENTS, "anchor", "frame", "body_frame")
 
 
 class CoverageFailure(PlumblineError):
@@ -156,7 +157,7 @@ def blind_spots(entries: Iterable[CoverageEntry]) -> list[str]:
     seen: dict[tuple[str, ...], bool] = {}
     for entry in entries:
         place = "body" if entry.body else "gravity"
-        if entry.joint in (ROD, BALL) and entry.kind not in _OF_SOME:
+        if entry.joint in (ROD, BALL) and entry.kind not in _RARE_KINDS:
             place = "first body" if entry.body == 1 else "later body"
         key = entry.level, entry.parameter, place, entry.joint
         counts = entry.is_seen and (entry.scale == abs(entry.value) or entry.unit == "rad")

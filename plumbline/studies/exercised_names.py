@@ -43,7 +43,7 @@ def exercised_names(truth: StateTruth, answer: SurfaceAnswer) -> dict[str, set[s
                 for x in (value, value * (1 + CHANGE))
             )
             if (before[0].verdict, after[0].verdict) == (Verdict.AGREES, Verdict.DISAGREES):
-                for name in call.split(", "):
+                for name in call:
                     found[name].add(quantity)
     return found
 
