@@ -33,7 +33,7 @@ from plumbline.judging.known_issues import KnownIssue, project_known_issues
 from plumbline.model.features import Feature, features
 from plumbline.processes.worker_pool import Limits, WorkerPool
 from plumbline.reproduce.write import write_scripts
-from plumbline.scenario.generator import MECHANISM_PREFIX, RANDOM_FAMILY, RandomScenarios, random_seed
+from plumbline.scenario.generator import RANDOM_FAMILY, RandomScenarios, random_seed
 from plumbline.scenario.loader import Scenario
 from plumbline.storage.history_of_nights import next_night_number, stored_runs
 from plumbline.storage.results_store import write_atomically
@@ -202,7 +202,7 @@ def run_nightly(
         if about["family"] == RANDOM_FAMILY and random_seed(name) == night.seed:
             about["file"] = (place / "scenarios" / f"{name}.yaml").as_posix()
     coverage = night_coverage(result, plan, progress) if level == "all" else None
-    drawn = [features(s.model) for s in random_scenarios if s.name.startswith(MECHANISM_PREFIX)]
+    drawn = [features(s.model) for s in random_scenarios.mechanisms]
     if drawn:
         earlier = itertools.chain(
             *map(_stored_features, [run.folder for run in stored_runs(history)][1 - WEEK :])

@@ -44,7 +44,7 @@ from plumbline.judging.state_level import SINGULAR_POSE, STATE_UNITS
 from plumbline.measurements.relation_result import OTHER_FORMULATIONS, REPEATABILITY, UNEXPLAINED
 from plumbline.measurements.run_relations import REVERSED_IN_TIME
 from plumbline.measurements.state_relations import REDESCRIPTIONS, STATE_RELATIONS, WELDED_HALVES
-from plumbline.model.invariants import INVARIANT_UNITS, LONG_RUN_QUANTITIES, MOTION_UNITS
+from plumbline.model.invariants import INVARIANT_UNITS, LIMITS, LONG_RUN_QUANTITIES
 from plumbline.scenario.generator import MECHANISM_PREFIX, MOTION_PREFIX, RANDOM_FAMILY
 from plumbline.scenario.line_and_column_errors import Problem, ScenarioError, did_you_mean, shorten
 from plumbline.scenario.loader import catalogue
@@ -52,7 +52,7 @@ from plumbline.scenario.schema import invalid_value_error
 from plumbline.scenario.validation_messages import problems_from_validation
 from plumbline.scenario.yaml_reader import read_yaml
 from plumbline.scenario.yaml_source import PathKey, YamlSource, dotted_path
-from plumbline.truth.step_comparison import CONSTRAINED_UNITS, RUN_UNITS, STEP_UNITS
+from plumbline.truth.step_comparison import CONSTRAINED_QUANTITIES, RUN_QUANTITIES, STEP_QUANTITIES
 from plumbline.truth.surface_truth import SURFACE_QUANTITIES
 
 RowKind = tuple[str, str, str, str, str]  # of a row: engine, its version, level, integrator, quantity
@@ -502,11 +502,11 @@ def _problem(
 
 def _quantities() -> set[str]:
     """Every quantity that a row may have, except of information."""
-    trajectory = ("order", *(f"{name}_limit" for name in MOTION_UNITS))
+    trajectory = ("order", *LIMITS)
     own = (*REDESCRIPTIONS, WELDED_HALVES, REVERSED_IN_TIME, REPEATABILITY)
     relations = (*(r.name for r in STATE_RELATIONS), *own)
     others = *OTHER_FORMULATIONS, *(f"by {text}" for text in declared_texts())
-    steps = (*STEP_UNITS, *CONSTRAINED_UNITS, *RUN_UNITS)
+    steps = (*STEP_QUANTITIES, *CONSTRAINED_QUANTITIES, *RUN_QUANTITIES)
     return {
         "all",
         *STATE_UNITS,

@@ -12,12 +12,12 @@ from itertools import combinations
 
 from plumbline.judging.rows import Deviation, Level, Row, Verdict
 from plumbline.judging.state_level import STATE_UNITS
-from plumbline.judging.trajectory_level import LIMIT_QUANTITIES
+from plumbline.model.invariants import LIMITS
 
 # What is compared with the truth; steps are with each method's formula, relations with the engine itself.
 COMPARED_WITH_TRUTH: Mapping[Level, frozenset[str]] = {
     "state": frozenset(STATE_UNITS),
-    "trajectory": frozenset(LIMIT_QUANTITIES),
+    "trajectory": frozenset(LIMITS),
 }
 MIN_FAMILIES = 2  # independent engines against the truth, whose answers agree with each other
 ENOUGH_FAMILIES = 3  # the same, whether they agree with each other or not

@@ -24,6 +24,7 @@ from plumbline.measurements.single_steps import MAX_STEP_BODIES, STEP_STATES, st
 from plumbline.model.datatypes import SPRING_FIELDS, Array, Float, Model, State, Trajectory
 from plumbline.model.invariants import (
     INVARIANT_UNITS,
+    LIMITS,
     MOTION_UNITS,
     Invariants,
     compute_invariants,
@@ -317,7 +318,7 @@ def _motion_tolerance(row: Row, times: Array) -> _MotionTolerance | None:
     An invariant that is exactly zero, as the joint gap of a body that turns about the pivot, says nothing of
     the uncertainty that a mistaken motion would have.
     """
-    quantity = row.quantity.removesuffix("_limit")
+    quantity = LIMITS.get(row.quantity, row.quantity)
     if quantity not in (*MOTION_UNITS, *INVARIANT_UNITS) or not row.tolerance:
         return None
     if quantity in INVARIANT_UNITS and row.value == 0:

@@ -17,9 +17,9 @@ from plumbline.model.datatypes import EngineFailure, Integrator, Model, State, S
 from plumbline.model.loops import keeps_dependent_rows
 from plumbline.model.step_methods import ConstrainedMethod, JointSpaceMethod
 from plumbline.truth.step_comparison import (
-    CONSTRAINED_UNITS,
-    RUN_UNITS,
-    STEP_UNITS,
+    CONSTRAINED_QUANTITIES,
+    RUN_QUANTITIES,
+    STEP_QUANTITIES,
     Comparisons,
     FormulaSteps,
     RunSteps,
@@ -91,22 +91,22 @@ def _single_step_rows(
         for i, attempt in enumerate(attempts):
             if attempt.failure and steps.is_stable(i):
                 return [context.make_row("step", integrator.name, "all", Verdict.FAILED, attempt.failure)]
-        found, units = steps.compare([run for *_, run in runs]), STEP_UNITS
+        found, table = steps.compare([run for *_, run in runs]), STEP_QUANTITIES
     else:
         assert isinstance(method, ConstrainedMethod)
-        found, units = compare_parts(method, model, states, runs), CONSTRAINED_UNITS
+        found, table = compare_parts(method, model, states, runs), CONSTRAINED_QUANTITIES
     alias = None if model.has_drag else integrator.alias_of  # with drag the two methods differ
     complete = sum(not (attempt.refusal or attempt.failure) for attempt in answer.attempts)
     note = f"{complete} runs of {max(step_counts(method))} steps"
     return [
-        _row(context, integrator, quantity, units[quantity], comparisons, note, alias, answer.cpu_time)
+        _row(context, integrator, quantity, table[quantity], comparisons, note, alias, answer.cpu_time)
         for quantity, comparisons in found.items()
     ]
 
 
 def _row(
-    context: RowContext, integrator: Integrator, quantity: str, unit: str, found: Comparisons, note: str,
-    alias: str | None, cpu_time: float,
+    context: RowContext, integrator: Integrator, quantity: str, about: tuple[str, str], found: Comparisons,
+    note: str, alias: str | None, cpu_time: float,
 ) -> Row:  # fmt: skip
     """The row of one quantity: its worst ratio decides, unless most bounds are too loose."""
     error, bound = np.array(found.errors), np.array(found.bounds)
@@ -114,7 +114,7 @@ def _row(
     at, looseness = int(np.argmax(ratios)), np.array(found.looseness)
     place = f"body {found.bodies[at] + 1}, {found.places[at]}"
     ratio, is_sharp = float(ratios[at]), looseness <= MAX_STEP_BOUND
-    name = quantity.removeprefix("step_").replace("_", " ")
+    name, unit = about[0].replace("_", " "), about[1]
     if ratio > 1:
         verdict = Verdict.DISAGREES
         reason = (
@@ -191,7 +191,7 @@ def _run_row(
     condition: Callable[[int, int], str], alias: str | None, cpu_time: float,
 ) -> Row:  # fmt: skip
     """The row of one quantity at every step: the worst step decides, the first wrong one is named."""
-    name, unit, ratios = quantity.removeprefix("run_"), RUN_UNITS[quantity], found.ratios
+    (name, unit), ratios = RUN_QUANTITIES[quantity], found.ratios
     ratios = np.where(np.isnan(ratios), np.inf, ratios)
     worst, column = (int(x) for x in np.unravel_index(np.argmax(ratios), ratios.shape))
     ratio, wrong = float(ratios[worst, column]), np.flatnonzero(np.any(ratios > 1, axis=1))

@@ -32,6 +32,7 @@ from plumbline.measurements.order_and_limit import ORDER_CHANGE_FACTOR, ORDER_MA
 from plumbline.model.datatypes import Array, Float, Integrator, Model, Trajectory
 from plumbline.model.invariants import (
     INVARIANT_UNITS,
+    LIMITS,
     MOTION_UNITS,
     attitude_error,
     motion_error,
@@ -40,7 +41,6 @@ from plumbline.model.invariants import (
 )
 from plumbline.truth.ground_truth import DETECTABLE_PARAMETER_ERROR, MotionTruth
 
-LIMIT_QUANTITIES = tuple(f"{quantity}_limit" for quantity in MOTION_UNITS)
 FINEST_RUN_SHOWN = ("position", "attitude")  # quantities with a row of information on the finest run
 
 
@@ -78,7 +78,7 @@ def judge_trajectory(
     deviations = {
         row.key: _limit_deviation(analysis, row)
         for row in rows
-        if row.verdict == Verdict.DISAGREES and row.quantity in LIMIT_QUANTITIES
+        if row.verdict == Verdict.DISAGREES and row.quantity in LIMITS
     }
     if truth.singular:
         end = float(truth.trajectory.t[-1])
@@ -97,7 +97,7 @@ def judge_trajectory(
 def _limit_deviation(study: RefinementAnalysis, row: Row) -> Deviation:
     """By how much a limit that disagrees is off the truth, in the window of its row."""
     count = int(np.searchsorted(study.times, row.compared_until or 0.0, side="right"))
-    quantity = row.quantity.removesuffix("_limit")
+    quantity = LIMITS[row.quantity]
     true = motion_samples(study.truth.trajectory)[quantity]
     limit = study.extrapolated_limit(study.samples[quantity]).y
     if quantity == "attitude":

@@ -203,6 +203,7 @@ class Invariants:
 
 
 MOTION_UNITS = {"position": "m", "attitude": "rad", "velocity": "m/s", "angular_velocity": "rad/s"}
+LIMITS = {f"{name}_limit": name for name in MOTION_UNITS}  # by a row's quantity, what it is the limit of
 INVARIANT_UNITS = {
     "energy_drift": "J",
     "momentum_drift": "kg m²/s",

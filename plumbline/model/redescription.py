@@ -76,7 +76,7 @@ class Rearranged:
             for k, value in enumerate(getattr(state, name)):
                 place = self.joint[k]
                 if 0 <= place < self.model.n:
-                    is_swapped = self.model.kinds[place].exchanges_axes and name.startswith("x")
+                    is_swapped = self.model.kinds[place].exchanges_axes and name in ("x", "xdot")
                     if self.is_reversed[k]:
                         value = -value[_swapped(len(value))] if is_swapped else -value
                     values[place] = value

@@ -19,7 +19,7 @@ from plumbline.engines.registry import load_adapter
 from plumbline.judging.invariant_drift import invariant_rows
 from plumbline.judging.refinement_analysis import RefinementAnalysis
 from plumbline.judging.rows import Row, RowContext, Verdict
-from plumbline.judging.trajectory_level import FINEST_RUN_SHOWN, LIMIT_QUANTITIES, trajectory_rows
+from plumbline.judging.trajectory_level import FINEST_RUN_SHOWN, trajectory_rows
 from plumbline.measurements.relation_result import OTHER_FORMULATIONS
 from plumbline.measurements.state_relations import (
     QUANTITIES,
@@ -29,7 +29,7 @@ from plumbline.measurements.state_relations import (
     scale_fields,
 )
 from plumbline.model.datatypes import Array, Float, Integrator
-from plumbline.model.invariants import MOTION_UNITS, motion_samples
+from plumbline.model.invariants import LIMITS, motion_samples
 from plumbline.model.step_methods import JointSpaceMethod, describe_method
 from plumbline.model.welding import split_bodies
 from plumbline.reproduce.engine_client import EngineClient
@@ -40,7 +40,7 @@ from plumbline.truth.ground_truth import MotionTruth, motion_truth
 from plumbline.truth.rounding_bound import state_rounding_bound
 from plumbline.truth.step_comparison import FormulaSteps
 
-LIMITS = (*LIMIT_QUANTITIES, *FINEST_RUN_SHOWN)
+TRUTH_QUANTITIES = (*LIMITS, *FINEST_RUN_SHOWN)
 TRANSFORMS = {relation.name: relation.transform for relation in STATE_RELATIONS}
 WORK_SAMPLES = 64  # of a run where the work of moments and drag is integrated
 TINY = 1e-300
@@ -328,7 +328,7 @@ class ConvergenceMeasure:
         of_invariants = self.level == "invariants"
         found = invariant_rows(analysis) if of_invariants else trajectory_rows(analysis)
         rows, wanted = {row.quantity: row for row in found}, set(self.quantities)
-        groups = [wanted] if of_invariants else [g for g in ({"order"}, set(LIMITS)) if g & wanted]
+        groups = [wanted] if of_invariants else [g for g in ({"order"}, set(TRUTH_QUANTITIES)) if g & wanted]
         ratios = [max((_excess(rows[q]) for q in group if q in rows), default=0.0) for group in groups]
         series, limits = self._disputed_series(analysis, rows)
         expected = {q: samples[-1] for q, samples in motion_samples(truth.trajectory).items()}
@@ -358,9 +358,9 @@ class ConvergenceMeasure:
                 q: [getattr(d, q) for d in analysis.invariant_drifts] for q in off
             }
             return drifts, {q: rows[q] for q in off}
-        if not set(LIMITS) & set(self.quantities):
+        if not set(TRUTH_QUANTITIES) & set(self.quantities):
             return {}, {}
-        limits = {q: rows[f"{q}_limit"] for q in MOTION_UNITS if rows.get(f"{q}_limit")}
+        limits = {of: rows[q] for q, of in LIMITS.items() if rows.get(q)}
         limits = {q: row for q, row in limits.items() if row.tolerance}
         return {q: analysis.samples[q] for q in limits}, limits
 

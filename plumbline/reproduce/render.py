@@ -42,7 +42,7 @@ from plumbline.reproduce.measure import (
     StepEvidence,
 )
 from plumbline.reproduce.shrink import ReproductionCase
-from plumbline.truth.step_comparison import CONSTRAINED_UNITS, RUN_UNITS
+from plumbline.truth.step_comparison import CONSTRAINED_QUANTITIES, RUN_QUANTITIES
 
 TEMPLATES = Path(__file__).parent / "templates"
 LINE = 100  # characters
@@ -126,9 +126,9 @@ def no_script_reason(engine: str, row: dict[str, Any]) -> str:
             return f"engine {name} has no template of scripts"
     if row["level"] == "surface":
         return "rows of the surface have no script: their reason names the call that is wrong"
-    if row["level"] == "step" and row["quantity"] in CONSTRAINED_UNITS:
+    if row["level"] == "step" and row["quantity"] in CONSTRAINED_QUANTITIES:
         return "rows of single steps with constraints have no script"
-    if row["level"] == "step" and row["quantity"] in RUN_UNITS:
+    if row["level"] == "step" and row["quantity"] in RUN_QUANTITIES:
         return "rows on every step of a run have no script: what single steps show has one"
     if relation in LONG_RUN_QUANTITIES:
         return "rows of long runs have no script"

@@ -30,7 +30,7 @@ from plumbline.reproduce.shrink import OutOfTime, ReproductionCase
 from plumbline.storage.results_store import read_results, write_atomically
 from plumbline.storage.script_index import read_script_index, script_name, scripts_folder, write_script_index
 from plumbline.storage.version_changes import read_version_changes
-from plumbline.truth.step_comparison import RUN_UNITS
+from plumbline.truth.step_comparison import RUN_QUANTITIES
 
 REQUESTED_SECONDS, UNREQUESTED_SECONDS = (
     60.0,
@@ -196,7 +196,7 @@ def find_disagreement(document: dict[str, Any], rows: list[StoredRow], seconds: 
 
     """
     if rows[0]["level"] == "step":  # single steps have scripts
-        rows = [row for row in rows if row["quantity"] not in RUN_UNITS] or rows
+        rows = [row for row in rows if row["quantity"] not in RUN_QUANTITIES] or rows
     row = max(rows, key=_ratio) if rows[0]["level"] == "step" else rows[0]
     ratio = max(_ratio(row) for row in rows)
     base, version = environments.split_version(row["engine"])

@@ -79,6 +79,11 @@ class RandomScenarios(Sequence[Scenario]):
         make, k = self._drawn[index]
         return make(self.seed, k)
 
+    @property
+    def mechanisms(self) -> list[Scenario]:
+        """Those on any mix of joints."""
+        return [make(self.seed, k) for make, k in self._drawn if make is random_mechanism]
+
     def named(self, name: str) -> Scenario:
         """Make the scenario of a name.
 

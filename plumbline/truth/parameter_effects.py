@@ -36,7 +36,14 @@ from plumbline.model.kinematics import (
     stack_states,
 )
 from plumbline.model.loops import determinate_projectors, wrench_length
-from plumbline.truth.parameters import STATE_KINDS, Parameter, derivative, perturb, perturb_model
+from plumbline.truth.parameters import (
+    FRAME_KINDS,
+    STATE_KINDS,
+    Parameter,
+    derivative,
+    perturb,
+    perturb_model,
+)
 from reference_impl.direct import DirectSystem
 from reference_impl.elements import ElementForces
 from reference_impl.mechanism import side_by_side
@@ -56,7 +63,7 @@ def effects_at_states(
     """Return the effects of unit changes of parameters of the model or of the states, state by state."""
     if model.has_loops:
         # the spring of a ball joint jumps at half a turn, which a smaller difference hardly ever meets
-        small = [one.kind.endswith("frame") and model.kinds[one.body].is_spherical for one in parameters]
+        small = [one.kind in FRAME_KINDS and model.kinds[one.body].is_spherical for one in parameters]
         sizes = [
             STATE_MISTAKE if is_small or one.kind in STATE_KINDS else LOOP_MISTAKE
             for one, is_small in zip(parameters, small, strict=True)

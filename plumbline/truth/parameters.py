@@ -34,6 +34,7 @@ SLIDE_UNITS = {
 STATE_KINDS = (
     "attitude", "omega", "direction", "rod_rate", "coordinate", "rate", "position", "velocity",
 )  # fmt: skip
+FRAME_KINDS = ("frame", "body_frame")  # turns of a joint's axes
 NEGLIGIBLE = 1e-9  # of the natural size: a value below is a rounded zero
 SLIDES = {  # names of motions
     name
@@ -121,7 +122,7 @@ def _geometry(model: Model, k: int, span: float) -> Iterator[Parameter]:
     if model.rods[k]:
         yield _parameter("length", k, "", model.length[k], model.length[k])
     if not kind.has_attitude or (kind.is_spherical and model.stiffness[k, 0]):
-        for frame in ("frame", "body_frame"):
+        for frame in FRAME_KINDS:
             yield from (Parameter(frame, k, axis, 0.0, 1.0) for axis in AXES)
 
 

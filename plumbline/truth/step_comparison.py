@@ -78,17 +78,19 @@ CLOCK_ROUNDINGS = 2  # of a time that is a sum of steps
 RESIDUAL_STEPS = 2  # after one, Euler does not show the axial inertia of rods
 TINY = float(np.finfo(float).tiny)
 MAX_GROWTH = 1e4  # of perturbations; beyond it the method itself is unstable, and nothing is compared
-STEP_UNITS = {"step_position": "m", "step_attitude": "rad", "step_velocity": "m/s", "step_rate": "rad/s"}
-CONSTRAINED_UNITS = {
-    "step_quadrature": "1",
-    "step_equations": "N",
-    "step_first_acceleration": "m/s²",
+# By the quantity of a row what it is of, and its unit; "1" are multiples of what rounding explains.
+_MOTION = {"position": "m", "attitude": "rad", "velocity": "m/s", "rate": "rad/s"}
+STEP_QUANTITIES = {f"step_{of}": (of, unit) for of, unit in _MOTION.items()}
+CONSTRAINED_QUANTITIES = {
+    f"step_{of}": (of, unit)
+    for of, unit in {"quadrature": "1", "equations": "N", "first_acceleration": "m/s²"}.items()
 }
-# of every step of a run; "1" are multiples of what rounding explains
-RUN_UNITS = {
-    "run_position": "m", "run_attitude": "rad", "run_velocity": "m/s", "run_rate": "rad/s",
-    "run_energy": "J", "run_momentum": "kg m²/s", "run_mean": "1", "run_samples": "1",
-    "run_quadrature": "1", "run_equations": "N",
+RUN_QUANTITIES = {  # at every step of a run
+    f"run_{of}": (of, unit)
+    for of, unit in {
+        **_MOTION, "energy": "J", "momentum": "kg m²/s", "mean": "1", "samples": "1",
+        "quadrature": "1", "equations": "N",
+    }.items()
 }  # fmt: skip
 
 Runs = Sequence[tuple[int, float, StepRun]]  # index of the state, step [s], steps
@@ -226,7 +228,7 @@ class FormulaSteps:
             Errors and bounds by quantity.
 
         """
-        found = {quantity: Comparisons() for quantity in STEP_UNITS}
+        found = {quantity: Comparisons() for quantity in STEP_QUANTITIES}
         for i, count, limit, scale in self.limits():
             if count >= len(runs[i].trajectory.t):
                 continue
@@ -277,7 +279,7 @@ class FormulaSteps:
             h: step [s].
 
         Returns:
-            By quantity the bounds (N,), in its unit of `STEP_UNITS`.
+            By quantity the bounds (N,), in its unit of `STEP_QUANTITIES`.
 
         """
         sizes = _sizes(stack_states(ends), bounds)
@@ -320,7 +322,7 @@ def step_bound(
         h: step [s].
 
     Returns:
-        By quantity the bounds (..., N), in its unit of `STEP_UNITS`.
+        By quantity the bounds (..., N), in its unit of `STEP_QUANTITIES`.
 
     """
     rate, speed, turning, acceleration, torque = (
@@ -520,7 +522,7 @@ class RunSteps:
         """Compare every step.
 
         Returns:
-            By quantity of `RUN_UNITS`.
+            By quantity of `RUN_QUANTITIES`.
 
         """
         found, bounds = dict[str, StepDeviations](), self.bounds
@@ -533,7 +535,7 @@ class RunSteps:
         effects |= {"attitude": self.h * turning, "position": self.h * pushing}
         off = _differences(self.after, self.motion, slice(1, None))
         for quantity, difference in off.items():
-            name = quantity.removeprefix("step_")
+            name, _ = STEP_QUANTITIES[quantity]
             found[f"run_{name}"] = StepDeviations(
                 np.linalg.norm(difference, axis=-1), self.of_step[quantity], effects[name]
             )
@@ -646,7 +648,7 @@ def compare_parts(
         The differences by quantity: quadrature, equations, first acceleration.
 
     """
-    found = {quantity: Comparisons() for quantity in CONSTRAINED_UNITS}
+    found = {quantity: Comparisons() for quantity in CONSTRAINED_QUANTITIES}
     first: dict[int, tuple[Array, Array]] = {}  # by state: first accelerations and their bounds
     for index, h, run in runs:
         place = Place(index, h, len(run.trajectory.t) - 1)

@@ -16,7 +16,7 @@ from plumbline.measurements.single_steps import run_counts, run_step_study
 from plumbline.model.random_mechanisms import random_loop_mechanism, random_tree
 from plumbline.model.sampling import compared_states, random_states
 from plumbline.truth import step_formulas
-from plumbline.truth.step_comparison import RUN_UNITS
+from plumbline.truth.step_comparison import RUN_QUANTITIES
 from tests.helpers.catalogue import catalogue_scenarios
 from tests.helpers.nightly_tests import SLOW, some_fast
 from tests.helpers.planted_runs import RUN_MISTAKES
@@ -27,7 +27,7 @@ if not step_formulas.HAS_EXTENDED_PRECISION:
 
 CONTEXT = RowContext("run", "test", "engine", "engine", "0")
 ENGINES = ("mujoco", "pinocchio", "exudyn", "exudyn-tree")
-OF_JOINT_SPACE = {name for name in RUN_UNITS if name not in ("run_quadrature", "run_equations")}
+OF_JOINT_SPACE = {name for name in RUN_QUANTITIES if name not in ("run_quadrature", "run_equations")}
 
 
 def rows_of(adapter, integrator, model, states):
@@ -54,7 +54,7 @@ def test_every_step_of_honest_engines_agrees(engine, name):
     model, states = subject(name)
     adapter = load_adapter(engine)
     for integrator in [i for i in adapter.integrators if i.method is not None][-2:]:
-        rows = [row for row in rows_of(adapter, integrator, model, states) if row.quantity in RUN_UNITS]
+        rows = [row for row in rows_of(adapter, integrator, model, states) if row.quantity in RUN_QUANTITIES]
         assert all(row.verdict == Verdict.AGREES and row.ratio < 1 for row in rows), rows
         if engine != "exudyn":
             assert {row.quantity for row in rows} == OF_JOINT_SPACE
@@ -74,7 +74,7 @@ def test_a_mistake_inside_a_run_is_reported_with_its_step(mistake):
     if mistake.quantities:
         assert any(row.quantity in mistake.quantities for row in wrong)
         return
-    steps = [row for row in wrong if row.quantity in RUN_UNITS and "first_step" in row.extra]
+    steps = [row for row in wrong if row.quantity in RUN_QUANTITIES and "first_step" in row.extra]
     assert steps, [row.quantity for row in wrong]
     found = min(row.extra["first_step"] for row in steps if row.quantity != "run_samples" or len(steps) == 1)
     first = mistake.first_step
