@@ -275,13 +275,15 @@ class _Run:
             yield from scenario_run.tasks()
 
     def _show_rows(self, scenario_run: ScenarioRun, outcome: Outcome) -> None:
-        name, bodies = scenario_run.scenario.name, scenario_run.scenario.model.n
+        name, model = scenario_run.scenario.name, scenario_run.scenario.model
         if name not in self.rows:  # random scenarios are many
             return
         if scenario_run.is_done:
             rows = scenario_run.judged_rows(scenario_run.findings(), self.known_of_observer)
         else:
-            rows = self.known_of_observer.mark_known(scenario_run.new_rows(outcome), bodies)
+            rows = self.known_of_observer.mark_known(
+                scenario_run.new_rows(outcome), model.n, joints=model.kind
+            )
         if rows:
             self.observer.on_rows(name, rows, scenario_run.is_done)
 

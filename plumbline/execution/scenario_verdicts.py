@@ -230,7 +230,7 @@ class ScenarioRun:
 
         """
         model, is_certified = self.scenario.model, self._is_certified
-        rows = known.mark_known(found.rows, model.n, inertia_ratio(model))
+        rows = known.mark_known(found.rows, model.n, inertia_ratio(model), model.kind)
         defines_truth = "" if is_certified else _family("reference")
         rows = outlier.doubt_truth(rows, found.deviations, _family, defines_truth)
         if is_certified and has_independent_truth():
@@ -445,7 +445,7 @@ class ScenarioRun:
         disputed = [row for row in found.rows if row.verdict == Verdict.DISAGREES and row.level == level]
         model, marked = self.scenario.model, disputed
         if self._known and disputed:
-            marked = self._known.mark_known(disputed, model.n, inertia_ratio(model))
+            marked = self._known.mark_known(disputed, model.n, inertia_ratio(model), model.kind)
         is_known = all(row.known_issue is not None for row in marked)
         key: TaskKey = answer.key
         if not disputed:

@@ -8,13 +8,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from plumbline.judging.findings import CLASSES, Finding
+from plumbline.judging.known_issues import DIAGNOSED_LEVELS, FOLLOWING_LEVELS
 from plumbline.judging.rows import Row, Verdict
 
+MATCHED_BY_CAUSE = (*DIAGNOSED_LEVELS, *FOLLOWING_LEVELS)
 MARGIN = 3.0  # of the largest error seen: what a new entry covers
 LINE = 118  # characters
 SELECTING = (
     "scenario", "engine", "level", "integrator", "quantity", "verdict", "max_ratio", "max_ratio_by_inertia",
-    "shown_by", "intermittent", "extra_refinements_only",
+    "min_bodies", "joints", "shown_by", "intermittent", "extra_refinements_only",
 )  # fmt: skip
 Entry = dict[str, Any]
 
@@ -42,7 +44,7 @@ def entry_of(finding: Finding) -> Entry:
     for row in finding.rows:
         groups.setdefault((row.level, row.integrator, row.verdict), []).append(row)
     entry["rows"] = [
-        _selection(rows, *names, is_about_scenarios=not (has_cause and names[0] in ("state", "step")))
+        _selection(rows, *names, is_about_scenarios=not (has_cause and names[0] in MATCHED_BY_CAUSE))
         for names, rows in groups.items()
     ]
     return entry

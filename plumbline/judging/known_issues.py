@@ -3,15 +3,17 @@
 An entry of known_issues.yaml records a finding: engine, cause or needs, version range, evidence and reason,
 and the rows that it covers, with their largest ratio of error and tolerance.  Rows of states and steps are
 matched by the cause that the diagnosis names, or, where a mechanism is recorded, as far as the run can check
-it; of other levels by patterns of integrator, quantity and scenario.  What exceeds the entry is a new
-disagreement.  Of a missing term the effect is computed; the entry covers that, and nothing that is left above
-the tolerance.  An entry that matches cells of the run but none of their verdicts is stale and fails the run.
+it.  Rows of motions follow from those: where states of the same mechanism are compared and none shows the
+finding, their entry does not cover them.  All are matched by what the mechanism has: so many bodies, a kind
+of joint.  A scenario's name is for what nothing else explains.  What exceeds the entry is a new disagreement.
+Of a missing term the effect is computed; the entry covers that, and nothing that is left above the tolerance.
+An entry that matches cells of the run but none of their verdicts is stale and fails the run.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from functools import cache
@@ -58,6 +60,7 @@ from plumbline.truth.surface_truth import SURFACE_QUANTITIES
 RowKind = tuple[str, str, str, str, str]  # of a row: engine, its version, level, integrator, quantity
 KNOWN_ISSUES_FILE = Path(__file__).with_name("known_issues.yaml")
 DIAGNOSED_LEVELS = ("state", "step")  # whose rows have causes
+FOLLOWING_LEVELS = ("trajectory", "invariants")  # whose rows follow from those
 LEVELS: tuple[Level, ...] = ("state", "surface", "step", "invariants", "trajectory", "relations", "model")
 ANY_LENGTH = 10**9  # bodies
 # Bounds are 64 roundings of the largest term and more: an answer that is off by a million times the quantity
@@ -97,6 +100,8 @@ class KnownIssue:
         default_factory=dict
     )  # by the number of bodies up to which it holds
     max_ratio_by_inertia: float | None = None  # the same, over `plumbline.model.invariants.inertia_ratio`
+    min_bodies: int = 0  # with fewer it does not occur
+    joints: tuple[str, ...] = ()  # kinds, of which the mechanism has one; empty: any
     mechanism: Mechanism | None = None
     shown_by: str = ""  # the engine whose rows show the mechanism; empty: the row's own
     intermittent: str = ""  # why the verdict may or may not occur; empty: it must
@@ -154,6 +159,10 @@ class KnownIssue:
             return SpecifierSet(self.versions).contains(Version(version), prereleases=True)
         except InvalidVersion:
             return False
+
+    def needs_of_mechanism_are_met(self, bodies: int, joints: Collection[str]) -> bool:
+        """Return whether a mechanism has what the entry needs."""
+        return bodies >= self.min_bodies and (not self.joints or not set(self.joints).isdisjoint(joints))
 
     def covered_ratio(self, bodies: int, inertia_ratio: float) -> float:
         """Return the largest ratio of error and tolerance that the entry covers.
@@ -272,6 +281,8 @@ class _Selector(BaseModel):
     max_ratio_by_inertia: _Ratio | None = _field(
         "The largest ratio of error and tolerance, over the chain's largest ratio of inertias.", None
     )
+    min_bodies: PositiveInt | None = _field("The smallest number of bodies with which it occurs.", None)
+    joints: _Texts | None = _field("A kind of joint, or a list: the mechanism has one of them.", None)
     shown_by: str = _field("The engine whose rows show the mechanism.", "")
     intermittent: str = _field("Why the verdict may or may not occur.", "")
     extra_refinements_only: bool = _field("Whether the nightly's smaller steps alone show it.", False)
@@ -307,6 +318,7 @@ class _Selector(BaseModel):
         """
         own = {one: getattr(self, one) for one in _Selector.model_fields}
         own["engine"] = self.engine or common["engine"]
+        own |= {"min_bodies": self.min_bodies or 0, "joints": tuple(self.joints or ())}
         lists = {one: own[one] for one in ("scenario", "integrator", "quantity")}
         for names in product(*lists.values()):
             varied = [one for one, given in zip(names, lists.values(), strict=True) if len(given) > 1]
@@ -534,6 +546,10 @@ class KnownIssues:
         """
         self.issues = [e for e in entries if has_extra_refinements or not e.extra_refinements_only]
         self.has_extra_refinements = has_extra_refinements
+        # entries that record what rows of states or steps show
+        self._shown_by_states = {
+            e.name for e in self.issues if e.level in DIAGNOSED_LEVELS and e.diagnosis is not None
+        }
         self._by_kind: dict[RowKind, list[KnownIssue]] = {}  # a cache: rows are many, kinds few
         self.used_ids: set[str] = set()
         self.matched_ids: set[str] = set()
@@ -553,15 +569,19 @@ class KnownIssues:
             self._by_kind[kind] = [e for e in self.issues if e.matches_kind(kind)]
         return [e for e in self._by_kind[kind] if fnmatchcase(row.scenario, e.scenario)]
 
-    def mark_known(self, rows: Sequence[Row], bodies: int, inertia_ratio: float = 1.0) -> list[Row]:
+    def mark_known(
+        self, rows: Sequence[Row], bodies: int, inertia_ratio: float = 1.0, joints: Collection[str] = ()
+    ) -> list[Row]:
         """Mark the rows whose verdict an entry expects.
 
         A row that is larger than its entry covers, or whose mechanism is another one, stays unmarked; its
         reason then says so.
 
         Args:
-            bodies: length of its chain.
+            rows: of one mechanism.
+            bodies: their number.
             inertia_ratio: its `plumbline.model.invariants.inertia_ratio`.
+            joints: kinds of its joints.
 
         Returns:
             The rows in the same order, with the entry's id as ``known_issue``; the entry's mechanism is their
@@ -570,19 +590,49 @@ class KnownIssues:
         """
         scatter: dict[str, dict[str, float]] = {}  # by version of the engine, then by engine
         for row in rows:
-            if row.ratio is not None and (found := _scatter_of(row)) is not None:
-                of = scatter.setdefault(row.engine_version, {})
-                engine = row.engine.partition("@")[0]
-                of[engine] = max(found, of.get(engine, 0.0))
+            if (size := _scatter_of(row)) is not None:
+                of, name = scatter.setdefault(row.engine_version, {}), row.engine.partition("@")[0]
+                of[name] = max(size, of.get(name, 0.0))
         chain = bodies, inertia_ratio
-        return [self._mark(row, chain, scatter.get(row.engine_version, {})) for row in rows]
+        marked = dict[int, Row]()
+        compared, shown = set[tuple[str, str]](), set[tuple[str, str, str]]()  # engines at states and steps
+        for place, row in sorted(enumerate(rows), key=lambda one: one[1].level in FOLLOWING_LEVELS):
+            entries = [e for e in self.issues_for(row) if e.needs_of_mechanism_are_met(bodies, joints)]
+            found = marked[place] = self._mark(
+                row,
+                entries,
+                {e.id for e in entries if not self._is_shown(e, row, compared, shown)},
+                chain,
+                scatter.get(row.engine_version, {}),
+            )
+            if row.level in DIAGNOSED_LEVELS and Verdict(row.verdict).is_comparison:
+                engine = row.engine.partition("@")[0], row.engine_version
+                compared.add(engine)
+                shown.add((*engine, found.known_issue or ""))
+        return [marked[place] for place in range(len(rows))]
 
-    def _mark(self, row: Row, chain: tuple[int, float], scatter: Mapping[str, float]) -> Row:
-        entries = self.issues_for(row)
+    def _is_shown(
+        self, entry: KnownIssue, row: Row, compared: Set[tuple[str, str]], shown: Set[tuple[str, str, str]]
+    ) -> bool:
+        """Whether states or steps show what a row of a motion follows from, if the run compares them."""
+        if row.level not in FOLLOWING_LEVELS or entry.name not in self._shown_by_states:
+            return True
+        engine = entry.shown_by or row.engine.partition("@")[0], row.engine_version
+        return engine not in compared or (*engine, entry.name) in shown
+
+    def _mark(
+        self, row: Row, entries: Sequence[KnownIssue], unshown: Set[str], chain: tuple[int, float],
+        scatter: Mapping[str, float],
+    ) -> Row:  # fmt: skip
         self.matched_ids.update(e.id for e in entries)
         expecting = [e for e in entries if e.verdict == row.verdict]
         self.used_ids.update(e.id for e in expecting[:1])
-        objections = [e.objection(row, e.covered_ratio(*chain), scatter) for e in expecting]
+        objections = [
+            f"the entry {e.name} records what states show, and none of this mechanism does"
+            if e.id in unshown
+            else e.objection(row, e.covered_ratio(*chain), scatter)
+            for e in expecting
+        ]
         if "" in objections:
             match = expecting[objections.index("")]
             self.used_ids.add(match.id)

@@ -86,7 +86,7 @@ def test_cell(name, engine, level, workers, engines, truths):
     excuses = known_issues.KnownIssues(known_issues.project_known_issues(), has_extra_refinements=False)
     wrong = [
         f"{r.key} {r.verdict}: {r.reason}"
-        for r in excuses.mark_known(rows, found.model.n, inertia_ratio(found.model))
+        for r in excuses.mark_known(rows, found.model.n, inertia_ratio(found.model), found.model.kind)
         if r.verdict.needs_attention and r.known_issue is None
     ]
     stale = [f"known entry {e.id} no longer occurs" for e in excuses.stale_issues(is_full_matrix=False)]

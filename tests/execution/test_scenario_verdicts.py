@@ -134,7 +134,7 @@ class Recorded:
     def __init__(self, *quantities):
         self.quantities = quantities
 
-    def mark_known(self, rows, bodies, inertia_ratio):
+    def mark_known(self, rows, bodies, inertia_ratio, joints):
         return [replace(row, known_issue="id") if row.quantity in self.quantities else row for row in rows]
 
 

@@ -529,6 +529,36 @@ def test_an_entry_of_what_no_cause_explains_is_matched_by_needs(tmp_path):
         assert judged_by([row_], entries, whole=True).rows[0].known_issue == known
 
 
+@pytest.mark.parametrize(
+    ("states", "is_known"),
+    [
+        ([with_cause()], True),
+        ([with_cause(term="joint moment")], False),
+        ([ratio_row(0.5, verdict="agrees")], False),
+        ([], True),  # as far as the run compares states
+    ],
+)
+def test_a_row_of_a_motion_follows_from_the_states_that_show_the_finding(tmp_path, states, is_known):
+    rows = [{"level": "state", "max_ratio": 30}, {"level": "trajectory", "max_ratio": 30}]
+    changes = {"scenario": "*", "verdict": "disagrees", "cause": CAUSE, "rows": rows}
+    motion = ratio_row(10.0, "trajectory", "position_limit")
+    found, *_ = judged_by([motion, *states], loaded(tmp_path, changes), whole=True).rows
+    assert (found.known_issue == "a") is is_known, found.reason
+    assert is_known or "records what states show" in found.reason
+
+
+@pytest.mark.parametrize(
+    ("needs", "is_known"),
+    [({"min_bodies": 3}, True), ({"min_bodies": 4}, False), ({"joints": "ball"}, True),
+     ({"joints": ["slide", "rod"]}, True), ({"joints": ["slide"]}, False)],
+)  # fmt: skip
+def test_an_entry_is_about_mechanisms_that_have_what_it_needs(tmp_path, needs, is_known):
+    entries = loaded(tmp_path, {"scenario": "*", **OFF, "max_ratio": 30, **needs})
+    excuses = known_issues.KnownIssues(entries, has_extra_refinements=False)
+    (found,) = excuses.mark_known([ratio_row(10.0)], 3, joints=("ball", "rod", "rod"))
+    assert (found.known_issue == "a") is is_known
+
+
 def test_each_row_of_an_entry_must_occur(tmp_path):
     rows = [{"level": "state", "max_ratio": 30}, {"level": "relations", "max_ratio": 30}]
     changes = {"scenario": "*", "verdict": "disagrees", "mechanism": "rounding", "rows": rows}

@@ -296,5 +296,5 @@ def test_an_error_besides_the_recorded_one_of_tendons_is_a_new_disagreement(move
         found = tendons(model, state)
     rows = judge_relations(RowContext("rest", "", "mujoco", "MuJoCo", "4.0.0"), [found]).rows
     known = KnownIssues(project_known_issues(), has_extra_refinements=False)
-    (row,) = known.mark_known(rows, model.n)
+    (row,) = known.mark_known(rows, model.n, joints=model.kind)
     assert row.verdict == "disagrees" and (row.known_issue is None) == (moved > 0), row
