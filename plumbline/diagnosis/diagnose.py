@@ -15,7 +15,7 @@ import numpy as np
 
 from plumbline.diagnosis.cause import Cause, Diagnosis
 from plumbline.diagnosis.digit_loss import Evaluate, Problem, find_digit_loss, measure_scatter, scatter_cause
-from plumbline.diagnosis.fit import ACCEPTED_RATIO, Difference, Explanation, Mask, Search
+from plumbline.diagnosis.fit import ACCEPTED_RATIO, Candidate, Difference, Explanation, Mask, Search
 from plumbline.diagnosis.needs import find_needs
 from plumbline.diagnosis.outputs import Outputs, error_ratio
 from plumbline.diagnosis.prediction import QUANTITIES, SUMS, VECTORS, WRENCHES, Answers, Case, View
@@ -150,12 +150,17 @@ class _Diagnosing:
             found
             or self._single(View(), are_sums_apart=True)
             or (self._single_of_loops() if set(VECTORS[:2]) & set(wrong) else ())
-            or self._with_outputs(wrong)
-            or self._pairs()
+            or self._two_or_more(wrong)
             or self._forces()
             or self._partly(wrong)
             or (self._unexplained(wrong),)
         )
+
+    def _two_or_more(self, wrong: Sequence[str]) -> tuple[Cause, ...]:
+        """Several causes; outputs with fitted amounts, or two of them, where no two numbers explain it."""
+        beside = self._with_outputs(wrong)
+        is_simple = len(beside) <= 2 and not any(one.kind == "output" and one.amount for one in beside)
+        return (beside if is_simple else ()) or self._pairs() or beside
 
     def _close(self, quantities: Sequence[str]) -> Cause:
         return Cause("unexplained", _words(quantities), "", "close", quantities=tuple(quantities))
@@ -208,12 +213,16 @@ class _Diagnosing:
         return ()
 
     def _named(self, found: Sequence[Explanation]) -> tuple[Cause, ...]:
-        """The causes of one explanation, with those from which the data cannot distinguish them."""
-        alone = [one.causes(len(self.places)) for one in found]
-        if len(alone[0]) == 1:
-            first, *equal = (causes[0] for causes in alone if len(causes) == 1)
-            return (replace(first, equal=tuple(equal)),)
-        return alone[0]
+        """The causes of the first explanation, with those from which the data cannot distinguish them."""
+        first, *others = found
+        causes = dict(zip(first.combination, first.causes(len(self.places)), strict=True))
+        equal: dict[Candidate, dict[Candidate, Cause]] = {one: {} for one in causes}
+        for other in others:
+            replaced, new = set(causes) - set(other.combination), set(other.combination) - set(causes)
+            if len(replaced) == len(new) == 1:
+                stated = dict(zip(other.combination, other.causes(len(self.places)), strict=True))
+                equal[replaced.pop()].update({one: stated[one] for one in new})
+        return tuple(replace(cause, equal=tuple(equal[one].values())) for one, cause in causes.items())
 
     def _proved(self, view: View, found: Sequence[Explanation], mask: Mask) -> list[Explanation]:
         """Those that explain the difference at further states too."""
@@ -336,7 +345,7 @@ class _Diagnosing:
         for mask in masks:
             found = self._proved(View(), search.explain_by_pairs(mask), mask)
             if found:
-                return self._named(found[:1])
+                return self._named(found)
         return ()
 
     def _forces(self) -> tuple[Cause, ...]:

@@ -272,6 +272,7 @@ def test_a_component_that_is_zero_within_its_uncertainty_is_zero():
 PAIRS = [
     (CHAIN, ("mass", "body 1"), ("inertia xx", "body 2")),
     (CHAIN, ("near point y", "joint 2"), ("mass", "body 1")),
+    (CHAIN, ("damping", "joint 1"), ("inertia xy", "body 2")),  # or the drag moment of body 1
     (TREE, ("mass", "body 2"), ("damping", "joint 1")),
     (TREE, ("near point x", "joint 2"), ("inertia yy", "body 1")),
     (LOOP, ("mass", "body 1"), ("damping", "joint 2")),
