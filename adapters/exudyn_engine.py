@@ -182,7 +182,7 @@ class ExudynChain:
         model, far = self.model, self.model.body[k, 0]
         above = rotation_matrix(self.state.p[far]) if far >= 0 else np.eye(3)
         axes = JointFrame(model, k, above).axes(self.x[k])
-        for i, ((what, number), (_, axis)) in enumerate(zip(model.kinds[k].motions, axes, strict=True)):
+        for i, ((what, number), (axis, *_)) in enumerate(zip(model.kinds[k].motions, axes, strict=True)):
             stiffness, damping, effort = (x[k, i] for x in (model.stiffness, model.damping, model.effort))
             if not (stiffness or damping or effort):
                 continue

@@ -209,7 +209,7 @@ class _Linkage:
         axes = A @ rotation_matrix(self.model.turn[k, 1])
         kind = self.model.kinds[k]
         if kind.exchanges_axes:  # the link between has x of the far and y of the near body
-            x, y = joint.axes(self.state.x[k])[0][1], axes[:, 1]
+            x, y = joint.axes(self.state.x[k])[0].axis, axes[:, 1]
             axes = np.stack([x, y, np.cross(x, y)], axis=1)
         self._hang = self._hang + self._axes.T @ shift
         for i, (what, axis) in enumerate(joint.motions):

@@ -35,7 +35,9 @@ motions likewise.
 
 The option "tendon equalities" makes bodies on rods free and each rod, also one that closes a loop, a spatial
 tendon of constant length; "joint equalities" makes hinges, slides and welds cylindrical joints and holds the
-coordinates that these have in addition at 0.  Both are soft, and extrapolated as loops are.
+coordinates that these have in addition at 0.  Both are soft, and extrapolated as loops are.  A joint with a
+pitch, which MuJoCo lacks, is a cylindrical one whose slide an equality of joints holds at the pitch times
+the turn; it is soft too.
 
 Welded halves are bodies without a joint on a massless one in their body's place.  The option "dense mass
 matrix" finds the accelerations by a dense solve with `mj_fullM`.  MuJoCo's solvers (PGS, CG, Newton) and
@@ -45,12 +47,12 @@ for bit.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import mujoco
 import numpy as np
@@ -77,6 +79,7 @@ from plumbline.model.datatypes import (
 from plumbline.model.loops import PER_BODY, STABILISATION, cut_open, determinate_part, wrench_length
 from plumbline.model.redescription import (
     HELD_KINDS,
+    PITCHED_KINDS,
     Rearranged,
     added_motions,
     joints_as_cylinders,
@@ -163,10 +166,14 @@ class Mujoco(MetamorphicHooks):
     # the matrices of implicit steps, in dampers too, depend on the coordinates
     motion_options = MappingProxyType({HELD: ("RK4",)})
     unmoved_options = MappingProxyType({TENDONS: TENDON_MOTIONS})
+    gaps: ClassVar[Mapping[str, str]] = {
+        "mass_matrix": "MuJoCo holds the pitch of a joint by an equality of a slide and a hinge: its mass "
+        "matrix has both"
+    }
     builds_trees = builds_elements = moves_loops = True
     loop_steps_unsupported_reason = (
-        "not compared: MuJoCo's loops are soft, the forces in a step are those of its regularised solver, "
-        "which has no formula; their limit is compared in motions"
+        "not compared: MuJoCo's constraints are soft, the forces in a step are those of its regularised "
+        "solver, which has no formula; their limit is compared in motions"
     )
     welding_unsupported_reason = ""
 
@@ -175,15 +182,22 @@ class Mujoco(MetamorphicHooks):
         return str(mujoco.mj_versionString())
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
-        if model.has_loops or self.option in self.joint_options:
-            soft = _SoftMechanism(model, self.option)
+        if self.is_soft(model):
+            soft = _SoftMechanism(model, self.option, self.body_pieces(model))
             with _raise_on_warnings(soft.tree.d):
                 return [_rigid_limit(soft, state) for state in states]
         chain = _MujocoChain(model, self.body_pieces(model), dense=self.option == DENSE)
         with _raise_on_warnings(chain.d):
             return [chain.quantities(state) for state in states]
 
+    def is_soft(self, model: Model) -> bool:
+        """Whether constraints hold it: loops, options of joints, pitches."""
+        has_pitch = any(kind.has_pitch for kind in model.kinds)
+        return model.has_loops or self.option in self.joint_options or has_pitch
+
     def _surface(self, model: Model, states: Sequence[State]) -> list[SurfaceAnswer]:
+        if self.is_soft(model):
+            return []
         chain = _MujocoChain(model, has_probes=True)
         with _raise_on_warnings(chain.d):
             return [
@@ -195,7 +209,7 @@ class Mujoco(MetamorphicHooks):
     ) -> Trajectory:
         if self.option == TENDONS:
             raise Unsupported(TENDON_MOTIONS)
-        if model.has_loops or self.option == HELD:
+        if self.is_soft(model):
             return self._rigid_run(model, state, times, integrator, resolution)
         return self._sampled_run(_MujocoChain(model), state, times, integrator, resolution)
 
@@ -264,7 +278,9 @@ class _Constraints:
     """What holds a tree besides its joints."""
 
     ends: tuple[tuple[int, int], ...] = ()  # bodies that stay together
-    held: tuple[tuple[int, ...], ...] = ()  # of each body's joint the motions that are held at 0
+    # of each body's joint the motions that are held, at pitches times the turns
+    held: tuple[tuple[int, ...], ...] = ()
+    pitches: tuple[float, ...] = ()  # m/rad, of each body's joint
     ties: tuple[_Tie, ...] = ()
 
 
@@ -515,7 +531,7 @@ class _MujocoChain:
 class _SoftMechanism:
     """A mechanism that MuJoCo holds by soft constraints: loops closed, rods as ties, motions held."""
 
-    def __init__(self, model: Model, option: str) -> None:
+    def __init__(self, model: Model, option: str, parts: BodyParts | None = None) -> None:
         self.source, ties = model, list[_Tie]()
         self.rodless = rods_taken_out(model) if option == TENDONS else None
         rest = self.rodless.model if self.rodless else model
@@ -527,16 +543,19 @@ class _SoftMechanism:
         for k in self.rods:
             softness = sum(1 / model.mass[b] for b in model.body[k] if b >= 0)
             ties.append(_Tie(place[model.body[k]], model.point[k], model.length[k], softness))
-        held = joints_as_cylinders(self.opened) if option == HELD else self.opened
-        added = added_motions(self.opened) if option == HELD else [() for _ in self.opened.kind]
-        constraints = _Constraints(self.cut.ends if self.cut else (), tuple(added), tuple(ties))
-        self.tree = _MujocoChain(held, dense=option == DENSE, constraints=constraints)
+        held = joints_as_cylinders(self.opened, PITCHED_KINDS + (HELD_KINDS if option == HELD else ()))
+        pairs = zip(self.opened.kinds, self.opened.length, strict=True)
+        pitches = tuple(float(length) if kind.has_pitch else 0.0 for kind, length in pairs)
+        added = tuple(added_motions(self.opened, held))
+        constraints = _Constraints(self.cut.ends if self.cut else (), added, pitches, tuple(ties))
+        parts = None if self.cut else parts
+        self.tree = _MujocoChain(held, parts, option == DENSE, constraints)
 
     def state(self, state: State) -> State:
         """The state of the tree."""
         there = self.rodless.state(state) if self.rodless else state
         there = self.cut.state(there) if self.cut else there
-        if self.tree.model is not self.opened:
+        if self.tree.model.kind != self.opened.kind:
             there = state_of_cylinders(self.opened, self.tree.model, there)
         return there
 
@@ -674,7 +693,12 @@ def _add_equalities(spec: Any, links: list[Any], constraints: _Constraints) -> N
     for k, motions in enumerate(constraints.held):
         for i in motions:
             joint = _set_attributes(links[k].joints[i], name=f"held {k} {i}")
-            _add_equality(spec, "JOINT", joint.name)
+            if pitch := constraints.pitches[k]:  # slide = pitch × hinge
+                turn = _set_attributes(links[k].joints[1 - i], name=f"turn {k}")
+                equality = _add_equality(spec, "JOINT", joint.name, turn.name)
+                equality.data[:5] = 0.0, pitch, 0.0, 0.0, 0.0
+            else:
+                _add_equality(spec, "JOINT", joint.name)
     for loop, pair in enumerate(constraints.ends):
         names = [f"end {loop} {side}" for side in (1, 2)]
         for k, name in zip(pair, names, strict=True):
@@ -682,10 +706,10 @@ def _add_equalities(spec: Any, links: list[Any], constraints: _Constraints) -> N
         _add_equality(spec, "WELD", *names)
 
 
-def _add_equality(spec: Any, kind: Literal["TENDON", "JOINT", "WELD"], name: str, other: str = "") -> None:
+def _add_equality(spec: Any, kind: Literal["TENDON", "JOINT", "WELD"], name: str, other: str = "") -> Any:
     """Add a constraint at zero, as hard as MuJoCo accepts; of an other element only where there is one."""
     of = {"WELD": "SITE"}.get(kind, kind)
-    _set_attributes(
+    return _set_attributes(
         spec.add_equality(), type=getattr(mujoco.mjtEq, f"mjEQ_{kind}"),
         objtype=getattr(mujoco.mjtObj, f"mjOBJ_{of}"), name1=name, name2=other,
         solref=[0.0, 0.0], solimp=[*[MAX_IMPEDANCE] * 2, 1, 0.5, 2],

@@ -113,10 +113,13 @@ class _FreeFlyerSystem:
         rows, drifts, directions = [np.zeros((0, engine.nv))], [np.zeros(0)], []
         for k in range(len(model.kind)):
             jacobian, drift = self._relative_motion(k, state)
-            push, turn = self._held_directions(k, state)
-            rows += [push @ jacobian[:3], turn @ jacobian[3:]]
-            drifts += [push @ drift[:3] + model.length[k] * self.udot[k] @ self.udot[k], turn @ drift[3:]]
-            directions.append((push, turn))
+            held = self._held_directions(k, state)
+            rows.append(held @ jacobian)
+            bend = held @ drift
+            if model.rods[k]:
+                bend = bend + model.length[k] * self.udot[k] @ self.udot[k]
+            drifts.append(bend)
+            directions.append(held)
         constraints, bend = np.vstack(rows), np.concatenate(drifts)
         kept = independent_rows(constraints) if model.has_loops else np.arange(len(bend))
         multiplier = np.zeros(len(bend))
@@ -129,10 +132,9 @@ class _FreeFlyerSystem:
         else:
             pin.forwardDynamics(engine, data, q, v, tau, constraints, bend, 0.0)
             multiplier[kept] = data.lambda_c
-        ends = np.cumsum([len(some) for pair in directions for some in pair])[:-1]
-        parts = iter(np.split(multiplier, ends))
-        wrench = np.array([[some.T @ next(parts) for some in pair] for pair in directions])
-        return wrench[:, 0], wrench[:, 1]
+        parts = np.split(multiplier, np.cumsum([len(held) for held in directions])[:-1])
+        wrench = np.array([held.T @ part for held, part in zip(directions, parts, strict=True)])
+        return wrench[:, :3], wrench[:, 3:]
 
     def _relative_motion(self, k: int, state: State) -> tuple[Array, Array]:
         """Jacobian (6, nv) of joint k, and its acceleration at v̇ = 0 less what allowed rates cause.
@@ -161,24 +163,29 @@ class _FreeFlyerSystem:
         drift[:3] -= np.cross(drift_far[3:], d) + np.cross(spin, np.cross(spin, d))
         carried = spin.copy()
         joint = JointFrame(model, k, placements[1].rotation)
-        for (what, axis), rate in zip(joint.axes(self.x[k]), self.xdot[k], strict=False):
-            if what == "slide":
-                drift[:3] -= 2 * np.cross(spin, axis * rate)
-            else:
-                drift[3:] -= np.cross(carried, axis * rate)
-                carried = carried + axis * rate
+        for (_, along, about), rate in zip(joint.axes(self.x[k]), self.xdot[k], strict=False):
+            if along is not None:
+                drift[:3] -= 2 * np.cross(spin, along * rate)
+            if about is not None:
+                drift[3:] -= np.cross(carried, about * rate)
+                carried = carried + about * rate
         return jacobian, drift
 
-    def _held_directions(self, k: int, state: State) -> tuple[Array, Array]:
-        """Unit vectors (c, 3) along which joint k holds the near point, and about which it holds the body."""
+    def _held_directions(self, k: int, state: State) -> Array:
+        """Rows (c, 6) of the near point's velocity and of the angular velocity that joint k holds."""
         model, kind = self.source_model, self.source_model.kinds[k]
         if kind.has_attitude:
             push = self.u[k : k + 1] if kind.holds_distance else np.eye(3)[: len(kind.rows)]
-            return push, np.zeros((0, 3))
+            return np.hstack([push, 0 * push])
         far = self.data.oMf[self.far_frames[k]].rotation
         axes = JointFrame(model, k, far).axes(self.x[k])
-        slides, turns = ([axis for what, axis in axes if what == name] for name in ("slide", "turn"))
-        return _complement(slides), _complement(turns)
+        pushes = _complement([axis for axis, along, _ in axes if along is not None])
+        turns = _complement([axis for axis, _, about in axes if about is not None])
+        held = [np.hstack([pushes, 0 * pushes]), np.hstack([0 * turns, turns])]
+        if kind.has_pitch:
+            axis = axes[0].axis
+            held.append(np.array([[*axis, *(-model.length[k] * axis)]]))
+        return np.vstack(held)
 
 
 def _complement(axes: list[Array]) -> Array:

@@ -35,6 +35,7 @@ class JointKind:
     # Its scalar coordinates from the far body on: turns about or slides along one of the axes 0, 1, 2.
     motions: tuple[tuple[Literal["turn", "slide"], int], ...] = ()
     has_attitude: bool = False  # whether p of the near body is a coordinate, not a result
+    has_pitch: bool = False  # whether its turn moves it along the axis: zᵀd is its pitch times the turn
 
     @cached_property
     def holds_distance(self) -> bool:
@@ -42,9 +43,19 @@ class JointKind:
         return ("d", "d") in self.rows
 
     @cached_property
+    def own_number(self) -> str:
+        """What its number in `Mechanism.length` is: "length" [m], "pitch" [m/rad], or empty."""
+        return "length" if self.holds_distance else "pitch" * self.has_pitch
+
+    @cached_property
     def holds_nothing(self) -> bool:
         """Whether the near body is free."""
         return not self.rows
+
+    @cached_property
+    def is_unbounded(self) -> bool:
+        """Whether its near point may go any distance from the far one."""
+        return self.holds_nothing or self.has_pitch or bool(self.slide_axes)
 
     @cached_property
     def holds_points(self) -> bool:
@@ -110,6 +121,8 @@ class JointKind:
     def description(self) -> str:
         """What the near body does, as seen from the far one."""
         verbs = {"turn": "turns about", "slide": "moves along"}
+        if self.has_pitch:
+            verbs["turn"] = "moves by its pitch per angle along, and turns about,"
         return (
             " and then ".join(f"{verbs[what]} {'xyz'[axis]}" for what, axis in self.motions)
             or "does not move"

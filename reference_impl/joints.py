@@ -18,6 +18,13 @@ b = A_near s_near,
 
 and γ = −d_t(C_r) ṙ − d_t(C_p) ṗ with Ȧ = 2 G L̇ᵀ, as the notes have it (E3); on the manifold it is the row
 dᵀd of (L2, L3).  For one and two bodies on rods these are S1–S4 and D2–D6, which `notes` has as printed.
+
+The row zᵀd of a joint with a pitch h is less h φ, φ = atan2(s, c) with s = yᵀX and c = xᵀX, and their
+derivatives from (L2, L3):
+
+    φ_q = (c s_q − s c_q)/(s² + c²),    φ̈₀ = (c s̈₀ − s c̈₀ − 2 φ̇ (s ṡ + c ċ))/(s² + c²)        (at q̈ = 0)
+
+Full turns are those that make the row smallest.
 """
 
 from __future__ import annotations
@@ -109,6 +116,9 @@ class _RowLayout:
     joint: Int[Indices, "c"]  # the joint of each row
     near: Int[Indices, "c"]  # its near body
     far: Int[Indices, "c"]  # its far body, −1 the world
+    pitched: NDArray[np.intp]  # joints with a pitch
+    pitch_rows: NDArray[np.intp]  # their rows zᵀd
+    pitch: Shaped[AnyArray, "h"]  # m/rad
     product_rows: Int[Indices, "k"]  # the rows that are products of `factors`
     factors: Int[Indices, "2 k"]  # u and w of these rows, places in VECTORS
     turned: Int[Indices, "t"]  # joints that have axes
@@ -131,6 +141,8 @@ def _row_layout(mechanism: Mechanism) -> _RowLayout:
     f, h = np.moveaxis(A(mechanism.turn[turned]).swapaxes(-1, -2), 1, 0)  # rows: the axes
     axes = np.stack([h, np.where(world[turned, None, None], 0, f)])
     factors = [[VECTORS.index(name) for name in pair] for pair in pairs if pair != ("d", "d")]
+    has_pitch = np.array([kind.has_pitch for kind in mechanism.kinds], bool)
+    is_along = np.array([pair == ("z", "d") for pair in pairs], bool) & has_pitch[joint]
     return _RowLayout(
         bodies=np.stack([near, np.maximum(far, 0)]),
         s=s,
@@ -142,6 +154,9 @@ def _row_layout(mechanism: Mechanism) -> _RowLayout:
         joint=joint,
         near=near[joint],
         far=far[joint],
+        pitched=joint[is_along],
+        pitch_rows=np.flatnonzero(is_along),
+        pitch=mechanism.length[joint[is_along]],
         product_rows=np.flatnonzero(~is_rod),
         factors=np.array(factors, np.intp).reshape(-1, 2).T,
         turned=turned,
@@ -202,7 +217,14 @@ def constraint_rows(
         row = fixed.product_rows
         H_d = np.stack([[H_near, H_far], [H_near_rate, H_far_rate]])
         vectors = _factor_vectors(fixed, d, xdot, both, H_d)
-        C[row], gamma[row], r_near[row], p_near[row], p_far[row] = _product_rows(fixed, vectors)
+        places = fixed.joint[row], fixed.factors
+        C[row], gamma[row], r_near[row], p_near[row], p_far[row] = _product_rows(places, vectors)
+    if len(fixed.pitch_rows):
+        row, h = fixed.pitch_rows, fixed.pitch
+        angle, *parts = _turns_about_z(fixed.pitched, vectors, C[row], h)
+        C[row] -= h * angle
+        for found, part in zip((gamma, p_near, p_far), parts, strict=True):
+            found[row] -= (h * part.T).T
     return ConstraintRows(fixed.joint, fixed.near, fixed.far, C, r_near, p_near, p_far, gamma, d)
 
 
@@ -232,10 +254,36 @@ def _factor_vectors(
     return value, of_p, rate, bias
 
 
-def _product_rows(fixed: _RowLayout, vectors: tuple[AnyArray, ...]) -> tuple[AnyArray, ...]:
-    """C, γ, C_r near, C_p near and C_p far of the rows that are products (L2, L3)."""
+def _turns_about_z(
+    joint: NDArray[np.intp], vectors: tuple[AnyArray, ...], shift: AnyArray, pitch: AnyArray
+) -> tuple[AnyArray, ...]:
+    """φ, −φ̈₀, φ_p near and φ_p far of joints, with full turns that are nearest to their shifts."""
+    s, c = (
+        _product_rows((joint, np.array([[VECTORS.index(x)] for x in pair])), vectors) for pair in ("yX", "xX")
+    )
+    square = s[0] ** 2 + c[0] ** 2
+    value, _, rates, _ = vectors
+    iy, ix, iX = (VECTORS.index(x) for x in "yxX")
+    s_rate, c_rate = (
+        dot(rates[joint, i], value[joint, iX]) + dot(value[joint, i], rates[joint, iX]) for i in (iy, ix)
+    )
+    rate = (c[0] * s_rate - s[0] * c_rate) / square
+    bend = (c[0] * s[1] - s[0] * c[1] + 2 * rate * (s[0] * s_rate + c[0] * c_rate)) / square
+    near, far = (((c[0] * s[i].T - s[0] * c[i].T) / square).T for i in (3, 4))
+    angle, full = np.arctan2(s[0].real, c[0].real), 2 * np.pi
+    turns = np.divide(shift.real, pitch, out=angle.copy(), where=pitch != 0) - angle
+    angle = angle + full * np.round(turns / full)
+    if np.iscomplexobj(shift):  # a step along i
+        angle = angle + 1j * (c[0].real * s[0].imag - s[0].real * c[0].imag) / square.real
+    return angle, bend, near, far
+
+
+def _product_rows(
+    places: tuple[NDArray[np.intp], NDArray[np.intp]], vectors: tuple[AnyArray, ...]
+) -> tuple[AnyArray, ...]:
+    """C, γ, C_r near, C_p near and C_p far of products, by their joints and factors (L2, L3)."""
     value, of_p, rate, bias = vectors
-    k, (iu, iw) = fixed.joint[fixed.product_rows], fixed.factors
+    k, (iu, iw) = places
     u, w = value[k, iu], value[k, iw]
     p_near, p_far = (_vector_matrix(u, x[k, iw]) + _vector_matrix(w, x[k, iu]) for x in of_p)
     gamma = -(dot(u, bias[k, iw]) + dot(w, bias[k, iu]) + 2 * dot(rate[k, iu], rate[k, iw]))

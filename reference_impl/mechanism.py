@@ -53,7 +53,9 @@ class Mechanism:
     body: Int[Indices, "joints 2"]  # far and near; in the tree body[k, 0] < body[k, 1] = k
     point: Float[Array, "*#batch joints 2 3"]  # m, far and near, each in the frame of its body
     turn: Float[Array, "*#batch joints 2 4"]  # unit quaternions: the joint's axes in both bodies
-    length: Float[Array, "*#batch joints"]  # m, ℓ of a rod, 0 for other joints
+    # The one number of its own that a kind may have, `JointKind.own_number`; 0 for other joints: m, ℓ of a
+    # rod; m/rad, the pitch of a turn that moves along its axis
+    length: Float[Array, "*#batch joints"]
     gravity: Float[Array, "*#batch 3"]  # m/s², world frame
     force: Float[Array, "*#batch bodies 3"]  # N, constant applied force at the centre of mass, world frame
     moment: Float[Array, "*#batch bodies 3"]  # N m, constant applied moment n′, body frame

@@ -434,7 +434,7 @@ def _body_shapes(scenario: Record) -> list[Record]:
         shapes.append(
             {
                 "is_free": kind.holds_nothing,
-                "is_apart": kind.holds_distance or bool(kind.slide_axes),
+                "is_apart": kind.holds_distance or (kind.is_unbounded and not kind.holds_nothing),
                 "far": int(model.body[k, 0]),
                 "body": int(model.body[k, 1]),
                 "hang": [_json_number(x, 4) for x in model.point[k, 0]],

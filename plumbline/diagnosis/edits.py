@@ -249,9 +249,10 @@ def _joints(model: Model) -> Iterator[Edit]:
         if kind.holds_nothing:
             continue
         place = f"joint {k + 1}"
-        if kind.holds_distance:
-            length = float(model.length[k])
-            yield _number("length", place, "length", (k,), length, length, " m", can_vanish=False)
+        if own := kind.own_number:
+            value, unit = float(model.length[k]), " m" if kind.holds_distance else " m/rad"
+            size, can_vanish = abs(value) or 0.1, not kind.holds_distance
+            yield _number(own, place, "length", (k,), value, size, unit, can_vanish, general=own)
         if kind.motions and kind.motions[0][0] == "slide" and _shift_is_askew(model, k):
             cause = Cause("number", "origin of the slide", place, nominal=(0.0,), unit=" m")
             yield Edit(cause, _shifted_slide(k), 0.1)

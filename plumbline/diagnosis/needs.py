@@ -169,7 +169,7 @@ def _with_other_joints(model: Model, states: list[State], kind: str) -> Iterator
         fields = {name: getattr(model, name) * (columns | ~where[:, None]) for name in JOINT_ELEMENTS}
         if new.is_spherical:
             fields |= {name: fields[name] * ~where[:, None] for name in ("rest", "effort")}
-        length = np.where(where, float(new.holds_distance), model.length)
+        length = np.where(where, float(bool(new.own_number)), model.length)
         changed = replace(model, kind=kinds, length=length, **fields)
         along = np.where(where[: model.n, None], [0.0, 0.0, -float(new.holds_distance)], 0.0)
         some = where[: model.n, None]

@@ -442,14 +442,15 @@ class Outputs:
         for k, s in np.ndindex(model.n, len(state.p)):
             far = int(model.body[k, 0])
             above = self._turns[s, far] if far >= 0 else np.eye(3)
-            for i, (what, axis) in enumerate(JointFrame(model, k, above).axes(state.x[s, k])):
-                row, total = int(what == "turn"), 0.0
+            for i, (axis, *pair) in enumerate(JointFrame(model, k, above).axes(state.x[s, k])):
+                row, total = int(pair[1] is not None), 0.0
                 for name, amounts in efforts.items():
                     values[name][row, s, k] += amounts[s, k, i] * axis
                     total += amounts[s, k, i]
                 if np.any(model.armature[k]):
-                    held = self.right[WRENCHES[row]][s, k]
-                    values["rotors"][row, s, k] += (axis @ held - total) * axis
+                    pairs = zip(WRENCHES, pair, strict=True)
+                    held = sum(e @ self.right[name][s, k] for name, e in pairs if e is not None)
+                    values["rotors"][row, s, k] += (held - total) * axis
         parts = list[Part]()
         everything = np.zeros((2, *self._near.shape))
         for name, value in values.items():

@@ -380,6 +380,9 @@ def _joint_readings(case: Case, k: int) -> Iterator[tuple[Any, ...]]:
                 f"{WORDS.get(name, name)} of the two coordinates", "exchanged",
                 _row(name, k, lambda c, pair=pair: pair[[1, 0, *range(2, len(pair))]]),  # type: ignore[misc]
             )  # fmt: skip
+    if kind.has_pitch:
+        for words, factor in (("reversed", -1.0), ("taken per turn, not per radian", 0.5 / np.pi)):
+            yield "pitch", words, _row("length", k, lambda c, x=factor: x * c.model.length[..., k])  # type: ignore[misc]
     if not kind.holds_nothing:
         yield from _point_readings(model, k)
     if not kind.has_attitude:

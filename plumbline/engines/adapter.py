@@ -69,6 +69,7 @@ MODEL_GAPS: Mapping[str, Callable[[Model], bool]] = {
     "ball elements": lambda model: _has_elements(model, _BALLS, "armature", "damping", "stiffness"),
     "ball springs": lambda model: _has_elements(model, _BALLS, "damping", "stiffness"),
     "planar elements": lambda model: _has_elements(model, _TWO_SLIDES, "damping", "stiffness", "effort"),
+    "pitches": lambda model: any(kind.has_pitch for kind in model.kinds),
     "universal springs": lambda model: _has_elements(model, _TWO_TURNS, "stiffness"),
     "point masses": lambda model: model.lacks_inertia,
     "bodies": lambda model: model.n > 1,
@@ -269,7 +270,7 @@ class Adapter(ABC):
 
         """
         self._check_motion(model)
-        if model.has_loops and self.loop_steps_unsupported_reason:
+        if self.is_soft(model) and self.loop_steps_unsupported_reason:
             raise Unsupported(self.loop_steps_unsupported_reason, "steps of loops")
         check_state(model, state)
         times = np.asarray(step * np.arange(count + 1), float)
@@ -279,6 +280,10 @@ class Adapter(ABC):
         check_record(run, StepRun, {"N": model.n, "T": len(times)}, label)
         _check_trajectory(model, times, run.trajectory, label)
         return run
+
+    def is_soft(self, model: Model) -> bool:
+        """Whether the engine holds a part of the mechanism by constraints of its own solver."""
+        return model.has_loops
 
     def _check_motion(self, model: Model) -> None:
         self._check_mechanism(model, self.builds_elements)

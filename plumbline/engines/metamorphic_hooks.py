@@ -111,6 +111,7 @@ class MetamorphicHooks(Adapter):
             Rows at 0, ``end`` and 2 ``end``.
 
         """
+        self._check_motion(model)
         check_state(model, state)
         run = self._simulate_round_trip(model, state, end, self.integrator(integrator), resolution)
         check_samples(

@@ -140,17 +140,30 @@ class Responses:
                 turns = every
                 elements = [(slides.shape[-1], None, None), (3, blocks[-1].effort, blocks[-1].armature)]
             else:
-                ordered = sorted(blocks, key=lambda block: block.turns)
+                ordered = sorted(blocks, key=lambda block: block.about is not None)
                 axes = [np.broadcast_to(block.axis, (S, 3, 1)) for block in ordered]
-                count = sum(not block.turns for block in ordered)
+                count = sum(block.about is None for block in ordered)
                 slides, turns = (np.concatenate([none, *some], -1) for some in (axes[:count], axes[count:]))
                 elements = [(1, block.effort, block.armature) for block in ordered]
             self._free.append(_both(slides, turns))
             self.held.append(_both(_across(slides), _across(turns)))
+            if kind.has_pitch:
+                self._add_pitch(turns, model.length[..., k, None, None])
             for size, effort, rotor in elements:
                 efforts.append(np.broadcast_to(0.0 if effort is None else effort[..., 0], (S, size)))
                 armature.append(np.broadcast_to(0.0 if rotor is None else rotor[..., 0], (S, size)))
         self._armature, self._effort = np.concatenate(armature, -1), np.concatenate(efforts, -1)
+
+    def _add_pitch(self, axis: Array, pitch: Array) -> None:
+        """Let the last joint's turn about an axis (S, 3, 1) advance along it."""
+        free, held = self._free[-1].copy(), self.held[-1].copy()
+        free[:, :3] = pitch * axis
+        size = np.sqrt(1 + pitch**2)
+        # the axis is held but for what the pitch gives it, and the moment about it that goes with the force
+        across, both = _across(axis), np.concatenate([axis, -pitch * axis], 1) / size
+        held[:, :3, :2] = across
+        held[:, :, 2:3] = both
+        self._free[-1], self.held[-1] = free, held
 
     def _find_motions(self) -> None:
         """A and H = AᵀM A + a, with rates in units in which H has a unit diagonal."""

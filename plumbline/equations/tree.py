@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -140,19 +141,22 @@ class _Turns:
 
 
 class _Single:
-    """One turn about or one slide along an axis through the near point."""
+    """One turn about or one slide along an axis through the near point, or a turn that advances along it."""
 
-    def __init__(self, num: Arithmetic, what: str, axis: Any, effort: Any, armature: Any) -> None:
-        self.num, self.turns, self.axis = num, what == "turn", axis
+    def __init__(
+        self, num: Arithmetic, axis: Any, along: Any | None, about: Any | None, effort: Any, armature: Any
+    ) -> None:
+        """Take the axis, and what a unit rate is: velocity of the near point and angular velocity."""
+        self.num, self.axis, self.along, self.about = num, axis, along, about
         self.effort, self.armature = num.from_rows([[effort]]), armature
 
     def reduce(self, x: Articulated) -> Articulated:
-        num, e = self.num, self.axis
-        blocks = (x.b, x.i) if self.turns else (x.c, num.transpose(x.b))
-        self.U, self.V = U, V = [num.mul(block, e) for block in blocks]
-        size = num.dot(e, V if self.turns else U)
+        num, along, about = self.num, self.along, self.about
+        self.U = U = _sum(num.mul, (x.c, along), (x.b, about))
+        self.V = V = _sum(num.mul, (num.transpose(x.b), along), (x.i, about))
+        size = _sum(num.dot, (U, along), (V, about))
         self.inverse = 1 / (size if self.armature is None else size + self.armature)
-        push = num.mul(num.transpose(e), x.n if self.turns else x.f)
+        push = _sum(partial(_projected, num), (x.f, along), (x.n, about))
         self.push = q = num.widened(self.effort, push) - push
         u, v = U * self.inverse, V * self.inverse
         return Articulated(
@@ -167,8 +171,19 @@ class _Single:
         num = self.num
         U, V = num.transpose(self.U), num.transpose(self.V)
         rate = (self.push - num.mul(U, a) - num.mul(V, alpha)) * self.inverse
-        gained = num.mul(self.axis, rate)
-        return (a, alpha + gained, rate) if self.turns else (a + gained, alpha, rate)
+        a = a if self.along is None else a + num.mul(self.along, rate)
+        alpha = alpha if self.about is None else alpha + num.mul(self.about, rate)
+        return a, alpha, rate
+
+
+def _sum(product: Callable[[Any, Any], Any], *pairs: tuple[Any, Any | None]) -> Any:
+    """Sum of products; None as a second factor is 0."""
+    found = [product(x, e) for x, e in pairs if e is not None]
+    return found[0] if len(found) == 1 else found[0] + found[1]
+
+
+def _projected(num: Arithmetic, x: Any, e: Any) -> Any:
+    return num.mul(num.transpose(e), x)
 
 
 def rotation_rows(p: Sequence[Any]) -> tuple[list[list[Any]], Any]:
@@ -417,13 +432,16 @@ class Tree:
                 effort, armature = push - stiffness * stretch - d * rate, a
                 self._kinetic = self._kinetic + a * rate * rate / 2
                 self._potential = self._potential + stiffness * stretch * stretch / 2
-            blocks.append(_Single(num, what, axis, effort, armature))
-            if what == "slide":
-                shift = axis * x
+            along, about = (axis, None) if what == "slide" else (None, axis)
+            if KINDS[model.kind[k]].has_pitch:
+                along = axis * num.scalar(model.length[..., k])
+            blocks.append(_Single(num, axis, along, about, effort, armature))
+            if along is not None:
+                shift = along * x
                 P, arm, bend = P + shift, arm + shift, bend + num.cross(w, num.cross(w, shift))
-                bend = bend + num.cross(swing, shift) + num.cross(w, axis) * (rate * 2)
-                v = v + num.cross(w, shift) + axis * rate
-            else:
+                bend = bend + num.cross(swing, shift) + num.cross(w, along) * (rate * 2)
+                v = v + num.cross(w, shift) + along * rate
+            if about is not None:
                 swing, w = swing + num.cross(w, axis) * rate, w + axis * rate
                 A = num.mul(A, self._turn_about(number, x))
         A = num.mul(A, num.transpose(self.joint_axes(k, 1)))
@@ -732,14 +750,13 @@ class Tree:
         for k in range(n):
             c, b, i = total[k]
             for at, slide, turn in columns[k]:
-                push = num.mul(c, slide) if turn is None else num.mul(b, turn)
-                moment = num.mul(num.transpose(b), slide) if turn is None else num.mul(i, turn)
+                push = _sum(num.mul, (c, slide), (b, turn))
+                moment = _sum(num.mul, (num.transpose(b), slide), (i, turn))
                 j = k
                 while j >= 0:
                     for row, along, about in columns[j]:
                         if j < k or row <= at:
-                            add(row, at, num.mul(num.transpose(along if about is None else about),
-                                                 push if about is None else moment))  # fmt: skip
+                            add(row, at, _sum(partial(_projected, num), (push, along), (moment, about)))
                     lever = num.mul(num.cross_matrix(self.arm[j]), push)
                     moment = lever if keeps_attitude[j] else moment + lever
                     j = self.far[j]
@@ -764,8 +781,7 @@ class Tree:
         n = [moment - num.cross(s, force) for s, (force, moment) in zip(self.near, wrenches, strict=True)]
         for k, columns in reversed([*enumerate(self._rate_columns())]):
             for at, slide, turn in columns:
-                along, part = (slide, f[k]) if turn is None else (turn, n[k])
-                found[at] = num.mul(num.transpose(along), part)
+                found[at] = _sum(partial(_projected, num), (f[k], slide), (n[k], turn))
             if (far := self.far[k]) >= 0:
                 f[far] = f[far] + f[k]
                 n[far] = n[far] + n[k] + num.cross(self.arm[k], f[k])
@@ -786,9 +802,7 @@ class Tree:
             if kind.has_attitude:
                 columns.append((own.stop - 3, None, self.A[k]))
             else:
-                for i, block in enumerate(self.blocks[k]):
-                    pair = (None, block.axis) if block.turns else (block.axis, None)
-                    columns.append((own.start + i, *pair))
+                columns += [(own.start + i, x.along, x.about) for i, x in enumerate(self.blocks[k])]
             found.append(columns)
         return found
 

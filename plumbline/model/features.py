@@ -137,11 +137,15 @@ def _joint_values(model: Model, k: int) -> Iterator[tuple[str, str, Index, Array
         near and not model.kinds[k].holds_nothing
     ):  # another parent: the world, or the body before
         yield "parent", "body", (k, 0), -1 if far >= 0 else near - 1
+    # What follows from the state of a closing joint: of a rod its length, of a turn with a pitch that number
+    # and the far point, on which neither its angle nor a rate depends.
+    own, is_given = model.kinds[k].own_number, k < model.n
     for side, end in enumerate(("parent", "body")):
-        yield f"point of the {end}", "point", (k, side), 0.0
+        if is_given or side or not model.kinds[k].has_pitch:
+            yield f"point of the {end}", "point", (k, side), 0.0
         yield f"axes in the {end}", "turn", (k, side), _IDENTITY
-    if model.rods[k] and k < model.n:  # of a closing rod it follows from the state
-        yield "length", "length", (k,), 1.0
+    if own and is_given:
+        yield own, "length", (k,), float(model.kinds[k].holds_distance)
     for name in JOINT_ELEMENTS:
         for i in range(model.columns):
             yield f"{name} {i + 1}", name, (k, i), 0.0

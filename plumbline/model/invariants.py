@@ -13,6 +13,7 @@ from plumbline.model.kinematics import (
     ball_spring_rest,
     cross,
     joint_vectors,
+    nearest_turn,
     quaternion_conjugate,
     quaternion_exponential,
     quaternion_product,
@@ -485,13 +486,21 @@ def _across_slides(model: Model, p: Array, omega: Array, d: Array, ddot: Array) 
     for k, (kind, far) in enumerate(zip(model.kinds, model.body[:, 0], strict=True)):
         if kind.holds_nothing:
             d[:, k] = ddot[:, k] = 0.0
-        if not kind.slide_axes:
+        if not (kind.slide_axes or kind.has_pitch):
             continue
         axes, spin = rotation_matrix(model.turn[k, 0]) * np.ones((len(d), 1, 1)), np.zeros_like(d[:, k])
         if far >= 0:
             above = rotation_matrix(p[:, far])
             axes, spin = above @ axes, np.matvec(above, omega[:, far])
         ddot[:, k] -= cross(spin, d[:, k])
+        if kind.has_pitch:
+            near, pitch = int(model.body[k, 1]), model.length[k]
+            own = rotation_matrix(p[:, near]) @ rotation_matrix(model.turn[k, 1])
+            relative, turning = axes.mT @ own, np.matvec(rotation_matrix(p[:, near]), omega[:, near]) - spin
+            z, angle = axes[..., 2], np.arctan2(relative[:, 1, 0], relative[:, 0, 0])
+            angle = nearest_turn(angle, _dot(z, d[:, k]), pitch)
+            d[:, k] -= pitch * angle[:, None] * z
+            ddot[:, k] -= pitch * _dot(z, turning)[:, None] * z
         for axis in (axes[..., i] for i in kind.slide_axes):
             for y in (d, ddot):
                 y[:, k] -= axis * np.sum(axis * y[:, k], axis=-1, keepdims=True)

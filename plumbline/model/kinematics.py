@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -328,6 +329,14 @@ def forward_kinematics(
     return p, omega, r, v
 
 
+class Motion(NamedTuple):
+    """What one coordinate of a joint does, world axes; None where it is exactly 0."""
+
+    axis: Float[Array, "... 3"]  # a unit vector
+    along: Float[Array, "... 3"] | None  # velocity of the near point by a unit rate [m/rad or 1]
+    about: Float[Array, "... 3"] | None  # angular velocity by a unit rate
+
+
 class JointFrame:
     """Joint k with coordinates x seen from its far body, of attitude ``above`` (..., 3, 3).
 
@@ -336,6 +345,7 @@ class JointFrame:
 
     def __init__(self, model: Model, k: int, above: Array) -> None:
         self.motions = model.kinds[k].motions
+        self.pitch = model.length[..., k, None] if model.kinds[k].has_pitch else None
         self.turn_far, self.turn_near = model.turn[..., k, 0, :], model.turn[..., k, 1, :]
         self.above = above
 
@@ -354,30 +364,28 @@ class JointFrame:
         """
         shift = shift_rate = spin = np.zeros(3)
         axes, turn = self._axes_and_turn(x)
-        for i, (what, along) in enumerate(axes):
+        for i, (_, along, about) in enumerate(axes):
             value, rate = x[..., i, None], xdot[..., i, None]
-            if what == "slide":
+            if along is not None:
                 shift, shift_rate = shift + along * value, shift_rate + along * rate
-            else:
-                spin = spin + along * rate
+            if about is not None:
+                spin = spin + about * rate
         return (shift, quaternion_product(turn, quaternion_conjugate(self.turn_near))), (shift_rate, spin)
 
-    def axes(self, x: Float[Array, "... coordinates"]) -> list[tuple[str, Float[Array, "... 3"]]]:
-        """Return what moves, and along or about which world axis.
-
-        Returns:
-            "turn" or "slide" and the axis, of every motion.
-
-        """
+    def axes(self, x: Float[Array, "... coordinates"]) -> list[Motion]:
+        """Return what a unit rate of every motion is."""
         return self._axes_and_turn(x)[0]
 
-    def _axes_and_turn(self, x: Array) -> tuple[list[tuple[str, Array]], Array]:
+    def _axes_and_turn(self, x: Array) -> tuple[list[Motion], Array]:
         """`axes`, and the quaternion from the near body's joint frame to the far body."""
-        turn, axes = self.turn_far, list[tuple[str, Array]]()
+        turn, axes = self.turn_far, list[Motion]()
         for i, (what, axis) in enumerate(self.motions):
             value = x[..., i, None]
-            axes.append((what, rotate_vectors(self.above, rotation_matrix(turn)[..., axis])))
-            if what == "turn":
+            unit = rotate_vectors(self.above, rotation_matrix(turn)[..., axis])
+            if what == "slide":
+                axes.append(Motion(unit, unit, None))
+            else:
+                axes.append(Motion(unit, None if self.pitch is None else self.pitch * unit, unit))
                 half = np.zeros((*value.shape[:-1], 4), value.dtype)
                 half[..., :1], half[..., 1 + axis, None] = np.cos(value / 2), np.sin(value / 2)
                 turn = quaternion_product(turn, half)
@@ -537,8 +545,10 @@ def velocity_jacobian(model: Model, state: State) -> Float[Array, "... rows nu"]
             joint, x = JointFrame(model, k, above), state.x[..., k, :]
             shift = joint.motion(x, state.xdot[..., k, :])[0][0]
             tip = tip + cross_matrix(-shift) @ spin
-            for i, (what, axis) in enumerate(joint.axes(x)):
-                (tip if what == "slide" else spin)[..., own.start + i] += axis
+            for i, (_, *pair) in enumerate(joint.axes(x)):
+                for moved, vector in zip((tip, spin), pair, strict=True):
+                    if vector is not None:
+                        moved[..., own.start + i] += vector
             out[..., k, 3:, :] = a[..., k, :, :].mT @ spin
         out[..., k, :3, :] = tip - near[..., k, :, :] @ out[..., k, 3:, :]
     return out.reshape(*a.shape[:-3], 6 * n, -1)
@@ -649,20 +659,32 @@ def coordinates_of_joints(
         motions = model.kinds[k].motions
         frame = rotation_matrix(model.turn[..., k, 0, :]).mT @ above.mT
         relative = frame @ a[..., near, :, :] @ rotation_matrix(model.turn[..., k, 1, :])
-        for i, value in enumerate(_coordinates(motions, rotate_vectors(frame, own), relative)):
+        shift = rotate_vectors(frame, own)
+        for i, value in enumerate(_coordinates(motions, shift, relative)):
             x[..., at, i] = value
+        if model.kinds[k].has_pitch:  # which counts full turns
+            x[..., at, 0] = nearest_turn(x[..., at, 0], shift[..., 2], model.length[..., k])
         axes = JointFrame(model, k, above).axes(x[..., at, :])
-        turns = [axis for what, axis in axes if what == "turn"]
+        turns = [about for *_, about in axes if about is not None]
         turning = iter(())
         if turns:
             columns = np.stack(np.broadcast_arrays(*turns), axis=-1)
             turning = iter(
                 np.moveaxis(rotate_vectors(np.linalg.pinv(columns), omega[..., near, :] - spin), -1, 0)
             )
-        for i, (what, axis) in enumerate(axes):
+        for i, (axis, _, about) in enumerate(axes):
             slide = np.sum(axis * (rate - cross(spin, own)), axis=-1)
-            xdot[..., at, i] = slide if what == "slide" else next(turning)
+            xdot[..., at, i] = slide if about is None else next(turning)
     return u, udot, x, xdot
+
+
+def nearest_turn(
+    angle: Float[Array, "..."], shift: Float[Array, "..."], pitch: Float[Array, "..."]
+) -> Float[Array, "..."]:
+    """Add the full turns to an angle [rad] that bring a shift [m] nearest to its pitch [m/rad] times it."""
+    angle, pitch = np.asarray(angle), np.broadcast_to(pitch, np.shape(angle))
+    turned = np.divide(shift, pitch, out=angle.copy(), where=pitch != 0)
+    return np.asarray(angle + 2 * np.pi * np.round((turned - angle) / (2 * np.pi)))
 
 
 def _coordinates(motions: tuple[tuple[str, int], ...], shift: Array, relative: Array) -> list[Array]:

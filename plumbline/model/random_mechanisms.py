@@ -94,7 +94,7 @@ def _with_numbers(
         body=np.stack([np.array(far), np.arange(n)], axis=1),
         point=point,
         turn=_unit(rng.normal(size=(n, 2, 4))),
-        length=np.where([KINDS[kind].holds_distance for kind in chosen], rng.uniform(0.2, 1.0, n), 0.0),
+        length=np.where([bool(KINDS[kind].own_number) for kind in chosen], rng.uniform(0.2, 1.0, n), 0.0),
         gravity=np.array([0.7, -0.4, -9.7]),
         force=loads * rng.normal(size=(n, 3)),
         moment=loads * 0.3 * rng.normal(size=(n, 3)),
@@ -159,6 +159,9 @@ def close_loop(
         if what == "turn":
             half = rng.uniform(-1, 1)
             axes = quaternion_product(axes, np.array([np.cos(half), *(np.sin(half) * np.eye(3)[axis])]))
+            if KINDS[kind].has_pitch:
+                length = float(rng.uniform(0.2, 1.0))
+                point = point + 2 * half * length * rotation_matrix(axes)[:, axis]
         else:
             point = point + rng.normal() * rotation_matrix(axes)[:, axis]
     if KINDS[kind].holds_distance:

@@ -9,8 +9,8 @@
     springs as loads   at one state, springs and dampers of joints are efforts, those between points loads
     rods taken out     bodies on rods are free, rods that close loops are left out: an adapter puts ties in
                        their place
-    joints as cylinders  hinges, slides and welds are cylindrical joints: an adapter holds the coordinates
-                       that these have in addition
+    joints as cylinders  hinges, slides, welds and joints with a pitch are cylindrical joints: an adapter
+                       holds the coordinates that these have in addition, at 0 or the pitch times the turn
 
 A universal joint is not described as two hinges with a body between them: that body would have no mass, and a
 small one would change the mechanism.
@@ -18,6 +18,7 @@ small one would change the mechanism.
 
 from __future__ import annotations
 
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -54,8 +55,11 @@ from plumbline.model.kinematics import (
 
 _CYLINDER = KINDS[CYLINDRICAL].motions
 HELD_KINDS = tuple(  # made of cylindrical joints by holding some of their motions
-    name for name, kind in KINDS.items() if not kind.has_attitude and {*kind.motions} < {*_CYLINDER}
+    name
+    for name, kind in KINDS.items()
+    if not (kind.has_attitude or kind.has_pitch) and {*kind.motions} < {*_CYLINDER}
 )
+PITCHED_KINDS = tuple(name for name, kind in KINDS.items() if kind.has_pitch)
 EXCHANGE = np.array([0.0, 1.0, 1.0, 0.0]) / np.sqrt(2)  # half a turn that exchanges x and y
 
 
@@ -180,28 +184,31 @@ def _swapped(columns: int) -> list[int]:
     return [1, 0, *range(2, columns)]
 
 
-def joints_as_cylinders(model: Model) -> Model:
-    """Make cylindrical joints of hinges, slides and welds.
+def joints_as_cylinders(model: Model, some: Collection[Kind]) -> Model:
+    """Make cylindrical joints of some kinds.
 
     Args:
         model: a tree.
+        some: of `HELD_KINDS` and `PITCHED_KINDS`.
 
     Returns:
         The tree, whose joints have motions in addition.
 
     """
-    kinds = tuple(CYLINDRICAL if kind in HELD_KINDS else kind for kind in model.kind)
-    elements: dict[str, Any] = {name: _of_cylinders(model, getattr(model, name)) for name in JOINT_ELEMENTS}
-    return replace(model, kind=kinds, **elements)
+    kinds = tuple(CYLINDRICAL if kind in some else kind for kind in model.kind)
+    elements: dict[str, Any] = {
+        name: _of_cylinders(model, kinds, getattr(model, name)) for name in JOINT_ELEMENTS
+    }
+    length = np.where([kind in some for kind in model.kind], 0.0, model.length)
+    return replace(model, kind=kinds, length=length, **elements)
 
 
-def added_motions(model: Model) -> list[tuple[int, ...]]:
+def added_motions(model: Model, cylinders: Model) -> list[tuple[int, ...]]:
     """List the coordinates that each joint has in addition where it is a cylindrical one."""
+    pairs = zip(model.kind, cylinders.kind, model.kinds, strict=True)
     return [
-        tuple(i for i, motion in enumerate(_CYLINDER) if motion not in kind.motions)
-        if name in HELD_KINDS
-        else ()
-        for name, kind in zip(model.kind, model.kinds, strict=True)
+        tuple(i for i, motion in enumerate(_CYLINDER) if old != new and motion not in kind.motions)
+        for old, new, kind in pairs
     ]
 
 
@@ -214,18 +221,21 @@ def state_of_cylinders(model: Model, cylinders: Model, state: State) -> State:
         state: of the tree.
 
     Returns:
-        The same state; the coordinates that joints have in addition are zero.
+        The same state; shifts that joints have in addition are their pitches times the turns, or zero.
 
     """
-    x, xdot = (_of_cylinders(model, values) for values in (state.x, state.xdot))
+    pitched = np.array([kind.has_pitch for kind in model.kinds])
+    x, xdot = (_of_cylinders(model, cylinders.kind, values) for values in (state.x, state.xdot))
+    for values in (x, xdot):
+        values[pitched, 0] = model.length[pitched] * values[pitched, 1]
     return complete_state(cylinders, replace(state, x=x, xdot=xdot))
 
 
-def _of_cylinders(model: Model, values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _of_cylinders(model: Model, kinds: Sequence[Kind], values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Numbers of coordinates in the columns of those of cylindrical joints, zeros of added ones."""
     found = values.copy()
     for k, kind in enumerate(model.kinds):
-        if model.kind[k] in HELD_KINDS:
+        if model.kind[k] != kinds[k]:
             found[k] = 0.0
             found[k, [_CYLINDER.index(motion) for motion in kind.motions]] = values[k, : len(kind.motions)]
     return found

@@ -41,7 +41,6 @@ from plumbline.scenario.schema import (
     VALID_NAME,
     Articulated,
     Body,
-    ClosingRod,
     Document,
     Free,
     Rod,
@@ -514,7 +513,7 @@ def _add_closing_joints(tree: Model, document: Document, closed: NDArray[np.intp
     joints = [end.joint for end in document.closes]
     elements = _joint_elements(joints, tree.columns)
     points = np.array([[end.anchor, end.proximal] for end in document.closes], dtype=float)
-    lengths = [joint.length if isinstance(joint, ClosingRod) else 0.0 for joint in joints]
+    lengths = [_own_number(joint) for joint in joints]
     return replace(
         tree,
         kind=(*tree.kind, *(joint.kind for joint in joints)),
@@ -551,6 +550,12 @@ def _closed_state(source: YamlSource, model: Model, state: State, bodies: list[B
                 f"has a loop, joint {k + 1} of closes, that {what} by {sizes[k]:.3g}", valid, place
             )
     return without_still_rates(model, found)
+
+
+def _own_number(joint: Any) -> float:
+    """The number that only its kind has, 0 where that has none."""
+    own = KINDS[joint.kind].own_number
+    return float(getattr(joint, own)) if own else 0.0
 
 
 def _joint_elements(joints: Sequence[Any], columns: int) -> dict[str, Array]:
@@ -593,7 +598,7 @@ def _build_model(
         turn=np.array([_joint_turns(body.joint) for body in bodies]),
         mass=np.array([body.mass for body in bodies], dtype=float),
         inertia=np.array([inertia_matrix(body.inertia) for body in bodies]),
-        length=np.array([body.joint.length if isinstance(body.joint, Rod) else 0.0 for body in bodies]),
+        length=np.array([_own_number(body.joint) for body in bodies]),
         gravity=np.array(document.gravity, dtype=float),
         force=np.array([body.load.force for body in bodies], dtype=float),
         moment=np.array([body.load.moment for body in bodies], dtype=float),

@@ -118,9 +118,9 @@ def _joint(model: Model, k: int) -> dict[str, Any]:
     """The joint without what depends on the state."""
     kind = model.kinds[k]
     found: dict[str, Any] = {"kind": model.kind[k]}
-    if kind.holds_distance:
-        found["length"] = float(model.length[k])
-    elif not kind.has_attitude:
+    if kind.own_number:
+        found[kind.own_number] = float(model.length[k])
+    if not kind.has_attitude:
         frames = ({"quaternion": turn.tolist()} for turn in model.turn[k])
         found |= zip(("frame", "body_frame"), frames, strict=True)
     for name in JOINT_ELEMENTS:

@@ -193,6 +193,9 @@ class _Check:
             row, sizes = coefficients(u, w), self.length_sizes if w == "d" else self.unit_sizes
             if u == w:
                 row, sizes = [row[0] - ell * ell, *row[1:]], self.square_sizes
+            elif kind.has_pitch and (u, w) == ("z", "d"):
+                angle = self._angle(coefficients, 2, 0, self.arb(float(given[2][0])))
+                row = [value - ell * turn for value, turn in zip(row, angle, strict=True)]
             for order, (value, size) in enumerate(zip(row, sizes, strict=True)):
                 slack = self.slack if is_closing else 0.0
                 self._equal(f"{name}: row {u}{w}, coefficient {order}", [value], size, slack)
@@ -271,15 +274,15 @@ class _Check:
                 push_size = self.scale["joint_reaction"]
                 value = value - x0
             else:
-                j, m = (axis + 1) % 3, (axis + 2) % 3
-                own = j if passed == 0 else m
-                sine = coefficients(_FAR[m], _NEAR[j])
-                cosine = coefficients(_FAR[own], _NEAR[own])
-                s, c = x0.sin_cos()
-                value = self.arb.atan2(sine[0] * c - cosine[0] * s, cosine[0] * c + sine[0] * s)
-                rate, second = (cosine[0] * sine[n] - sine[0] * cosine[n] for n in (1, 2))
+                own = (axis + 1 + passed) % 3
+                value, rate, second = self._angle(coefficients, axis, own, x0)
+                value = value - x0
                 push, sizes, passed = self._dot(along, self.moment[k]), self.unit_sizes, passed + 1
                 push_size = self.moment_size
+                if KINDS[model.kind[k]].has_pitch:
+                    pitch = self.arb(float(model.length[k]))
+                    push += pitch * self._dot(along, self.force[k])
+                    push_size += abs(float(model.length[k])) * self.scale["joint_reaction"]
             if not is_closing:
                 self._equal(f"{name}: coordinate {i + 1}", [value], max(1.0, sizes[0]), self._deviation)
                 self._equal(f"{name}: rate {i + 1}", [rate - rate0], sizes[1], self._deviation)
@@ -292,6 +295,14 @@ class _Check:
             self._equal(f"{name}: work on motion {i + 1}", [push - given_push], push_size, self.slack)
             kinetic, potential = kinetic + a * rate * rate / 2, potential + stiffness * x * x / 2
         return kinetic, potential
+
+    def _angle(self, coefficients: Any, axis: int, own: int, near: Any) -> list[Any]:
+        """Coefficients of the turn about an axis, ``own`` perpendicular to all turns, near a value."""
+        j, m = (axis + 1) % 3, (axis + 2) % 3
+        sine, cosine = coefficients(_FAR[m], _NEAR[j]), coefficients(_FAR[own], _NEAR[own])
+        s, c = near.sin_cos()
+        off = self.arb.atan2(sine[0] * c - cosine[0] * s, cosine[0] * c + sine[0] * s)
+        return [near + off, *(cosine[0] * sine[n] - sine[0] * cosine[n] for n in (1, 2))]
 
     @property
     def _deviation(self) -> float:

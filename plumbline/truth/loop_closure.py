@@ -111,7 +111,8 @@ class _LoopTree(Tree):
         if kind.has_attitude:
             pairs += [(zero, e) for e in units]
         else:
-            pairs += [(zero, b.axis) if b.turns else (b.axis, zero) for b in self.blocks[k]]
+            moves = [(block.along, block.about) for block in self.blocks[k]]
+            pairs += [tuple(zero if e is None else e for e in pair) for pair in moves]
         empty = self.mat(3, 0)
         slides, turns = zip(*pairs, strict=True) if pairs else ((), ())
         return (num.columns(slides), num.columns(turns)) if pairs else (empty, empty)

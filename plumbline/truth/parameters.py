@@ -18,6 +18,7 @@ AXES = ("x", "y", "z")
 INERTIA_ENTRIES = {"xx": (0, 0), "yy": (1, 1), "zz": (2, 2), "xy": (0, 1), "xz": (0, 2), "yz": (1, 2)}
 UNITS = {
     "gravity": "m/s²", "mass": "kg", "inertia": "kg m²", "proximal": "m", "distal": "m", "length": "m",
+    "pitch": "m/rad",
     "force": "N", "moment": "N m", "drag_force": "N s/m", "drag_moment": "N m s", "attitude": "rad",
     "omega": "rad/s", "direction": "rad", "rod_rate": "1/s",
     # of trees: the far point of a joint, its axes in both bodies; elements of turns; springs between points
@@ -119,8 +120,8 @@ def _geometry(model: Model, k: int, span: float) -> Iterator[Parameter]:
         yield from _components("anchor", k, model.point[k, 0], span)
     elif k + 1 < model.n:
         yield from _components("distal", k, model.distal[k], span)
-    if model.rods[k]:
-        yield _parameter("length", k, "", model.length[k], model.length[k])
+    if kind.own_number:
+        yield _parameter(kind.own_number, k, "", model.length[k], span)
     if not kind.has_attitude or (kind.is_spherical and model.stiffness[k, 0]):
         for frame in FRAME_KINDS:
             yield from (Parameter(frame, k, axis, 0.0, 1.0) for axis in AXES)
@@ -275,6 +276,7 @@ def derivative(model: Model, state: State, parameter: Parameter) -> dict[str, Ar
 
 _FIELDS = {  # where they are not named as the kind
     "proximal": "point", "distal": "point", "anchor": "point", "frame": "turn", "body_frame": "turn",
+    "pitch": "length",
     "omega": "omega", "position": "r", "velocity": "v",
 }  # fmt: skip
 

@@ -285,8 +285,9 @@ class _Terms:
         self.transport, self.spin = spin * self.speed, self.J * spin * self.W
         self.load = norm(found.load, axis=-1) + self.springs.size
         self.torque = norm(found.torque, axis=-1) + self.springs.moment_size
-        slides = [bool(kind.slide_axes) for kind in model.kinds]
-        self.slide_rate = np.sum(np.abs(state.xdot), -1) * slides
+        slides = np.array([bool(kind.slide_axes) for kind in model.kinds], float)
+        self.pitch = np.where([kind.has_pitch for kind in model.kinds], np.abs(model.length), 0.0)
+        self.slide_rate = np.sum(np.abs(state.xdot), -1) * (slides + self.pitch)
         self.F_children = self.F @ self.children.T
         self.moment_children = (self.moment + self.reach * self.F) @ self.children.T
 
@@ -313,7 +314,7 @@ class _Terms:
         weight = np.broadcast_to(m * g, self.a.shape)
         forces = (m * self.a, weight, m * self.transport, self.F, self.F_children, self.load)
         # a body that slides or is free may have any speed; others move as fast as their levers turn
-        drifting = [kind.holds_nothing or bool(kind.slide_axes) for kind in self.model.kinds]
+        drifting = [kind.is_unbounded for kind in self.model.kinds]
         drifts = np.any(self.below[drifting], axis=0)
         square = np.where(drifts, 1.0, POSITION_SHARE) * m * self.speed**2
         moments = (
@@ -473,7 +474,7 @@ class _JointSpace:
                 add("lower", k, reach, True, w - spin, alpha - swing)
                 continue
             if kind.has_attitude or kind.turn_axes:
-                add("turn", k, reach, True, w - far_w, alpha - far_alpha)
+                add("turn", k, reach + terms.pitch[k], True, w - far_w, alpha - far_alpha)
             if kind.holds_nothing:
                 add("slide", k, np.ones_like(reach), False, state.v[:, k], relative[:, k])
             elif kind.slide_axes:

@@ -394,7 +394,7 @@ def _paths(far: NDArray[np.intp]) -> NDArray[np.bool_]:
 
 
 def _slides(kind: Kind) -> bool:
-    return KINDS[kind].holds_nothing or bool(KINDS[kind].slide_axes)
+    return KINDS[kind].is_unbounded
 
 
 def _pick(links: BodyStates, i: int) -> BodyStates:
