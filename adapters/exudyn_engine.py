@@ -313,6 +313,7 @@ class Exudyn(ExudynAdapter):
         "ball springs": "Exudyn has no spring along the rotation vector of a ball joint",
         "planar elements": "the force of Exudyn's linear spring acts along its axis at both points, which in "
         "a joint with two slides are not on one line",
+        "pitches": "Exudyn has no joint whose turn advances along its axis",
         "universal springs": "the angle of Exudyn's torsional spring, atan2(-A01, A00) of the relative turn, "
         "is that of a joint with one turn, not of a universal joint",
     }

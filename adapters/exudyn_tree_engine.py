@@ -443,6 +443,7 @@ class ExudynTree(ExudynAdapter):
     gaps: ClassVar[Mapping[str, str]] = {
         "ball elements": "a ball joint of Exudyn's kinematic tree is three revolutes, whose angles are not "
         "the rotation vector that springs, dampers and rotors of ball joints act on",
+        "pitches": "Exudyn's kinematic tree has revolute and prismatic joints, none that turns and advances",
         "joint_moment": "minimal coordinates have no moments at the joints",
         "angles": "each ball of the tree is three revolute joints, each rod two: singular at a right angle",
     }

@@ -90,6 +90,7 @@ JOINT_MODELS = {
     "turn": (pin.JointModelRX, pin.JointModelRY, pin.JointModelRZ),
     "slide": (pin.JointModelPX, pin.JointModelPY, pin.JointModelPZ),
 }
+HELICAL_MODELS = pin.JointModelHX, pin.JointModelHY, pin.JointModelHZ
 FIXED_STEPS = {"semi-implicit-euler": semi_implicit_euler, "rkmk4": rkmk4}
 
 
@@ -176,6 +177,8 @@ class PinocchioChain:
             return parent
         self.placements.append(place)
         joints = [JOINT_MODELS[what][axis]() for what, axis in kind.motions]
+        if kind.has_pitch:
+            joints = [HELICAL_MODELS[axis](model.length[k]) for _, axis in kind.motions]
         joint = joints[0] if len(joints) == 1 else composite(*joints)
         return self._add_joint(parent, joint, hang * far, f"body {k}")
 

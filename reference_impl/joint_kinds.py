@@ -9,6 +9,7 @@ notes' rod and ball are
     slide        xᵀd, yᵀd; xᵀY, yᵀZ, zᵀX       zᵀd
     cylindrical  xᵀd, yᵀd; xᵀZ, yᵀZ            zᵀd, φ as of the hinge
     planar       zᵀd; xᵀZ, yᵀZ                 xᵀd, yᵀd, φ as of the hinge
+    helical      xᵀd, yᵀd, zᵀd − h φ; xᵀZ, yᵀZ     φ as of the hinge, with all full turns; pitch h
     weld         d; xᵀY, yᵀZ, zᵀX
 """
 
@@ -20,7 +21,7 @@ from functools import cached_property
 from typing import Literal
 
 AxesKind = Literal[
-    "hinge", "universal", "slide", "cylindrical", "planar", "weld"
+    "hinge", "universal", "slide", "cylindrical", "planar", "helical", "weld"
 ]  # joints with axes in both bodies
 Kind = Literal["rod", "ball", "free"] | AxesKind
 
@@ -139,6 +140,9 @@ KINDS: dict[Kind, JointKind] = {
     "slide": JointKind((("x", "d"), ("y", "d"), *_ATTITUDE), (("slide", 2),)),
     "cylindrical": JointKind((("x", "d"), ("y", "d"), ("x", "Z"), ("y", "Z")), (("slide", 2), ("turn", 2))),
     "planar": JointKind((("z", "d"), ("x", "Z"), ("y", "Z")), (("slide", 0), ("slide", 1), ("turn", 2))),
+    "helical": JointKind(
+        (("x", "d"), ("y", "d"), ("z", "d"), ("x", "Z"), ("y", "Z")), (("turn", 2),), has_pitch=True
+    ),
     "weld": JointKind((*_POINT, *_ATTITUDE)),
     "free": JointKind((), has_attitude=True),
 }

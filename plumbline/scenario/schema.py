@@ -420,6 +420,13 @@ class Articulated(JointElements):
         default=None,
         examples=[[0, 1, 0]],
     )
+    pitch: float | None = _field(
+        "How far the body moves along z per angle that it turns; negative: a left-hand screw. Of a helical "
+        "joint, and needed there. Not 0.",
+        "m/rad",
+        None,
+        examples=[0.02],
+    )
     frame: Attitude | None = _field(
         "Attitude of the joint's axes in the parent's frame. Absent: parallel.", default=None
     )
@@ -460,6 +467,16 @@ class Articulated(JointElements):
             raise invalid_value_error("gives axis and a frame", "one of them")
         if self.axis is not None and not KINDS[self.kind].is_about_z:
             raise invalid_value_error(f"gives an axis to a {self.kind} joint", "`frame` and `body_frame`")
+        return self
+
+    @model_validator(mode="after")
+    def _check_pitch(self) -> Articulated:
+        if (self.pitch is not None) != KINDS[self.kind].has_pitch:
+            given = "no pitch" if self.pitch is None else "a pitch"
+            valid = "a pitch where the joint is helical, and only there"
+            raise invalid_value_error(f"gives {given} to a {self.kind} joint", valid)
+        if self.pitch == 0:
+            raise invalid_value_error("gives a pitch of 0", "another pitch, or a hinge")
         return self
 
     @model_validator(mode="after")

@@ -8,7 +8,7 @@ import pytest
 from plumbline.engines.registry import load_adapter
 from plumbline.model.datatypes import KINDS, EngineFailure, Unsupported
 from plumbline.model.loops import assembled, cut_open, loop_gaps
-from plumbline.model.random_mechanisms import random_loop_mechanism
+from plumbline.model.random_mechanisms import LOOP_KINDS, random_loop_mechanism
 from plumbline.model.sampling import random_loop_states
 from plumbline.truth.certified_state import certify_state
 from plumbline.truth.rounding_bound import state_rounding_bound
@@ -33,8 +33,15 @@ def shared_truths():
 @pytest.mark.parametrize("closing", CLOSING)
 @pytest.mark.parametrize("engine", ENGINES)
 def test_states_of_random_loops_are_right(engine, closing, seed):
-    model, start = random_loop_mechanism(seed, 6, CLOSING[closing])
+    missing = ("helical",) if engine == "exudyn" else ()
+    model, start = random_loop_mechanism(
+        seed, 6, CLOSING[closing], [kind for kind in LOOP_KINDS if kind not in missing]
+    )
     states = [start, *random_loop_states(model, start, 1, seed)]
+    if closing in missing:
+        with pytest.raises(Unsupported, match="advances"):
+            load_adapter(engine).evaluate(model, states)
+        return
     for state, found in zip(states, load_adapter(engine).evaluate(model, states), strict=True):
         truth, bound = certify_state(model, state).quantities, state_rounding_bound(model, state)
         assert_within_bound(found, truth, bound)

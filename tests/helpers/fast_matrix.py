@@ -20,6 +20,7 @@ STEPS = MOTIONS | {
 STATES = STEPS | {
     "double-rod-then-ball": "a ball on a rod",
     "planar-top": "a planar joint",
+    "helical-screw": "a helical joint",
     "universal-pendulum": "a universal joint",
     "wrecking-ball": "a weld",
     "double-loaded-rods": "every load on rods",

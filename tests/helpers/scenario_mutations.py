@@ -28,6 +28,7 @@ KINDS = (
     "free",
     "screw",
     "planar",
+    "helical",
     "Ball",
 )
 PLANTED: dict[str, Any] = {  # fields of scenario files, right or wrong where they are planted, and strangers

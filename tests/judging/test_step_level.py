@@ -251,9 +251,10 @@ ELEMENTS = ("armature", "damping", "stiffness", "effort", "springs")
 
 
 @cache
-def tree(seed, elements=ELEMENTS):
-    """A random tree on every kind of joint, with elements on those that take them."""
-    model = random_tree(np.random.default_rng(seed), 7, elements=elements)
+def tree(seed, elements=ELEMENTS, missing=()):
+    """A random tree on every kind of joint but some, with elements on those that take them."""
+    kinds = [kind for kind in KINDS if kind not in missing]
+    model = random_tree(np.random.default_rng(seed), 7, kinds, elements=elements)
     return model, random_states(model, 2, seed=5)
 
 
@@ -285,7 +286,9 @@ def test_accelerations_of_trees_equal_the_certified_ones(seed, free, kinds):
 @pytest.mark.parametrize("elements", [(), ELEMENTS], ids=["bare", "elements"])
 @pytest.mark.parametrize("seed", range(2))
 def test_honest_engines_take_the_declared_step_on_trees(engine, elements, seed):
-    model, states = tree(seed, elements)
+    # a joint that Exudyn lacks, and whose steps in MuJoCo have no formula
+    missing = ("helical",) if engine.startswith(("exudyn", "mujoco")) else ()
+    model, states = tree(seed, elements, missing)
     for integrator in methods(engine):
         rows = judged(load_adapter(engine), integrator, model, states)
         if engine.startswith("exudyn") and rows[0].verdict == Verdict.UNSUPPORTED:
