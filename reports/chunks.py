@@ -211,7 +211,7 @@ def encode_texts(texts: Iterable[str]) -> str:
         numbers[code].append(NUMBER.findall(text))
     header = {
         "templates": list(templates),
-        "codes": packer.add(np.array(codes, np.uint16)),
+        "codes": packer.add(np.array(codes, np.uint32)),
         "numbers": [[" ".join(slot) for slot in zip(*some, strict=True)] for some in numbers],
     }
     return packer.encode(header)
