@@ -159,16 +159,15 @@ class ChunkBuilder:
 
     def _column(self, values: list[Any]) -> Any:
         given = [x for x in values if x is not None]
-        if all(isinstance(x, str) for x in given):
+        types = set(map(type, given))
+        if types <= {str}:
             return self.add_texts(values)
-        if all(isinstance(x, Mapping) and "$" not in x for x in given):
+        if types <= {dict} and not any("$" in x for x in given):
             return self.add_table([x or {} for x in values])
-        if all(isinstance(x, list) and all(y is None or isinstance(y, float) for y in x) for x in given):
+        if types <= {list} and {type(y) for x in given for y in x} <= {float, type(None)}:
             counts = np.array([len(x or ()) for x in values], np.uint16)
             return {"$lists": [self.add(counts), self._column([y for x in given for y in x])]}
-        if not all(isinstance(x, (int, float)) for x in given) or any(
-            isinstance(x, int) and abs(x) >= 10**DIGITS for x in given
-        ):
+        if not types <= {int, float, bool} or any(isinstance(x, int) and abs(x) >= 10**DIGITS for x in given):
             return [None if isinstance(x, float) and not np.isfinite(x) else x for x in values]
         found = (
             np.full(len(values), NO_NUMBER, np.int16),

@@ -174,7 +174,8 @@ def scenario_chunk(
         detail |= {k: row[k] for k in _NUMBER_FIELDS if row.get(k) is not None}
         details.append(detail | {"extra": row.get("extra"), "script": results.scripts.get(row["key"])})
         level = "long" if row["quantity"] in LONG_RUN_QUANTITIES else row["level"]
-        commands[f"{row['engine']}/{level}"] = rerun_command(row, scenario)
+        if (cell := f"{row['engine']}/{level}") not in commands:  # the same for all rows of a cell
+            commands[cell] = rerun_command(row, scenario)
     header = {
         "scenario": {
             k: _json_number(scenario[k]) if isinstance(scenario[k], float) else scenario[k]

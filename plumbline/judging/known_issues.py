@@ -497,7 +497,9 @@ def _name_problems(source: YamlSource, entries: Sequence[_Entry], others: set[st
         for (at, selector), (name, words) in product(places, known.items()):
             given = getattr(selector, name)
             for place, pattern in enumerate(given if isinstance(given, list) else [given]):
-                if pattern and not any(fnmatchcase(word, pattern) for word in words):
+                if not pattern or pattern in words:
+                    continue
+                if not any(fnmatchcase(word, pattern) for word in words):
                     path: tuple[PathKey, ...] = (*at, name)
                     if (*path, place) in source.value_positions:
                         path = (*path, place)

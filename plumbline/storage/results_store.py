@@ -30,6 +30,7 @@ from plumbline.storage.schema_upgrade import upgrade_document, upgrade_summary
 Record = dict[str, Any]
 SCHEMA_VERSION = 6
 READABLE_VERSIONS = (1, 2, 3, 4, 5, 6)
+_PLAIN_TYPES = (str, type(None), int, bool)
 TEXT = pa.string()
 REAL = pa.float64()
 INTEGER = pa.int32()
@@ -142,8 +143,10 @@ def to_json_value(value: Any) -> Any:
         The same structure, tuples as lists, keys as texts.
 
     """
-    if isinstance(value, float) and not (-float("inf") < value < float("inf")):
-        return None
+    if type(value) in _PLAIN_TYPES:  # nearly all: this runs for every field of every row
+        return value
+    if isinstance(value, float):
+        return value if -float("inf") < value < float("inf") else None
     if isinstance(value, dict):
         return {str(key): to_json_value(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -163,7 +166,7 @@ def row_record(row: Row) -> dict[str, Any]:
     """
     return {
         "key": row.key,
-        **{name: value if type(value) is str else to_json_value(value) for name, value in vars(row).items()},
+        **{name: to_json_value(value) for name, value in vars(row).items()},
     }
 
 
