@@ -657,6 +657,20 @@ class Tree:
             acceleration.append(a + num.mul(num.cross_matrix(self.near[k]), alpha) - inward)
         return Solution(acceleration, turning, forces, moments, rates)
 
+    def end_wrench(
+        self, b: int, c: int, axis: Any, is_force: bool, lever: Any | None = None
+    ) -> dict[int, tuple[Any, Any]]:
+        """Return a unit force, or moment, along an axis on body b, and what is against it on body c.
+
+        Args:
+            lever: from the centre of mass of c to that of b, where the force acts; absent: 0.
+
+        """
+        if not is_force:
+            return {b: (self.zero, axis), c: (self.zero, -axis)}
+        moment = self.zero if lever is None else -self.num.cross(lever, axis)
+        return {b: (axis, self.zero), c: (-axis, moment)}
+
     def reduced(self, k: int, x: Articulated) -> Articulated:
         """Take the motions of joint k out of what its body and all beyond need."""
         for block in reversed(self.blocks[k]):

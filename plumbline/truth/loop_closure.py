@@ -342,9 +342,8 @@ def _constrained_motion(flint: Any, c: _LoopTree, cut: CutMechanism, rows: NDArr
     units = [flint.arb_mat(3, 1, [int(i == j) for i in range(3)]) for j in range(3)]
     wrenches = []
     for row in rows:
-        (b, part), axis = cut.ends[row // 6], units[row % 3]
-        force, moment = (axis, c.zero) if row % 6 < 3 else (c.zero, c.A[b] * axis)
-        wrenches.append({b: (force, moment), part: (-force, -moment)})
+        (b, part), axis, is_force = cut.ends[row // 6], units[row % 3], bool(row % 6 < 3)
+        wrenches.append(c.end_wrench(b, part, axis if is_force else c.A[b] * axis, is_force))
     found = c.solve(wrenches)
     relative = []
     for b, part in cut.ends:

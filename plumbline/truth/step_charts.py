@@ -619,8 +619,8 @@ class _MovingTree(Tree):
         for b, c in ends:
             lever = self.r[b] - self.r[c]
             axes = [self.A[b][..., i : i + 1] for i in range(3)]
-            found += [{b: (self.zero, e), c: (self.zero, -e)} for e in axes]
-            found += [{b: (e, self.zero), c: (-e, -self.num.cross(lever, e))} for e in axes]
+            found += [self.end_wrench(b, c, e, is_force=False) for e in axes]
+            found += [self.end_wrench(b, c, e, is_force=True, lever=lever) for e in axes]
         return found
 
     def closing_shares(self, ends: Sequence[tuple[int, int]], found: Solution) -> Array:

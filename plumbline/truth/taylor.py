@@ -478,7 +478,10 @@ class _ExpressionTree(tree.Tree):
 
     def equations(self, closures: Sequence[Closure]) -> list[tuple[Any, Any]]:
         """Pairs (coordinate, its rate)."""
-        found = self.solve([wrench for closure in closures for wrench in self._wrenches(*closure)])
+        places = [(b, c, row, row % 3) for b, c, rows in closures for row in rows]
+        found = self.solve(
+            [self.end_wrench(b, c, self.A[b][:, i : i + 1], row < 3) for b, c, row, i in places]
+        )
         if closures:
             rows = np.concatenate([self._relative(found, *closure) for closure in closures])
             shares = np.concatenate([[[1.0]], _solve_symmetric(rows[:, 1:], -rows[:, :1])])
@@ -525,15 +528,6 @@ class _ExpressionTree(tree.Tree):
         for term in reversed(self.terms):
             f = square * f * term + 1.0
         return [(square, change), (ratio, ratio * ratio * change * f)]
-
-    def _wrenches(self, b: int, c: int, rows: Sequence[int]) -> list[dict[int, tuple[Any, Any]]]:
-        """Unit forces, or moments, along the axes of b on it, and against them on c."""
-        found = []
-        for row in rows:
-            axis = self.A[b][:, row % 3 : row % 3 + 1]
-            force, moment = (axis, self.zero) if row < 3 else (self.zero, axis)
-            found.append({b: (force, moment), c: (-force, -moment)})
-        return found
 
     def _relative(self, found: tree.Solution, b: int, c: int, rows: Sequence[int]) -> Any:
         """Relative accelerations of b and c in the rows that are held."""
