@@ -74,6 +74,10 @@ def _offset(k: int, size: float) -> Inputs:
 JOINT_DEFECTS = [
     Defect(name, "", (expected,), engine, scenario, inputs=change)
     for name, engine, scenario, expected, change in (
+        ("helical: the other hand", P, "sprung-helical", "the pitch of joint 2 had the opposite sign",
+         number_change("length", 1, times=-1.0)),
+        ("helical: pitch", P, "sprung-helical", "the pitch of joint 2 were 0.050000005 m/rad",
+         number_change("length", 1, times=1 + 1e-7)),
         ("universal: axes exchanged", M, "sprung-universal", "x and y of joint 1 were exchanged",
          number_change("turn", 0, BOTH, to=exchanged(0, 1))),
         ("universal in a tree: axes exchanged", P, "loaded-tree", "x and y of joint 3 were exchanged",
