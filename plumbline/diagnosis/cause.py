@@ -113,6 +113,11 @@ def _describe_other(cause: Cause) -> str:
     return f"{tried} explains the {cause.term}{needs}"
 
 
+def quantity_words(quantities: Sequence[str]) -> str:
+    """Name quantities in a sentence."""
+    return " and ".join(quantity.replace("_", " ") for quantity in quantities)
+
+
 def join_words(words: Sequence[str], last: str = "and") -> str:
     """Join words to a list in a sentence."""
     return f" {last} ".join(filter(None, (", ".join(words[:-1]), words[-1])))

@@ -13,9 +13,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from plumbline.diagnosis.cause import Cause, Diagnosis
+from plumbline.diagnosis.cause import Cause, Diagnosis, quantity_words
 from plumbline.diagnosis.digit_loss import Evaluate, Problem, find_digit_loss, measure_scatter, scatter_cause
-from plumbline.diagnosis.fit import ACCEPTED_RATIO, Candidate, Difference, Explanation, Mask, Search
+from plumbline.diagnosis.edits import Edit
+from plumbline.diagnosis.fit import ACCEPTED_RATIO, Difference, Explanation, Mask, Search
 from plumbline.diagnosis.needs import find_needs
 from plumbline.diagnosis.outputs import Outputs, error_ratio
 from plumbline.diagnosis.prediction import QUANTITIES, SUMS, VECTORS, WRENCHES, Answers, Case, View
@@ -93,10 +94,6 @@ def error_ratios(reported: Sequence[StateQuantities], truth: StateTruth, quantit
     return np.nan_to_num(found, nan=np.inf)
 
 
-def _words(quantities: Sequence[str]) -> str:
-    return " and ".join(q.replace("_", " ") for q in quantities)
-
-
 class _Diagnosing:
     """One diagnosis: the difference at states that show it, and what was tried."""
 
@@ -163,10 +160,10 @@ class _Diagnosing:
         return (beside if is_simple else ()) or self._pairs() or beside
 
     def _close(self, quantities: Sequence[str]) -> Cause:
-        return Cause("unexplained", _words(quantities), "", "close", quantities=tuple(quantities))
+        return Cause("unexplained", quantity_words(quantities), "", "close", quantities=tuple(quantities))
 
     def _unexplained(self, quantities: Sequence[str]) -> Cause:
-        return Cause("unexplained", _words(quantities), quantities=tuple(quantities))
+        return Cause("unexplained", quantity_words(quantities), quantities=tuple(quantities))
 
     def _digit_loss(self, quantities: Sequence[str]) -> Cause | None:
         if not self.evaluate or self.model.has_loops:
@@ -216,7 +213,7 @@ class _Diagnosing:
         """The causes of the first explanation, with those from which the data cannot distinguish them."""
         first, *others = found
         causes = dict(zip(first.combination, first.causes(len(self.places)), strict=True))
-        equal: dict[Candidate, dict[Candidate, Cause]] = {one: {} for one in causes}
+        equal: dict[Edit, dict[Edit, Cause]] = {one: {} for one in causes}
         for other in others:
             replaced, new = set(causes) - set(other.combination), set(other.combination) - set(causes)
             if len(replaced) == len(new) == 1:
@@ -359,9 +356,7 @@ class _Diagnosing:
         wanted, states, accepted = difference.values[mask], difference.state[mask], difference.accepted(mask)
         for places in force_places(self.model):
             edits = [edit for _, some in places for edit in some]
-            effects = iter(
-                difference.effects([e.change(difference.predictor.case, e.nominal) for e in edits])
-            )
+            effects = iter(difference.evaluate([((e,), e.nominal) for e in edits]))
             found = []
             for cause, some in places:
                 basis = np.stack([next(effects)[mask] for _ in some], axis=1)

@@ -13,7 +13,7 @@ from typing import ParamSpec, TypeVar
 
 import numpy as np
 
-from plumbline.diagnosis.cause import Cause, CauseKind
+from plumbline.diagnosis.cause import Cause, CauseKind, quantity_words
 from plumbline.diagnosis.outputs import error_ratio
 from plumbline.diagnosis.prediction import QUANTITIES, Answers, Predictor, View
 from plumbline.model.datatypes import Array, EngineFailure, Model, State, StateQuantities, StepRun
@@ -58,9 +58,8 @@ def scatter_cause(quantities: Sequence[str], scatter: float) -> Cause:
     is_loss = scatter >= MIN_SCATTER
     verb = "lose digits: they scatter" if is_loss else "have a cause: they scatter"
     text = f"{verb} by {scatter:.2g} of their error when world and body axes are turned by {TURN:g} rad"
-    words = " and ".join(q.replace("_", " ") for q in quantities)
     kind: CauseKind = "rounding" if is_loss else "unexplained"
-    return Cause(kind, words, "", text, (scatter,), quantities=tuple(quantities))
+    return Cause(kind, quantity_words(quantities), "", text, (scatter,), quantities=tuple(quantities))
 
 
 @dataclass(frozen=True)
@@ -142,11 +141,10 @@ def find_digit_loss(problem: Problem, evaluate: Evaluate) -> DigitLoss | None:
         The loss; None where the error has a cause, or where the engine fails on the turned problems.
 
     """
-    try:
-        scatter = _measure_scatter(problem, evaluate)
-        return DigitLoss(scatter, _ratios(problem, evaluate)) if scatter >= MIN_SCATTER else None
-    except REFUSALS:
+    scatter = measure_scatter(problem, evaluate)
+    if scatter is None or scatter < MIN_SCATTER:
         return None
+    return DigitLoss(scatter, _ratios(problem, evaluate))
 
 
 def measure_scatter(problem: Problem, evaluate: Evaluate) -> float | None:

@@ -27,19 +27,23 @@ UNITS = {"mass": " kg", "inertia": " kg m²", "force": " N", "moment": " N m", "
          "drag_moment": " N m s", "gravity": " m/s²", "length": " m", "point": " m"}  # fmt: skip
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Edit:
-    """A change of what an engine evaluates, by the numbers x, of which ``nominal`` are right; or by none."""
+    """A change of what an engine evaluates, by the numbers x, of which ``nominal`` are right; or by none.
+
+    Of a term that is linear it has the effect (m,) per unit of its amount in place of the change.
+    """
 
     cause: Cause
-    change: Callable[[Case, Array], Case]
-    scale: float = 0.0  # natural size of a change of x
+    change: Callable[[Case, Array], Case] | None = None
+    scale: float = 1.0  # natural size of a change of x
     can_vanish: bool = True  # whether factors 0, 2 and −1 are possible
     fields: tuple[str, ...] = ()  # of the model, of which numbers are changed
+    effect: Array | None = None
 
     @property
     def nominal(self) -> Array:
-        """The right numbers."""
+        """The right numbers; none of what has no amount."""
         return np.array(self.cause.nominal)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plumbline.diagnosis.cause import FACTORS, Cause
-from plumbline.diagnosis.edits import LENGTHS, number_edits, vector_edits
+from plumbline.diagnosis.edits import LENGTHS, Edit, number_edits, vector_edits
 from plumbline.diagnosis.prediction import VECTORS, Answers, Case, Predictor, View
 from plumbline.diagnosis.readings import reading_edits
 from plumbline.diagnosis.terms import Terms
@@ -44,24 +44,7 @@ QUARTER_TURNS = [  # rotation vectors of the turns of a cube, half turns twice
 Mask = NDArray[np.bool_]
 
 
-@dataclass(frozen=True, eq=False)
-class Candidate:
-    """An edit of what is evaluated, or a term with an effect (m,) per unit of its amount, or whole."""
-
-    cause: Cause
-    change: Callable[[Case, Array], Case] | None = None
-    effect: Array | None = None
-    scale: float = 1.0
-    can_vanish: bool = True
-    fields: tuple[str, ...] = ()  # of the model, of which numbers are changed
-
-    @property
-    def nominal(self) -> Array:
-        """The right numbers; none of what has no amount."""
-        return np.array(self.cause.nominal)
-
-
-Combination = tuple[Candidate, ...]
+Combination = tuple[Edit, ...]
 
 
 class Difference:
@@ -164,7 +147,7 @@ class Difference:
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """Candidates with amounts that leave little of a difference."""
+    """Edits with amounts that leave little of a difference."""
 
     combination: Combination
     amounts: Array
@@ -208,18 +191,14 @@ class Search:
         case = difference.predictor.case
         # other numbers act as in joint coordinates
         is_of_lengths = view.are_bodies_kept or view.end_rows == "twists"
-        edits = [one for one in number_edits(case) if not is_of_lengths or one.cause.unit in LENGTHS]
-        self.numbers = [
-            Candidate(e.cause, e.change, scale=e.scale, can_vanish=e.can_vanish, fields=e.fields)
-            for e in edits
-        ]
-        self.fixed = list[Candidate]()
+        self.numbers = [one for one in number_edits(case) if not is_of_lengths or one.cause.unit in LENGTHS]
+        self.fixed = list[Edit]()
         if not is_of_lengths:
-            self.fixed = [Candidate(e.cause, e.change) for e in reading_edits(case)]
+            self.fixed = list(reading_edits(case))
             terms = Terms(difference.predictor)
             flat = difference.flat_vectors
-            self.numbers += [Candidate(cause, effect=flat(effect)) for cause, effect in terms.linear()]
-            self.fixed += [Candidate(cause, effect=flat(effect)) for cause, effect in terms.fixed()]
+            self.numbers += [Edit(cause, effect=flat(effect)) for cause, effect in terms.linear()]
+            self.fixed += [Edit(cause, effect=flat(effect)) for cause, effect in terms.fixed()]
         elif view.are_bodies_kept:
             self.fixed += self._missing_gammas(model)
         steps = [one.nominal + STEP * one.scale for one in self.numbers]
@@ -231,7 +210,7 @@ class Search:
         ]
         self.effects = difference.evaluate(self.whole)
 
-    def _missing_gammas(self, model: Model) -> Iterator[Candidate]:
+    def _missing_gammas(self, model: Model) -> Iterator[Edit]:
         """γ of rows of joints that an engine in maximal coordinates leaves out."""
         predictor = self.difference.predictor
         at = list(predictor.each_state(predictor.case))
@@ -240,7 +219,7 @@ class Search:
                 answers = predictor.of_bodies(at, k)
                 change = {name: answers[name] - predictor.right[name] for name in VECTORS}
                 cause = Cause("term", "γ of the rows", f"joint {k + 1}", "missing")
-                yield Candidate(cause, effect=self.difference.flat_vectors(change))
+                yield Edit(cause, effect=self.difference.flat_vectors(change))
 
     def _whole_numbers(self) -> list[tuple[Combination, Array]]:
         """The amounts of words of numbers that may vanish."""
@@ -302,9 +281,8 @@ class Search:
         difference, wanted = self.difference, self.difference.values[mask]
         if np.max(np.abs(wanted), initial=0.0) < MIN_RATIO_OF_VECTORS:
             return []
-        every = [Candidate(e.cause, e.change, scale=e.scale) for e in vector_edits(difference.model)]
         is_of_lengths = difference.view != View(difference.view.quantities)
-        every = [one for one in every if not is_of_lengths or one.cause.unit in LENGTHS]
+        every = [e for e in vector_edits(difference.model) if not is_of_lengths or e.cause.unit in LENGTHS]
         lanes = [((one,), one.nominal + STEP * one.scale * e) for one in every for e in np.eye(3)]
         slopes = difference.evaluate(lanes)[:, mask].reshape(len(every), 3, -1).mT
         slopes = np.where(np.isfinite(slopes), slopes, 0.0)
@@ -425,7 +403,7 @@ class _Fit:
             return None  # no mass or length
         return Explanation(self.combination, self.x, uncertainty, self.left)
 
-    def _singles(self) -> Iterator[tuple[Candidate, float, float]]:
+    def _singles(self) -> Iterator[tuple[Edit, float, float]]:
         """The candidates of one amount, with it and the nominal one."""
         first = 0
         for one in self.combination:

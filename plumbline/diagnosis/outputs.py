@@ -12,14 +12,21 @@ from functools import cached_property
 
 import numpy as np
 
-from plumbline.diagnosis.cause import Cause, significant
+from plumbline.diagnosis.cause import Cause, quantity_words, significant
 from plumbline.diagnosis.edits import gyroscopic_moment
-from plumbline.diagnosis.prediction import WRENCHES, Answers, Case
+from plumbline.diagnosis.prediction import (
+    WRENCHES,
+    Answers,
+    Case,
+    determinate,
+    projectors_at,
+    single_states,
+)
 from plumbline.equations.arithmetic import floats
 from plumbline.equations.tree import Tree
-from plumbline.model.datatypes import Array, State
+from plumbline.model.datatypes import Array
 from plumbline.model.kinematics import JointFrame, cross, rotate_vectors, rotation_matrix
-from plumbline.model.loops import cut_open, determinate_projectors, wrench_length
+from plumbline.model.loops import cut_open
 
 Choose = Callable[[Array], Array]  # of the rows of some bodies or joints
 MakeCause = Callable[..., Cause]  # of words and amounts
@@ -101,7 +108,11 @@ class Outputs:
         is_swap = len(wrong) == 2 and source == {wrong[0]: wrong[1], wrong[1]: wrong[0]}
         change = "exchanged" if is_swap else f"as that of {of}"
         return Cause(
-            "output", _words(quantity), of if is_swap else as_that, change, general=f"of another {thing}"
+            "output",
+            quantity_words([quantity]),
+            of if is_swap else as_that,
+            change,
+            general=f"of another {thing}",
         )
 
     def _of_places(self, quantity: str, reported: Array, places: list[int] | None) -> Cause | None:
@@ -115,7 +126,7 @@ class Outputs:
         place = "" if places is None else " and ".join(f"{thing} {k + 1}" for k in places)
 
         def cause(change: str, *amount: float) -> Cause:
-            return Cause("output", _words(quantity), place, change, amount, states=len(given))
+            return Cause("output", quantity_words([quantity]), place, change, amount, states=len(given))
 
         def matches(x: Array, rows: slice = slice(None)) -> bool:
             """Whether x is what was reported, and differs from what is right by more than both bounds."""
@@ -352,22 +363,14 @@ class Outputs:
 
     @cached_property
     def _projectors(self) -> list[Array | None]:
-        model, state = self.case
-        if not model.has_loops:
-            return [None] * len(state.p)
-        return [
-            determinate_projectors(model, State(**{name: x[s] for name, x in vars(state).items()}))
-            for s in range(len(state.p))
-        ]
+        return projectors_at(self.case.model, single_states(self.case.state))
 
     def _wrench(self, what: str, force: Array, moment: Array, every: str = "") -> Part:
         """A part in the wrenches of joints; in loops what is determinate of it."""
-        length = wrench_length(self.case.model) if self.case.model.has_loops else 1.0
-        for s, projector in enumerate(self._projectors):
-            if projector is not None:
-                both = rotate_vectors(projector, np.concatenate([force[s], moment[s] / length], axis=-1))
-                force[s], moment[s] = both[:, :3], both[:, 3:] * length
-        return Part(what, np.array([force, moment]), every=every)
+        both = determinate(
+            self.case.model, dict(zip(WRENCHES, (force, moment), strict=True)), self._projectors
+        )
+        return Part(what, np.array([both[name] for name in WRENCHES]), every=every)
 
     def _carried(self, what: str, force: Array, moment: Array, every: str = "") -> Part:
         """What joints carry of forces and moments (S, N, 3) at the centres of mass."""
@@ -589,10 +592,6 @@ def _of_bodies(values: dict[str, Array]) -> list[Part]:
 
 def _thing(quantity: str) -> str:
     return "joint" if quantity in WRENCHES else "body"
-
-
-def _words(quantity: str) -> str:
-    return quantity.replace("_", " ")
 
 
 def _per_entry(bound: Array, values: Array) -> Array:

@@ -12,6 +12,7 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from plumbline.equations.arithmetic import floats
 from plumbline.equations.responses import EndRows, Responses
@@ -81,8 +82,7 @@ class Predictor:
         """Prepare for the states."""
         self.case, self.view, self.count = Case(model, stack_states(states)), view, len(states)
         self.states = states
-        if model.has_loops:
-            self.projectors = [determinate_projectors(model, state) for state in states]
+        self.projectors = projectors_at(model, states)
 
     @cached_property
     def right(self) -> Answers:
@@ -138,25 +138,20 @@ class Predictor:
                 changes[name] = np.concatenate(
                     [np.broadcast_to(x, (self.count, *value.shape)) for x in given]
                 )
-        state = State(
-            **{
-                name: np.concatenate([getattr(case.state, name) for case in cases])
-                for name in vars(self.case.state)
-            }
-        )
-        return replace(like, **changes), state
+        names = vars(self.case.state)
+        fields = {name: np.concatenate([getattr(case.state, name) for case in cases]) for name in names}
+        return replace(like, **changes), State(**fields)
 
     def each_state(self, case: Case) -> Iterator[tuple[Model, State]]:
         """Split a case into the models and states that it is made of."""
         like = self.case.model
-        for s in range(self.count):
+        for s, state in enumerate(single_states(case.state)):
             changes = {
                 name: getattr(case.model, name)[s]
                 for name, value in vars(like).items()
                 if name not in CONSTANT_FIELDS and getattr(case.model, name).ndim > value.ndim
             }
-            model = replace(case.model, **changes) if changes else case.model
-            yield model, State(**{name: x[s] for name, x in vars(case.state).items()})
+            yield replace(case.model, **changes) if changes else case.model, state
 
     def cut(self, model: Model, state: State) -> tuple[Model, State]:
         """Cut loops open: model and state (B, ...), of which fields of the model may lack the axis.
@@ -202,35 +197,48 @@ class Predictor:
         model, state = self.cut(*self._stacked(cases))
         cut = cut_open(self.case.model)
         found = Responses(model, state, cut.ends, cut.row_scale, self.view.end_rows)
-        return self.of_cut(found, [self.projectors[i % self.count] for i in range(len(state.p))])
+        projectors = [self.projectors[i % self.count] for i in range(len(state.p))]
+        return self.vectors(found.solution, found.tree, cut.place, projectors) | sums_of(found.tree)
 
-    def of_cut(self, found: Responses, projectors: Sequence[Array | None]) -> Answers:
-        """Read the mechanism's quantities from the tree that it is cut open to."""
-        cut = cut_open(self.case.model)
-        bodies = cut.place[: self.case.model.n]
-        answers = dict(zip(VECTORS, np.moveaxis(found.solution, 2, 0), strict=True))
-        turns = np.stack([np.broadcast_to(A, (len(projectors), 3, 3)) for A in found.tree.A], 1)
-        answers["angular_acceleration"] = np.matvec(turns.mT, answers["angular_acceleration"])
-        for name in VECTORS:
-            answers[name] = answers[name][:, cut.place if name in WRENCHES else bodies]
-        return self.determinate(answers, projectors) | sums_of(found.tree)
-
-    def determinate(self, answers: Answers, projectors: Sequence[Array | None]) -> Answers:
-        """Keep of the joints' wrenches what rows that depend on others leave determinate."""
-        if all(one is None for one in projectors):
-            return answers
-        length = wrench_length(self.case.model)
-        wrench = np.concatenate([answers["joint_reaction"], answers["joint_moment"] / length], axis=-1)
-        for i, projector in enumerate(projectors):
-            if projector is not None:
-                wrench[i] = rotate_vectors(projector, wrench[i])
-        return answers | {"joint_reaction": wrench[..., :3], "joint_moment": wrench[..., 3:] * length}
+    def vectors(
+        self, solution: Array, tree: Tree, joints: NDArray[np.intp], projectors: Sequence[Array | None]
+    ) -> Answers:
+        """Read the mechanism's vectors from a solution (S, N, 4, 3) of a tree, with where its joints are."""
+        found = dict(zip(VECTORS, np.moveaxis(solution, 2, 0), strict=True))
+        turns = np.stack([np.broadcast_to(A, (len(solution), 3, 3)) for A in tree.A], 1)
+        found["angular_acceleration"] = np.matvec(turns.mT, found["angular_acceleration"])
+        for name, x in found.items():
+            found[name] = x[:, joints if name in WRENCHES else joints[: self.case.model.n]]
+        return determinate(self.case.model, found, projectors)
 
     def of_bodies(self, seen: Sequence[tuple[Model, State]], missing_gamma: int | None = None) -> Answers:
         """Predict quantities of bodies where they are, in maximal coordinates; (lanes times S, ...)."""
         each = [maximal_quantities(*one, missing_gamma) for one in seen]
         answers = {name: np.stack([one[name] for one in each]) for name in QUANTITIES}
-        return self.determinate(answers, [self.projectors[i % self.count] for i in range(len(each))])
+        projectors = [self.projectors[i % self.count] for i in range(len(each))]
+        return determinate(self.case.model, answers, projectors)
+
+
+def single_states(state: State) -> list[State]:
+    """Split arrays (S, ...) into states."""
+    return [State(**{name: x[s] for name, x in vars(state).items()}) for s in range(len(state.p))]
+
+
+def projectors_at(model: Model, states: Sequence[State]) -> list[Array | None]:
+    """Return what rows that depend on others leave of the joints' wrenches; None where it is everything."""
+    return [determinate_projectors(model, state) if model.has_loops else None for state in states]
+
+
+def determinate(model: Model, answers: Answers, projectors: Sequence[Array | None]) -> Answers:
+    """Keep of the joints' wrenches what rows that depend on others leave determinate."""
+    if all(one is None for one in projectors):
+        return answers
+    length = wrench_length(model)
+    wrench = np.concatenate([answers["joint_reaction"], answers["joint_moment"] / length], axis=-1)
+    for i, projector in enumerate(projectors):
+        if projector is not None:
+            wrench[i] = rotate_vectors(projector, wrench[i])
+    return answers | {"joint_reaction": wrench[..., :3], "joint_moment": wrench[..., 3:] * length}
 
 
 def maximal_quantities(model: Model, state: State, missing_gamma: int | None) -> Answers:

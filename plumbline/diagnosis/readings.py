@@ -15,7 +15,7 @@ import numpy as np
 
 from plumbline.diagnosis.cause import Cause
 from plumbline.diagnosis.edits import WORDS, Edit, field, with_fields
-from plumbline.diagnosis.prediction import TRAILING, Case
+from plumbline.diagnosis.prediction import TRAILING, Case, single_states
 from plumbline.model.datatypes import JOINT_ELEMENTS, SPRING_FIELDS, Array, Model, State
 from plumbline.model.kinematics import (
     complete_state,
@@ -182,6 +182,11 @@ def _row(name: str, k: int, of: Callable[[Case], Array]) -> Change:
     return change
 
 
+def _constant(name: str, k: int, value: Any) -> Change:
+    """Replace what a field holds of one place by other numbers."""
+    return _row(name, k, lambda _: np.array(value))
+
+
 # -- bodies --------------------------------------------------------------------------------------------
 
 
@@ -307,7 +312,7 @@ def _inertia_readings(model: Model, k: int) -> Iterator[tuple[Any, ...]]:
                 a, b, c, d = (i + 1) % 3, (i + 2) % 3, (j + 1) % 3, (j + 2) % 3
                 other[a, b] = other[b, a] = sign * J[c, d]
             taken = ", ".join("-" * (sign < 0) + PRODUCTS[j] for j in order)
-            yield "products of inertia yz, xz, xy", taken, _row("inertia", k, partial(lambda x, _: x, other))
+            yield "products of inertia yz, xz, xy", taken, _constant("inertia", k, other)
 
 
 def _load_readings(model: Model, b: _Body) -> Iterator[tuple[Any, ...]]:
@@ -342,14 +347,13 @@ def _load_readings(model: Model, b: _Body) -> Iterator[tuple[Any, ...]]:
         yield "drag force", where, at_point(point, lambda c: -c_t * b.v(c))
     for names, words in ((("force", "moment"), "applied force and moment"),
                          (("drag_force", "drag_moment"), "drag force and drag moment")):  # fmt: skip
-        changes = [_row(name, k, partial(lambda x, _: x, getattr(model, other)[k]))
-                   for name, other in (names, names[::-1])]  # fmt: skip
+        changes = [_constant(name, k, getattr(model, other)[k]) for name, other in (names, names[::-1])]
         yield words, "exchanged", partial(lambda one, other, case: other(one(case)), *changes)
     if c_t != c_r:
         if c_t:
-            yield "drag moment", "that of the drag force's coefficient", _row("drag_moment", k, lambda c: c_t)
+            yield "drag moment", "that of the drag force's coefficient", _constant("drag_moment", k, c_t)
         if c_r:
-            yield "drag force", "that of the drag moment's coefficient", _row("drag_force", k, lambda c: c_r)
+            yield "drag force", "that of the drag moment's coefficient", _constant("drag_force", k, c_r)
     drags = {
         "taken with the body-frame velocity": lambda c: c_t * (b.v(c) - b.to_body(c, b.v(c))),
         "taken with the velocity of its joint's point": lambda c: -c_t * of_point(c),
@@ -442,7 +446,7 @@ def _point_readings(model: Model, k: int) -> Iterator[tuple[Any, ...]]:
             readings[f"{where} point", words, ""] = (point, near) if side == 0 else (far, point)
     readings["points", "reversed", " in both bodies"] = (-far, -near)
     for (term, words, where), pair in readings.items():
-        yield term, words, _row("point", k, partial(lambda x, _: np.array(x), pair)), where
+        yield term, words, _constant("point", k, pair), where
 
 
 def _axes_readings(model: Model, k: int) -> Iterator[tuple[Any, ...]]:
@@ -471,7 +475,7 @@ def _axes_readings(model: Model, k: int) -> Iterator[tuple[Any, ...]]:
         pair = (quaternion_product(far, half), quaternion_product(near, half))
         readings[f"axes {'xyz'[i]} and {'xyz'[j]}", "exchanged", ""] = pair
     for (term, words, where), pair in readings.items():
-        yield term, words, _row("turn", k, partial(lambda x, _: np.array(x), pair)), where
+        yield term, words, _constant("turn", k, pair), where
 
 
 # -- springs, fields of others, and all ----------------------------------------------------------------
@@ -481,16 +485,16 @@ def _spring_readings(case: Case, i: int) -> Iterator[tuple[Any, ...]]:
     """Points of springs negated, left out or exchanged; rates not divided by the length."""
     model = case.model
     points = model.spring_point[i]
-    yield "points", "exchanged", _row("spring_point", i, lambda c: points[::-1].copy())
+    yield "points", "exchanged", _constant("spring_point", i, points[::-1])
     for side, where in enumerate(("first", "second")):
         where = f"{where} point" if model.spring_body[i, side] >= 0 else "world's point"
         for words, point in (("reversed", -points[side]), ("left out", 0 * points[side])):
             pair = (point, points[1]) if side == 0 else (points[0], point)
-            yield where, words, _row("spring_point", i, partial(lambda x, _: np.array(x), pair))
+            yield where, words, _constant("spring_point", i, pair)
     if model.spring_damping[i]:
 
         def undivided(c: Case) -> Array:
-            each = [State(**{name: x[s] for name, x in vars(c.state).items()}) for s in range(len(c.state.p))]
+            each = single_states(c.state)
             spans = np.array([np.linalg.norm(spring_vectors(model, s.r, s.p)[i]) for s in each])
             return np.asarray(spans * model.spring_damping[i])
 

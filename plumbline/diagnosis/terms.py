@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from plumbline.diagnosis.cause import Cause
 from plumbline.diagnosis.edits import Edit, at_place, coordinate_place, with_fields
-from plumbline.diagnosis.prediction import VECTORS, WRENCHES, Answers, Case, Predictor
+from plumbline.diagnosis.prediction import Answers, Case, Predictor
 from plumbline.equations.responses import Responses
 from plumbline.model.datatypes import Array, Model
 from plumbline.model.kinematics import (
@@ -54,14 +54,7 @@ class Terms:
 
     def answers(self, change: Array) -> Answers:
         """Turn changes (S, N, 4, 3) of the solution into those of the mechanism's vectors."""
-        bodies = self.joints[: self.model.n]
-        found = dict(zip(VECTORS, np.moveaxis(change, 2, 0), strict=True))
-        turns = np.stack([np.broadcast_to(A, (len(change), 3, 3)) for A in self.found.tree.A], 1)
-        found["angular_acceleration"] = np.matvec(turns.mT, found["angular_acceleration"])
-        found = {name: x[:, self.joints if name in WRENCHES else bodies] for name, x in found.items()}
-        if not self.model.has_loops:
-            return found
-        return self.predictor.determinate(found, self.predictor.projectors)
+        return self.predictor.vectors(change, self.found.tree, self.joints, self.predictor.projectors)
 
     def linear(self) -> Iterator[tuple[Cause, Answers]]:
         """List velocity terms, with the effect of one more of each."""
