@@ -57,10 +57,7 @@ def explain_disagreement(
 
 
 def diagnose(
-    model: Model,
-    reported: Sequence[StateQuantities],
-    truth: StateTruth,
-    evaluate: Evaluate | None = None,
+    model: Model, reported: Sequence[StateQuantities], truth: StateTruth, evaluate: Evaluate | None = None
 ) -> Diagnosis:
     """Name the causes that explain how an engine differs from the truth.
 

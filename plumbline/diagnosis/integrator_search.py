@@ -12,7 +12,7 @@ import itertools
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -171,11 +171,9 @@ def sample_readings(model: Model) -> Iterator[tuple[Cause, Callable[[StepRun], S
         The cause, and what turns such samples into right ones.
 
     """
-    frames = rotation_matrix(model.turn[: model.n, 1])
+    frames, arms = rotation_matrix(model.turn[: model.n, 1]), model.proximal[: model.n]
 
-    def corrected(
-        change: Callable[[Array, Array, Array], tuple[Array, Array]],
-    ) -> Callable[[StepRun], StepRun]:
+    def corrected(change: Callable[[Array, Array, Array], Any]) -> Callable[[StepRun], StepRun]:
         def correct(run: StepRun) -> StepRun:
             motion = run.trajectory
             v, omega = change(rotation_matrix(motion.p), motion.v, angular_velocity(motion.p, motion.pdot))
@@ -183,19 +181,14 @@ def sample_readings(model: Model) -> Iterator[tuple[Cause, Callable[[StepRun], S
 
         return correct
 
-    for (term, words), change in {
-        ("velocities of samples", "in the body frame"): lambda a, v, w: (np.matvec(a, v), w),
-        ("velocities of samples", "those of the joints' points"): lambda a, v, w: (
-            v - np.matvec(a, np.cross(w, model.proximal[: model.n])),
-            w,
-        ),
-        ("angular velocities of samples", "in the world frame"): lambda a, v, w: (v, np.matvec(a.mT, w)),
-        ("angular velocities of samples", "in the joints' axes"): lambda a, v, w: (
-            v,
-            np.matvec(frames, w),
-        ),
-    }.items():
-        yield Cause("frame", term, "", words), corrected(change)
+    of_points, angular = "those of the joints' points", "angular velocities"
+    for term, words, change in (
+        ("velocities", "in the body frame", lambda a, v, w: (np.matvec(a, v), w)),
+        ("velocities", of_points, lambda a, v, w: (v - np.matvec(a, np.cross(w, arms)), w)),
+        (angular, "in the world frame", lambda a, v, w: (v, np.matvec(a.mT, w))),
+        (angular, "in the joints' axes", lambda a, v, w: (v, np.matvec(frames, w))),
+    ):
+        yield Cause("frame", f"{term} of samples", "", words), corrected(change)
 
 
 def _best(
@@ -291,46 +284,38 @@ def _other_formulas(declared: JointSpaceMethod, model: Model) -> Iterator[tuple[
     if model.has_loops and declared.gap_correction:
         yield "it did not correct the gaps of loops", replace(declared, gap_correction=0.0)
     euler = JointSpaceMethod(
-        "semi-implicit Euler",
-        declared.coordinates,
-        declared.rod_axial_inertia,
-        free_coordinates=declared.free_coordinates,
-        gap_correction=declared.gap_correction,
-    )
+        "semi-implicit Euler", declared.coordinates, declared.rod_axial_inertia,
+        free_coordinates=declared.free_coordinates, gap_correction=declared.gap_correction,
+    )  # fmt: skip
     is_euler = declared.formula == "semi-implicit Euler"
-    yield (
-        "it took explicit Euler's step: positions by the old velocity",
-        replace(euler, new_velocity_share=0.0),
-    )
-    yield "it took semi-implicit Euler's step, with all forces explicit", euler
-    yield (
-        "it exchanged the halves of semi-implicit Euler: positions first",
-        replace(euler, formula="positions first"),
-    )
     verlet = replace(euler, formula="velocity Verlet")
-    yield "it took velocity Verlet's step", verlet
-    for name, method in (("velocity Verlet's", verlet), ("its declared", declared)):
-        words = f"it took {name} step, with the last acceleration of the step before in place of its first"
-        yield words, replace(method, reuses_acceleration=True)
-    mean = "it moved positions by the mean of the old and the new velocity"
-    yield mean, replace(declared if is_euler else euler, new_velocity_share=0.5)
+    reused = "step, with the last acceleration of the step before in place of its first"
+    yield from {
+        "it took explicit Euler's step: positions by the old velocity": replace(
+            euler, new_velocity_share=0.0
+        ),
+        "it took semi-implicit Euler's step, with all forces explicit": euler,
+        "it exchanged the halves of semi-implicit Euler: positions first": replace(
+            euler, formula="positions first"
+        ),
+        "it took velocity Verlet's step": verlet,
+        f"it took velocity Verlet's {reused}": replace(verlet, reuses_acceleration=True),
+        f"it took its declared {reused}": replace(declared, reuses_acceleration=True),
+        "it moved positions by the mean of the old and the new velocity": replace(
+            declared if is_euler else euler, new_velocity_share=0.5
+        ),
+    }.items()
     if declared.coordinates == "joint rotations":
         if model.has_drag:
             words = "it took semi-implicit Euler's step, with the drag implicit and velocity terms explicit"
             yield words, replace(euler, implicit_forces="applied")
-        yield (
-            "it took semi-implicit Euler's step, with all forces implicit",
-            replace(euler, implicit_forces="all"),
-        )
-        yield (
-            "it moved quaternions by p + h ṗ and normalised them",
-            replace(declared, is_rotation_exact=False),
-        )
+        words = "it took semi-implicit Euler's step, with all forces implicit"
+        yield words, replace(euler, implicit_forces="all")
+        words = "it moved quaternions by p + h ṗ and normalised them"
+        yield words, replace(declared, is_rotation_exact=False)
     if declared.implicit_forces != "none":
-        yield (
-            "it symmetrised the derivatives of forces in the matrix",
-            replace(declared, is_damping_symmetric=True),
-        )
+        words = "it symmetrised the derivatives of forces in the matrix"
+        yield words, replace(declared, is_damping_symmetric=True)
         yield "it moved positions by the old velocity", replace(declared, new_velocity_share=0.0)
     for count in (2, 3, 4):
         yield f"it took {count} steps of 1/{count} of the size", replace(declared, substeps=count)

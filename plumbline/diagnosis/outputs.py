@@ -14,14 +14,7 @@ import numpy as np
 
 from plumbline.diagnosis.cause import Cause, quantity_words, significant
 from plumbline.diagnosis.edits import gyroscopic_moment
-from plumbline.diagnosis.prediction import (
-    WRENCHES,
-    Answers,
-    Case,
-    determinate,
-    projectors_at,
-    single_states,
-)
+from plumbline.diagnosis.prediction import WRENCHES, Answers, Case, determinate, projectors_at, single_states
 from plumbline.equations.arithmetic import floats
 from plumbline.equations.tree import Tree
 from plumbline.model.datatypes import Array
@@ -78,29 +71,19 @@ class Outputs:
 
     def _of_wrong_places(self, quantity: str, reported: Array) -> Cause | None:
         bound, right = self.bounds[quantity], self.right[quantity]
-        wrong = [
-            k
-            for k in range(bound.shape[1])
-            if not error_ratio(reported[:, k] - right[:, k], bound[:, k]) <= 1
-        ]
+        off = reported - right
+        wrong = [k for k in range(bound.shape[1]) if not error_ratio(off[:, k], bound[:, k]) <= 1]
         if not wrong or len(wrong) == bound.shape[1]:
             return self._exchanged(quantity, reported, wrong) if wrong else None
         return self._of_places(quantity, reported, wrong) or self._exchanged(quantity, reported, wrong)
 
     def _exchanged(self, quantity: str, reported: Array, wrong: list[int]) -> Cause | None:
         """Rows that are those of other bodies."""
-        bound, right = self.bounds[quantity], self.right[quantity]
-        source = {}
+        source, count = {}, reported.shape[1]
         for k in wrong:
-            for j in range(bound.shape[1]):
-                if (
-                    j != k
-                    and error_ratio(reported[:, k] - right[:, j], MAX_RATIO * (bound[:, k] + bound[:, j]))
-                    <= 1
-                ):
-                    source[k] = j
-                    break
-            else:
+            others = (j for j in range(count) if j != k and self._is_that_of(quantity, reported, k, j))
+            source[k] = next(others, -1)
+            if source[k] < 0:
                 return None
         thing = _thing(quantity)
         of = " and ".join(f"{thing} {k + 1}" for k in wrong)
@@ -114,6 +97,11 @@ class Outputs:
             change,
             general=f"of another {thing}",
         )
+
+    def _is_that_of(self, quantity: str, reported: Array, k: int, j: int) -> bool:
+        """Whether row k is what row j should be."""
+        bound, right = self.bounds[quantity], self.right[quantity]
+        return error_ratio(reported[:, k] - right[:, j], MAX_RATIO * (bound[:, k] + bound[:, j])) <= 1
 
     def _of_places(self, quantity: str, reported: Array, places: list[int] | None) -> Cause | None:
         """What was returned in place of a quantity of all bodies or joints, or of some."""
@@ -171,21 +159,16 @@ class Outputs:
         turns = self._turns
         if quantity == "acceleration":
             omega = np.matvec(turns, state.omega)
-            g = model.gravity[..., None, :]
-            swing = np.cross(state.omega, np.cross(state.omega, model.proximal[: model.n]))
-            arm = np.matvec(
-                turns, np.cross(self.right["angular_acceleration"], model.proximal[: model.n]) + swing
-            )
-            yield (
-                "as the spatial acceleration (r̈ − ω × ṙ) instead of the classical one",
-                right - cross(omega, state.v),
-            )
+            g, point = model.gravity[..., None, :], model.proximal[: model.n]
+            swing = np.cross(state.omega, np.cross(state.omega, point))
+            arm = np.matvec(turns, np.cross(self.right["angular_acceleration"], point) + swing)
+            words = "as the spatial acceleration (r̈ − ω × ṙ) instead of the classical one"
+            yield words, right - cross(omega, state.v)
             yield "minus gravity", right - g
             yield "plus gravity", right + g
             yield "of the joint's point", right + arm
         if quantity in ("acceleration", *WRENCHES):
-            near = model.body[:, 1][: right.shape[1]]
-            far = model.body[:, 0][: right.shape[1]]
+            far, near = model.body[: right.shape[1]].T
             yield "in the body frame", np.matvec(turns[:, near].mT, right)
             if np.any(far >= 0):
                 above = np.where((far >= 0)[:, None, None], turns[:, far].mT, np.eye(3))
@@ -195,26 +178,20 @@ class Outputs:
             axes = rotation_matrix(model.turn[: model.n, 1]).mT
             yield "in the axes of its joint", np.matvec(axes, right)
         if right.ndim == 3 and right.shape[1] > 1:
-            thing, hangs = (
-                _thing(quantity),
-                np.where(model.body[:, 0] < 0, 0, model.body[:, 0])[: right.shape[1]],
-            )
+            thing, hangs = _thing(quantity), np.maximum(model.body[: right.shape[1], 0], 0)
             yield f"of another {thing}, the next one", np.roll(right, -1, 1)
             yield f"of another {thing}, the previous one", np.roll(right, 1, 1)
             yield f"of another {thing}, the one counted from the other end", right[:, ::-1]
             yield f"of another {thing}, the one on which it hangs", right[:, hangs]
         if quantity == "kinetic_energy":
-            moving = [part.value for part in self._kinetic if part.what == "the translation of all bodies"]
-            yield "of rotation alone", right - moving[0]
+            yield "of rotation alone", right - 0.5 * np.sum(model.mass[..., None] * state.v**2, axis=(1, 2))
         if quantity == "angular_momentum":
             momentum = np.sum(model.mass[..., None] * state.v, axis=1)
             centre = np.sum(model.mass[..., None] * state.r, axis=1) / np.sum(model.mass, axis=-1)[..., None]
             spin = rotate_vectors(model.inertia, state.omega)
             yield "about the centre of mass", right - cross(centre, momentum)
-            yield (
-                "with the spin in body axes of all bodies",
-                right - np.sum(np.matvec(turns, spin) - spin, axis=1),
-            )
+            turned = right - np.sum(np.matvec(turns, spin) - spin, axis=1)
+            yield "with the spin in body axes of all bodies", turned
 
     @cached_property
     def _turns(self) -> Array:
@@ -261,13 +238,8 @@ class Outputs:
         found = []
         for a in SHARES:
             for b in SHARES:
-                norm = (
-                    square
-                    - 2 * (a * along[:, None] + b * along)
-                    + a * a * size[:, None]
-                    + b * b * size
-                    + 2 * a * b * gram
-                )
+                norm = square - 2 * (a * along[:, None] + b * along)
+                norm = norm + a * a * size[:, None] + b * b * size + 2 * a * b * gram
                 for i, j in zip(*np.nonzero(norm <= len(off) * limit**2 + 1e-9 * square), strict=True):
                     if i < j and np.max(np.abs(off - a * A[i] - b * A[j])) <= limit:
                         both = (SHARES[a], parts[i]), (SHARES[b], parts[j])
@@ -307,17 +279,9 @@ class Outputs:
         ]
         parts = _of_bodies({"the weight of {}": weight}) + self._element_energies("stiffness", "spring", 1)
         if springs:
-            parts += [
-                *springs,
-                Part(SPRINGS, np.sum([s.value for s in springs], axis=0)),
-            ]
-            parts.append(
-                Part(
-                    "all springs",
-                    self._energy_without("spring_stiffness", ())[1]
-                    + self._energy_without("stiffness", ())[1],
-                )
-            )
+            parts += [*springs, Part(SPRINGS, np.sum([s.value for s in springs], axis=0))]
+            of_joints = self._energy_without("stiffness", ())[1]
+            parts.append(Part("all springs", parts[-1].value + of_joints))
         return parts
 
     def _energy_without(self, name: str, at: tuple[int, ...]) -> tuple[Array, Array]:

@@ -514,18 +514,18 @@ def _fields_of_others(model: Model) -> Iterator[tuple[str, str, str, Change]]:
         if count < 2:
             continue
         places = np.arange(count)
+        few = count - 2 if 3 <= count <= MAX_PLACES else 1  # from how many places on
         sources = {
-            f"that of the {thing} before": np.maximum(places - 1, 0),
-            f"that of the {thing} after": np.minimum(places + 1, count - 1),
-            f"that of the first {thing}": 0 * places,
-            f"that of the {thing} counted from the other end": places[::-1],
+            f"that of the {thing} before": (np.maximum(places - 1, 0), few),
+            f"that of the {thing} after": (np.minimum(places + 1, count - 1), 1),
+            f"that of the first {thing}": (0 * places, few),
+            f"that of the {thing} counted from the other end": (places[::-1], 1),
         }
         if thing != "spring":
             hangs_on = np.where(model.body[:count, 0] < 0, places, model.body[:count, 0])
-            sources[f"that of the {thing} on which it hangs"] = hangs_on
-        for words, source in sources.items():
-            is_first = "after" in words or "other end" in words or count > MAX_PLACES or count < 3
-            for first in range(1 if is_first else count - 2):
+            sources[f"that of the {thing} on which it hangs"] = (hangs_on, few)
+        for words, (source, starts) in sources.items():
+            for first in range(starts):
                 taken = np.where(places > first, source, places) if first else source
                 moved = values[taken] * _has_place(model, name)
                 if np.sum(moved != values) >= 2:  # a single number is a cause of its own

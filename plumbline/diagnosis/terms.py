@@ -15,12 +15,7 @@ from plumbline.diagnosis.edits import Edit, at_place, coordinate_place, with_fie
 from plumbline.diagnosis.prediction import Answers, Case, Predictor
 from plumbline.equations.responses import Responses
 from plumbline.model.datatypes import Array, Model
-from plumbline.model.kinematics import (
-    cross,
-    quaternion_exponential,
-    quaternion_product,
-    rotation_matrix,
-)
+from plumbline.model.kinematics import cross, quaternion_exponential, quaternion_product, rotation_matrix
 from plumbline.model.loops import cut_open
 
 NOT_HELD = 1e-9  # of a direction: what the joint holds of it
