@@ -90,6 +90,8 @@ def _vanished(ways: Iterable[Problem], quantities: Collection[str], evaluate: Ev
     """Those of the quantities that are right in all ways that the engine accepts; None if it accepts none."""
     left, is_answered = set(quantities), False
     for model, states in ways:
+        if all(kind.is_rigid for kind in model.kinds):  # nothing moves
+            continue
         try:
             left -= _wrong(model, states, left, evaluate)
             is_answered = True
