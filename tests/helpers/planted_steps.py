@@ -357,7 +357,7 @@ STEP_DEFECTS = (
                   quadrature="a is the acceleration"),
     exudyn_defect("alpha-m-sign", "−αm in place of αm", "generalized-alpha", "αm had the opposite sign",
                   quadrature="sign of alpha_m"),
-    exudyn_defect("trapezoidal-beta", "β = 1/6", "trapezoidal", "β were 0.1667", newmarkBeta=1 / 6),
+    exudyn_defect("trapezoidal-beta", "β = 1/6", "trapezoidal", "β were 0.1666", newmarkBeta=1 / 6),
     exudyn_defect("trapezoidal-gamma", "γ = ½ + 1e-6", "trapezoidal", "γ were 0.500001",
                   newmarkGamma=0.5 + 1e-6),
     exudyn_defect("trapezoidal-index-3", "constraints on positions", "trapezoidal",
