@@ -105,6 +105,7 @@ def run(
         scheduler=scheduler,
         known_issues=known_issues,
         are_engines_required=options.are_engines_named(),
+        has_all_studies=level != "all",
     )
     from plumbline.reproduce.write import write_scripts
 

@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import cached_property
 from typing import Literal
+
+import numpy as np
 
 from plumbline.engines.adapter import EngineInfo
 from plumbline.engines.registry import REFERENCE_ENGINES
@@ -62,6 +65,30 @@ class Plan:
     random_level: Literal["state", "random"] = "state"  # of the random scenarios; "random": state and step
     random_trajectory_count: int = 0  # so many of the random scenarios, the first ones, run at every level
     result_cache: ResultCache = field(default_factory=ResultCache)
+    # Whether all refinement studies run; else those of low order only where every step of a run does not
+    # decide, and on one scenario of each family.
+    has_all_studies: bool = True
+
+    @cached_property
+    def studied(self) -> dict[str, str]:
+        """By family the scenario whose refinement studies always run.
+
+        Of the scenarios of this run with motions, the one with the fewest bodies, without elements and with
+        inertia, that has the most numbers that are not zero: the plainest that every engine can move, in the
+        most general motion.
+        """
+        found: dict[str, Scenario] = {}
+        for s in sorted(self.scenarios, key=_plainness):
+            if s.level == "all":
+                found.setdefault(s.family, s)
+        return {family: s.name for family, s in found.items()}
+
+
+def _plainness(scenario: Scenario) -> tuple[bool, int, int, str]:
+    model, state = scenario.model, scenario.state
+    numbers = [x for name, x in model.fields.items() if name != "kind"] + list(vars(state).values())
+    used = sum(int(np.count_nonzero(x)) for x in numbers)
+    return model.has_elements or model.lacks_inertia, model.n, -used, scenario.name
 
 
 class TaskKind(StrEnum):

@@ -243,8 +243,11 @@ class _Run:
         for done, outcome in enumerate(scheduler.run(self._tasks()), start=1):
             self.cpu_times.add_outcome(outcome, outcome.key.cpu_time_kind)
             with self.cpu_times.measure("judging"):
-                following = self.open[outcome.key.scenario].on_outcome(outcome)
-                self._show_rows(self.open[outcome.key.scenario], outcome)
+                scenario_run = self.open[outcome.key.scenario]
+                left_before = scenario_run.left_to_the_night
+                following = scenario_run.on_outcome(outcome)
+                total -= scenario_run.left_to_the_night - left_before
+                self._show_rows(scenario_run, outcome)
                 self._finish_done()
             for task in following:
                 scheduler.submit(task)

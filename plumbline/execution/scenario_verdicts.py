@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache, cached_property
 from typing import Any
@@ -28,7 +28,7 @@ from plumbline.judging.known_issues import KnownIssues
 from plumbline.judging.long_runs import judge_long_runs
 from plumbline.judging.rows import Fingerprints, JudgingResult, Level, Row, RowContext, Verdict, mark_aliases
 from plumbline.judging.state_level import judge_states, singular_pose_row
-from plumbline.judging.step_level import judge_steps
+from plumbline.judging.step_level import decides_without_study, judge_steps
 from plumbline.judging.trajectory_level import judge_trajectory
 from plumbline.measurements import relations
 from plumbline.measurements.long_run_study import plan_long_run, run_long_run_study
@@ -54,6 +54,12 @@ _LEVELS: dict[TaskKind, Level] = {
     TaskKind.TRAJECTORY: "trajectory",
     TaskKind.LONG_RUN: "invariants",
 }
+LOW_ORDER = 2  # studies up to it cost most
+LEFT_TO_THE_NIGHT = (
+    "not run: every step of a run is compared with the declared formula, which in so fast a motion detects "
+    "smaller mistakes; of this family the study of {} runs, and a nightly or `run --level trajectory` runs "
+    "all"
+)
 LIFTED = ("acceleration", "angular_acceleration")  # computed here where an engine returns those of its joints
 NO_INDEPENDENT_TRUTH = "no independent truth: python-flint is not installed, and the reference is no judge"
 NO_REGULAR_POSE = (
@@ -132,6 +138,7 @@ class ScenarioRun:
         self._pending = set(self._keys)  # without an outcome
         self._findings: dict[TaskKey, JudgingResult] = {}
         self._has_retried_truth = False
+        self.left_to_the_night = 0  # number of tasks
         self._packed_truths: dict[TaskKind, Packed] = {}  # for judges and diagnoses in workers
 
     def _compared_states(self, count: int) -> EncodedRecord:
@@ -261,13 +268,47 @@ class ScenarioRun:
             self.truths[key.kind] = TruthFailure(outcome.failure) if outcome.failure else outcome.value
             if not outcome.failure:
                 self._packed_truths[key.kind] = outcome.packed
-            following = [self._cell_task(k) for k in self._keys if k.needed_truth == key.kind]
+            following = [
+                self._cell_task(k) for k in self._keys if k.needed_truth == key.kind and self._is_due(k)
+            ]
         else:
             found = self._findings[key] = self._judged(outcome)
             if key.kind in (TaskKind.STATE, TaskKind.STEP):
                 following = self._diagnosis_tasks(outcome, found)
+            if key.kind == TaskKind.STEP:
+                following += self._study_tasks(key, found.rows)
         self._pending |= {task.key for task in following}
         return following
+
+    def _awaited_steps(self, key: TaskKey) -> TaskKey | None:
+        """The steps that decide whether a refinement study runs; None where it always does."""
+        studied = self._plan.studied.get(self.scenario.family) if not self._plan.has_all_studies else None
+        if key.kind != TaskKind.TRAJECTORY or studied in (None, self.scenario.name):
+            return None
+        integrator, steps = self._integrator(key), replace(key, kind=TaskKind.STEP)
+        is_low = integrator.kind == "step" and integrator.order <= LOW_ORDER
+        return steps if is_low and steps in self._keys else None
+
+    def _is_due(self, key: TaskKey) -> bool:
+        """Whether a cell need not wait for steps, and is not left to the night."""
+        steps = self._awaited_steps(key)
+        return key in self._pending and (steps is None or steps in self._findings)
+
+    def _study_tasks(self, steps: TaskKey, rows: Sequence[Row]) -> list[Task]:
+        """The refinement study that waited for steps, unless they decide without it."""
+        study = replace(steps, kind=TaskKind.TRAJECTORY)
+        if study not in self._keys or self._awaited_steps(study) is None:
+            return []
+        if not decides_without_study(rows, self._resolutions(self._integrator(study))[0]):
+            return [self._cell_task(study)] if study.needed_truth in self.truths else []
+        reason = LEFT_TO_THE_NIGHT.format(self._plan.studied[self.scenario.family])
+        row = self._context(study.engine).make_row(
+            "trajectory", study.integrator, "all", Verdict.INFORMATION, reason
+        )
+        self._findings[study] = JudgingResult([row])
+        self._pending.discard(study)
+        self.left_to_the_night += 1
+        return []
 
     def new_rows(self, outcome: Outcome) -> list[Row]:
         """Return what was found by an outcome.
@@ -377,14 +418,17 @@ class ScenarioRun:
         if key.kind == TaskKind.STEP:
             return run_step_study, (integrator, s.model, self._step_states)
         if key.kind == TaskKind.TRAJECTORY:
-            steps = refinement_resolutions(
-                integrator, s.model.n, s.duration, plan.extra_refinements, s.sample_interval
-            )
+            steps = self._resolutions(integrator)
             truth = self.truths.get(TaskKind.MOTION_TRUTH)  # ends before a singular pose
             times = truth.trajectory.t if isinstance(truth, MotionTruth) else s.times
             return run_refinement_study, (integrator.name, s.model, s.state, times, steps)
         length = plan_long_run(integrator, s.model.n, plan.long_run_seconds, s.sample_interval, s.duration)
         return run_long_run_study, (integrator.name, s.model, s.state, s.sample_interval, length)
+
+    def _resolutions(self, integrator: Integrator) -> list[float]:
+        """The steps or tolerances of a refinement study, coarse to fine."""
+        s, finer = self.scenario, self._plan.extra_refinements
+        return refinement_resolutions(integrator, s.model.n, s.duration, finer, s.sample_interval)
 
     def _judge(self, key: TaskKey) -> tuple[Callable[..., JudgingResult] | None, tuple[Any, ...]]:
         """The function that judges a cell's answer in the worker, and its arguments; None without a truth."""

@@ -6,7 +6,8 @@ the level reports. docs/coverage.md explains the table.
 
 - state: every quantity at every compared state, within the rounding bound. A mistake in the initial state
   shows at that state only.
-- step: one step and ten of the classical Runge-Kutta method, within the bound of the level.
+- step: one step and ten of the classical Runge-Kutta method, and every step of a run, within the bounds of
+  the level.
 - trajectory and invariants: the tolerances of the judged rows; the effect is that on the true motion.
 """
 
@@ -20,7 +21,13 @@ from numpy.typing import NDArray
 
 from plumbline.judging.rows import Level, Row, Verdict
 from plumbline.judging.state_level import STATE_UNITS
-from plumbline.measurements.single_steps import MAX_STEP_BODIES, STEP_STATES, step_sizes
+from plumbline.measurements.single_steps import (
+    MAX_STEP_BODIES,
+    RUN_STEP_SHARE,
+    STEP_STATES,
+    run_counts,
+    step_sizes,
+)
 from plumbline.model.datatypes import SPRING_FIELDS, Array, Float, Model, State, Trajectory
 from plumbline.model.invariants import (
     INVARIANT_UNITS,
@@ -31,12 +38,13 @@ from plumbline.model.invariants import (
     motion_errors,
 )
 from plumbline.model.kinematics import angular_velocity, with_joint_coordinates
-from plumbline.model.step_methods import classical_runge_kutta
+from plumbline.model.step_methods import JointSpaceMethod, classical_runge_kutta
 from plumbline.truth.parameter_effects import difference_effects, effects_at_states
 from plumbline.truth.parameters import STATE_KINDS, Parameter, list_parameters, perturb
 from plumbline.truth.predictability_horizon import project_to_manifold
 from plumbline.truth.rounding_bound import EPS, remembered_rounding_bound
-from plumbline.truth.step_comparison import FormulaSteps
+from plumbline.truth.step_charts import StepCharts
+from plumbline.truth.step_comparison import FormulaSteps, StepsFromSamples
 from plumbline.truth.trajectory_truth import (
     MOTION_MISTAKE,
     AccurateMotion,
@@ -56,6 +64,8 @@ FURTHER_MISTAKES = (5e-4, MAX_MISTAKE / LARGER_MISTAKE)  # where smaller ones pa
 DOUBTFUL_MISTAKE = 1e-6  # from here on an effect may be rounding of the runs: a proof is tried
 NO_EFFECT = 1e-9  # of the largest effect that a term could have: rounding
 MAX_SLOWDOWN = 10  # of a motion by a mistake, in steps
+RUN_SAMPLES = 33  # of a run, from which steps with a mistake are taken
+RUN_MISTAKE = 1e-6  # of a parameter's scale in them, in extended precision
 MOTION_SAMPLES = 32  # of a motion, at which the effect of a mistake is measured; or all, where it has fewer
 PROOF_SAMPLES = 17  # of the motion, at which a parameter's term is shown to vanish
 TINY = float(np.finfo(float).tiny)
@@ -162,7 +172,8 @@ def scenario_coverage(
         )
     if "step" in levels and not model.has_loops and model.n <= MAX_STEP_BODIES:
         some = states[:STEP_STATES]
-        by_engine = {"": _step_ratios(model, some, parameters)}
+        of_run = run_ratios(STEP_METHOD, model, state, parameters)
+        by_engine = {"": _sharpest([_step_ratios(model, some, parameters), of_run])}
         found += _entries(
             name, "step", model, parameters, by_engine, _proofs(model, some, parameters, by_engine, "step")
         )
@@ -286,6 +297,38 @@ def _step_ratios(model: Model, states: Sequence[State], parameters: Sequence[Par
     return ratios
 
 
+def run_ratios(
+    method: JointSpaceMethod, model: Model, state: State, parameters: Sequence[Parameter]
+) -> _Ratios:
+    """Effects of mistakes on every step of a run over its bounds, from some samples along the true motion.
+
+    What the mean of the deviations shows besides is not counted: its bound depends on how the engine rounds.
+
+    Args:
+        method: a declared formula.
+        state: where the run starts.
+        parameters: mistakes in them.
+
+    """
+    h = RUN_STEP_SHARE * step_sizes(False, model, [state])[0][0]
+    times = np.linspace(0, h * max(run_counts(model.n)), RUN_SAMPLES)
+    states = [state, *_visited_states(accurate_motion(model, state, times, substeps=1), RUN_SAMPLES)[1:]]
+    charts = StepCharts(model, method, states)
+    q, v = charts.start()
+    coordinates, velocities = np.asarray(np.concatenate(q, -1), float), np.asarray(v, float)
+    steps = StepsFromSamples(method, model, charts, coordinates, velocities, h, len(states))
+    ratios = _Ratios(len(parameters))
+    for k, one in enumerate(parameters):
+        if one.kind in STATE_KINDS:
+            off = {"run_samples": steps.start_ratio(perturb(model, state, one, RUN_MISTAKE)[1])}
+        else:
+            cases = [perturb(model, at, one, RUN_MISTAKE) for at in states]
+            off = steps.mistake_ratios(cases[0][0], [at for _, at in cases])
+        for quantity, ratio in off.items():
+            ratios.add(k, ratio / RUN_MISTAKE, quantity)
+    return ratios
+
+
 def _step_errors(motion: PerturbedMotion, count: int) -> dict[str, Array]:
     """Differences (N,) after some steps, as the step level measures them."""
     run, true = motion.run, motion.true
@@ -367,7 +410,7 @@ def _motion_entries(
         finer[i] += same
     ratios = _motion_ratios(tolerances, effects, finer)
     found = []
-    visited = _visited_states(motions[0])
+    visited = _visited_states(motions[0], PROOF_SAMPLES)
     for level, by_engine in ratios.items():
         proofs = _proofs(model, visited, parameters, by_engine, level)
         own = [one for one in tolerances if one.row.level == level]
@@ -453,10 +496,10 @@ def _conserved(
     return found
 
 
-def _visited_states(motion: AccurateMotion) -> list[State]:
-    """States along the motion."""
+def _visited_states(motion: AccurateMotion, count: int) -> list[State]:
+    """So many states along the motion."""
     model, samples = motion.model, motion.samples.swapaxes(-1, -2)
-    along = np.linspace(0, len(samples) - 1, PROOF_SAMPLES).astype(int)
+    along = np.linspace(0, len(samples) - 1, count).astype(int)
     found = [
         project_to_manifold(model, q[:, :3], q[:, 3:], rate[:, :3], rate[:, 3:]) for q, rate in samples[along]
     ]

@@ -40,6 +40,13 @@ NO_COORDINATES = (
     "not compared: the adapter returns no coordinates with the samples, from which the next step could start"
 )
 TOTALS = ("run_energy", "run_momentum", "run_equations")  # of the whole mechanism
+DECISIVE = {"run_velocity", "run_rate"}  # rows
+# rad, coarsest step × fastest rate up to which limits may be known to rounding: measured, docs/coverage.md
+MAX_RESOLVED_TURN = 1 / 20
+DECIDED, UNDECIDED = (
+    {Verdict.AGREES, Verdict.DISAGREES},
+    {Verdict.UNRESOLVED, Verdict.FAILED, Verdict.HARNESS_FAILED},
+)
 MAX_STEP_BOUND = 1e-6  # of the accelerations' effect; a looser bound could hide a mistake
 
 
@@ -63,6 +70,28 @@ def judge_steps(
         if any(row.quantity == "all" for row in rows):  # why nothing is compared
             return JudgingResult(rows)
     return JudgingResult([*rows, *_run_rows(context, integrator, model, states[0], answer)])
+
+
+def decides_without_study(rows: Sequence[Row], coarsest: float) -> bool:
+    """Find out whether the steps of a run decide, so that a refinement study of low order adds nothing.
+
+    Args:
+        rows: of `judge_steps`, of one integrator.
+        coarsest: step of the study [s].
+
+    Returns:
+        Whether the rates of all bodies, in which every number of the mechanism shows, are compared at every
+        step that differs, no row failed or is unresolved, and the motion is too fast for the study's limit
+        to be known to rounding (docs/coverage.md).
+
+    """
+    if any(row.verdict in UNDECIDED or row.extra.get("left_out_wrong_steps") for row in rows):
+        return False
+    decided = {row.quantity: row for row in rows if row.verdict in DECIDED}
+    if not decided.keys() >= DECISIVE:
+        return False
+    turn = coarsest * max(decided[name].extra.get("fastest_mode", 0.0) for name in DECISIVE)
+    return turn > MAX_RESOLVED_TURN
 
 
 def _single_step_rows(
@@ -161,6 +190,7 @@ def _run_rows(
     if not HAS_EXTENDED_PRECISION:
         return one(Verdict.UNSUPPORTED, NO_EXTENDED_PRECISION)
     condition: Callable[[int, int], str] = partial(_time, run)
+    more = dict[str, float]()
     if isinstance(method, ConstrainedMethod):
         parts = constrained_deviations(method, model, run, h)
         found = {f"run_{name}": joined(some) for name, some in parts.items()}
@@ -175,11 +205,27 @@ def _run_rows(
         except EngineFailure as error:
             return one(Verdict.FAILED, str(error))
         found, condition = steps.compare(), steps.condition
+        more = {"fastest_mode": steps.fastest_mode} if np.isfinite(steps.fastest_mode) else {}
     alias = None if model.has_drag else integrator.alias_of
     return [
-        _run_row(context, integrator, quantity, deviations, h, condition, alias, answer.cpu_time)
+        _run_row(context, integrator, quantity, deviations, h, condition, alias, answer.cpu_time, more)
         for quantity, deviations in found.items()
     ]
+
+
+def _left_out_words(found: StepDeviations, unit: str) -> tuple[str, float]:
+    """What a row says of the steps without a bound, and how many of them are off by more than one."""
+    left_out = found.is_left_out
+    reasons, numbers = np.unique(found.left_out[left_out], return_counts=True)
+    causes = [f"{number} ({why})" for why, number in zip(reasons, numbers, strict=True)]
+    off = found.ratios_of_all[left_out]
+    is_off = ~(off <= 1)
+    wrong = int(np.count_nonzero(np.any(is_off, axis=1)))
+    words = f"; {np.count_nonzero(left_out)} steps have no bound: {', '.join(causes)}"
+    if wrong:
+        size = float(np.max(found.errors[left_out][is_off]))
+        words += f", of which {wrong} differ by more than one would allow, at most by {size:.3g} {unit}"
+    return words, float(wrong)
 
 
 def _time(run: StepRun, index: int, _: int) -> str:
@@ -188,17 +234,18 @@ def _time(run: StepRun, index: int, _: int) -> str:
 
 def _run_row(
     context: RowContext, integrator: Integrator, quantity: str, found: StepDeviations, h: float,
-    condition: Callable[[int, int], str], alias: str | None, cpu_time: float,
+    condition: Callable[[int, int], str], alias: str | None, cpu_time: float, more: dict[str, float],
 ) -> Row:  # fmt: skip
     """The row of one quantity at every step: the worst step decides, the first wrong one is named."""
     (name, unit), ratios = RUN_QUANTITIES[quantity], found.ratios
     ratios = np.where(np.isnan(ratios), np.inf, ratios)
     worst, column = (int(x) for x in np.unravel_index(np.argmax(ratios), ratios.shape))
     ratio, wrong = float(ratios[worst, column]), np.flatnonzero(np.any(ratios > 1, axis=1))
-    has_bodies, count = quantity not in TOTALS, len(ratios)
+    has_bodies, count, left_out = quantity not in TOTALS, len(ratios), found.is_left_out
     body = column if has_bodies else 0
     sharp = (found.bounds <= MAX_STEP_BOUND * found.effects) | (found.effects == 0)
-    extra = {"step": h, "worst_step": worst + 1.0, "comparisons": float(ratios.size)}
+    sharp &= ~left_out[:, None]
+    extra = more | {"step": h, "worst_step": worst + 1.0, "comparisons": float(ratios.size)}
     what = f"{name} of {count} steps of {h:.4g} s"
     if ratio > 1:
         first = int(wrong[0])
@@ -221,22 +268,17 @@ def _run_row(
     elif np.mean(sharp) < 0.5:
         verdict = Verdict.INFORMATION  # single steps are larger, and decide
         reason = (
-            f"not compared: at {np.mean(~sharp):.0%} of the steps the rounding bound is above "
+            f"not compared: at {np.mean(~sharp):.0%} of the steps there is no bound, or it is above "
             f"{MAX_STEP_BOUND:g} of the accelerations' effect, too loose to detect an error"
         )
     else:
         verdict = Verdict.AGREES
         reason = f"{what} within {ratio:.2g} of the rounding bound, each from the sample before"
-        if left_out := int(np.count_nonzero(np.any(np.isinf(found.bounds), axis=1))):
-            size = float(np.max(found.errors[np.isinf(found.bounds)]))
-            extra["left_out_steps"] = float(left_out)
-            reason += (
-                f"; {left_out} of them are not compared, since something differs there (this quantity by up "
-                f"to {size:.3g} {unit}) and the step does not resolve the motion, a body is far away, or "
-                "angles are near their singular pose"
-            )
         if quantity == "run_mean":
             reason = f"no direction in the deviations of the steps: {ratio:.2g} of what rounding explains"
+    if quantity != "run_mean" and (number := int(np.count_nonzero(left_out))):
+        words, extra["left_out_steps"] = _left_out_words(found, unit), float(number)
+        reason, extra["left_out_wrong_steps"] = reason + words[0], words[1]
     return context.make_row(
         "step", integrator.name, quantity, verdict, reason, unit,
         value=float(found.errors[worst, column]), tolerance=float(found.bounds[worst, column]), ratio=ratio,

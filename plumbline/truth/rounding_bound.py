@@ -83,6 +83,7 @@ class RoundingBound:
     kinematics: Array  # (4, N): of r [m], v [m/s], attitudes [rad] and ω [rad/s] that follow from coordinates
     rod_torque: Array  # (N,) N m, of the torques at both ends of the rod that body k hangs by; 0 for a ball
     joint_terms: float  # N m about the origin, of the terms of all joints
+    joint_power: float  # W, of the same with the joints' rates
 
     def tolerance(self, quantity: str) -> Array | float:
         """Look up a tolerance by the name of its quantity.
@@ -183,9 +184,9 @@ def rounding_bounds(
 
 
 def _of_tree(terms: _Terms) -> list[RoundingBound]:
-    total, scale, sums, rods, moments, motion = terms.bounds()
+    total, scale, sums, rods, joints, motion = terms.bounds()
     return [
-        _bound(total[s], _at(scale, s), _at(sums, s), rods[s], moments[s], motion[:, s])
+        _bound(total[s], _at(scale, s), _at(sums, s), rods[s], joints[s], motion[:, s])
         for s in range(len(total))
     ]
 
@@ -195,7 +196,7 @@ def _of_loops(model: Model, states: Sequence[State]) -> list[RoundingBound]:
     cut, found = cut_open(model), list[RoundingBound]()
     there = cut.state(stack_states(states))
     terms = _Terms(cut.model, there, None, cut.ends, cut.row_scale)
-    totals, scales, sums, _, moments, motion = terms.bounds()
+    totals, scales, sums, _, joints, motion = terms.bounds()
     of_welds, rank = terms.weld_errors(), regular_rank(model, states[0])
     scaled = cut.jacobian(there) * cut.row_scale[:, None]
     spreads = 1 + 1 / np.linalg.svd(scaled, compute_uv=False)[:, rank - 1]  # as `smallest_singular_value`
@@ -212,7 +213,7 @@ def _of_loops(model: Model, states: Sequence[State]) -> list[RoundingBound]:
         }
         spread_sums = {name: size * spread for name, size in _at(sums, s).items()}
         largest_motion = np.repeat(np.max(motion[:, s], axis=-1, keepdims=True), model.n, axis=-1)
-        of_joints = np.zeros(model.n), spread * moments[s], spread * largest_motion
+        of_joints = np.zeros(model.n), spread * joints[s], spread * largest_motion
         found.append(_bound(total[cut.place], scale, spread_sums, *of_joints))
     return found
 
@@ -222,7 +223,7 @@ def _at(values: dict[str, Array], s: int) -> dict[str, Array]:
 
 
 def _bound(
-    total: Array, scale: dict[str, Array], sums: dict[str, Array], rods: Array, moments: float, motion: Array
+    total: Array, scale: dict[str, Array], sums: dict[str, Array], rods: Array, joints: Array, motion: Array
 ) -> RoundingBound:
     """Tolerances by the sums of all sizes: (J, 4) of joints, of which the first hold the bodies."""
     total, sizes = ROUNDING_FACTOR * EPS * total, {name: float(size) for name, size in sums.items()}
@@ -234,7 +235,8 @@ def _bound(
         scale=scale | sizes,
         kinematics=ROUNDING_FACTOR * EPS * motion,
         rod_torque=ROUNDING_FACTOR * EPS * rods,
-        joint_terms=float(ROUNDING_FACTOR * EPS * moments),
+        joint_terms=float(ROUNDING_FACTOR * EPS * joints[0]),
+        joint_power=float(ROUNDING_FACTOR * EPS * joints[1]),
         **{name: SUM_ROUNDING_FACTOR * EPS * size for name, size in sizes.items()},
     )
 
@@ -368,7 +370,8 @@ class _Terms:
         Returns:
             tB + tS + tJ + d (S, N, 4) of r̈ [m/s²], α [rad/s²], F [N] and M [N m]; the scales of vectors; the
             sums (S,) behind the energies [J], the angular momentum and the mass matrix; torques of rods
-            (S, N) [N m]; moments (S,) of all joints [N m]; sizes (4, S, N) behind r, v, attitudes and ω.
+            (S, N) [N m]; of all joints (S, 2) the moments [N m] and their power [W]; sizes (4, S, N) behind
+            r, v, attitudes and ω.
 
         """
         t, model, state, joints = self, self.model, self.state, _JointSpace(self)
@@ -419,13 +422,14 @@ class _Terms:
                 [t.moment, t.arm * t.F, t.J * t.alpha, np.sum(t.element_size, -1), (lever @ (t.m * t.g))], 0
             ),
         }
-        rods, moments = np.zeros(t.a.shape), np.zeros(len(total))
+        rods, of_joints = np.zeros(t.a.shape), np.zeros((len(total), 2))
         for at, (what, k) in enumerate(joints.pairs):
             load = joints.load[:, at]
             rods[:, k] += load * (what in ("upper", "lower"))
-            moments += load * (np.linalg.norm(tip[:, k], axis=-1) if what == "slide" else 1.0)
+            of_joints[:, 0] += load * (np.linalg.norm(tip[:, k], axis=-1) if what == "slide" else 1.0)
+            of_joints[:, 1] += load * joints.rate[:, at]
         depth = np.broadcast_to(np.sum(t.below, axis=0), height.shape)
-        return total, scale, sums, rods, moments, np.stack([height, with_place, depth, rate])
+        return total, scale, sums, rods, of_joints, np.stack([height, with_place, depth, rate])
 
 
 def _norms(responses: Array) -> Array:

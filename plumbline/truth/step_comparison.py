@@ -7,10 +7,10 @@ of any link up to body k, n its place among the links, ℓ the chain's stretched
     ω′  3 h (b_α + c) + 32 ε n W        ṙ  3 h (b_a + c ℓ) + 32 ε n max(V, W ℓ)
     p   h (bound of ω′) + 32 ε n          r  h (bound of ṙ) + 32 ε n ℓ
 
-b holds the error of the accelerations, the factor 3 the stages elsewhere, the second term the roundings of
-quaternion products and of the way from joint rates to the bodies', c = h W Σ (b_α of the links before, and of
-rods about their own axes) what relative rates pass on.  Ten steps: the sum over the steps, times
-the growth of perturbations, as one.
+b holds the error of the accelerations, the engine's and the formula's own, the factor 3 the stages
+elsewhere, the second term the roundings of quaternion products and of the way from joint rates to the
+bodies', c = h W Σ (b_α of the links before, and of rods about their own axes) what relative rates pass on.
+Ten steps: the sum over the steps, times the growth of perturbations, as one.
 
 Of loops b is larger by what the roundings of gaps and of their rates (32 ε (ℓ′, 1) and 32 ε (V + W ℓ′, W) in
 length and angle, ℓ′ the mechanism's size) leave in accelerations, a² and 2 a times their sum with the
@@ -29,6 +29,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from plumbline.equations.arithmetic import floats
+from plumbline.equations.tree import Tree
 from plumbline.model.datatypes import KINDS, Array, Kind, Model, State, StepRun, Trajectory
 from plumbline.model.kinematics import (
     angular_velocity,
@@ -43,15 +45,17 @@ from plumbline.model.sampling import derive_seed
 from plumbline.model.step_methods import ConstrainedMethod, JointSpaceMethod, StepMethod
 from plumbline.truth.rounding_bound import (
     EPS,
+    ROUNDING_FACTOR,
     SUM_ROUNDING_FACTOR,
     RoundingBound,
     remembered_rounding_bound,
     rounding_bounds,
 )
-from plumbline.truth.step_charts import BodyStates, StepCharts
+from plumbline.truth.step_charts import BodyStates, LongDouble, StepCharts
 from plumbline.truth.step_formulas import (
     constrained_quadrature,
     constrained_residual,
+    coordinates_after,
     engine_coordinates,
     fastest_rates,
     first_acceleration_bound,
@@ -67,13 +71,15 @@ ACCELERATIONS = ("angular_acceleration", "acceleration", "rod_torque")  # whose 
 DISTURBANCE = 1e-9  # of rates, to measure the growth of perturbations
 ANGLE_ROUNDINGS = 4
 MAX_STRETCH = 2e-15  # of a joint's quaternions
+MIN_MIDDLE_COSINE = 0.1  # of the second of two or three angles: at 0 two of their axes are one
 MAX_DISTANCE = 10.0  # of bodies from the origin, over the mechanism's size
-MIN_MIDDLE_COSINE = 0.5  # of the second of two or three angles: at 0 two of their axes are one
+MAX_COSINE_CHANGE = 1 / 2  # of that cosine in a step, over itself
 MAX_TURN = 1.0  # rad, step × fastest rate: beyond it explicit methods become unstable, and bounds do not hold
-SAMPLE_FACTOR = 8.0  # on what a step's bound has without accelerations: velocities add up along chains
-# Of the bounds, in the mean of many steps: what is rounded alike in all of them, and chance.
-MEAN_ROUNDING, MEAN_ACCELERATION, MEAN_SPREAD = 1 / 2, 1 / 16, 1.0
-MOMENTUM_SHARE = 1 / 4  # of the bounds of all rates, in the change of momentum
+SAMPLE_STRIDE = 8  # of the samples at which what changes slowly is estimated: rates, the formula's own errors
+LOST_DIGITS = 4.0  # by how much errors of one size may differ by chance
+# Roundings that are alike in all steps, of those in a bound: see `RunSteps._mean`.
+CONSTANT_ROUNDINGS, CONSTANT_FACTORS = 16 / STEP_ROUNDINGS, 12 / ROUNDING_FACTOR / ACCELERATION_FACTOR
+MEAN_ALARM = 1e-9  # how probable it is that chance alone passes the bound of a mean
 CLOCK_ROUNDINGS = 2  # of a time that is a sum of steps
 RESIDUAL_STEPS = 2  # after one, Euler does not show the axial inertia of rods
 TINY = float(np.finfo(float).tiny)
@@ -290,11 +296,19 @@ class FormulaSteps:
 def acceleration_bounds(
     method: JointSpaceMethod, model: Model, states: Sequence[State]
 ) -> list[RoundingBound]:
-    """Compute the state level's bounds, and what the correction of gaps adds to its accelerations."""
+    """Compute the bounds of accelerations in steps.
+
+    Returns:
+        The state level's, and what the correction of gaps adds, or on trees the formula's own errors.
+
+    """
     bounds, rate = rounding_bounds(model, states), method.gap_correction
-    if not (model.has_loops and rate):
+    if model.has_loops and not rate:
         return bounds
-    added = _correction_roundings(model, stack_states(states), rate)
+    if model.has_loops:
+        added = _correction_roundings(model, stack_states(states), rate)
+    else:
+        added = _formula_errors(model, states)
     return [
         replace(b, acceleration=b.acceleration + a, angular_acceleration=b.angular_acceleration + alpha)
         for b, (a, alpha) in zip(bounds, added, strict=True)
@@ -364,6 +378,66 @@ def step_bound(
         "step_attitude": count * h * omega + rounding + turned,
         "step_position": count * h * velocity + (rounding + turned) * arm,
     }
+
+
+def _sample_bound(method: JointSpaceMethod, model: Model, sizes: dict[str, Array]) -> dict[str, Array]:
+    """Bound what rounding leaves between coordinates and the bodies' motion that they map to.
+
+    Places and attitudes as in a step without accelerations.  The relative rates uⱼ of the joints are added up
+    along a path, each turned by an attitude that is off by the roundings ρⱼ up to it, and at a lever ℓ ahead,
+    or about a common point, as the centre of the tree: as far away as the furthest body.
+
+        ω′  Σ ρⱼ |uⱼ|        ṙ  ℓ Σ ρⱼ |uⱼ| + ρ max(V, W ℓ)
+
+    Args:
+        sizes: of `_sizes`, and of `StepCharts.coordinate_sizes`, (S, N).
+
+    Returns:
+        By quantity the bounds (S, N), in its unit of `STEP_UNITS`.
+
+    """
+    bound = step_bound(method, model, sizes, 0.0, 0)
+    far, path = model.body[: model.n, 0], _paths(model.body[: model.n, 0])
+    relative = sizes["rate"] + np.where(far >= 0, sizes["rate"][..., far], 0.0)
+    turned = (bound["step_attitude"] * relative) @ path.T
+    lever = bound["step_position"] / np.maximum(bound["step_attitude"], TINY)
+    lever = np.maximum(lever, np.max(sizes["place"], axis=-1, keepdims=True))
+    bound |= {"step_rate": turned, "step_velocity": bound["step_velocity"] + turned * lever}
+    return {name: np.maximum(x, TINY) for name, x in bound.items()}
+
+
+def _formula_errors(model: Model, states: Sequence[State]) -> Array:
+    """(S, 2, N) errors of r̈ and ω̇′ by the formula itself, in extended precision.
+
+    Its recursion loses digits where light bodies carry heavy ones, as in doubles, where the same loss shows
+    and is larger by the ratio of the two precisions.  Of the samples of a run, the largest loss counts.
+    """
+    some = _every_few(len(states))
+    state, found = stack_states([states[n] for n in some]), list[Any]()
+    for dtype in (np.float64, LongDouble):
+        tree = Tree(floats(dtype), model, state)
+        solution = tree.solve()
+        each = [
+            *solution.acceleration,
+            *tree.in_bodies(solution.turning),
+        ]  # of a held body one for all states
+        found.append(np.stack([np.broadcast_to(x, (len(some), 3, 1)) for x in each]))
+    size = np.linalg.norm(np.asarray(found[0] - found[1], float)[..., 0], axis=-1).reshape(2, model.n, -1)
+    share = float(np.finfo(LongDouble).eps / np.finfo(float).eps)
+    lost = LOST_DIGITS * share * np.moveaxis(size, -1, 0)
+    return lost if len(some) == len(states) else np.tile(np.max(lost, axis=0), (len(states), 1, 1))
+
+
+def _every_few(count: int) -> NDArray[np.intp]:
+    """Indices of every `SAMPLE_STRIDE`-th of so many samples, and of the last; of few, all."""
+    stride = SAMPLE_STRIDE if count > 4 * SAMPLE_STRIDE else 1
+    return np.unique(np.append(np.arange(0, count, stride), count - 1))
+
+
+def _spread(values: Array, some: NDArray[np.intp]) -> Array:
+    """Give each sample the larger of the two values around it, of those at some samples."""
+    at = np.searchsorted(some, np.arange(some[-1] + 1))
+    return np.maximum(values[at], values[np.maximum(at - 1, 0)])
 
 
 def _correction_roundings(model: Model, states: State, rate: float) -> Array:
@@ -436,6 +510,15 @@ def _differences(true: BodyStates | State, t: Trajectory, count: int | slice) ->
     return {name: np.asarray(a - b, float) for name, (a, b) in pairs.items()}
 
 
+def _body_differences(one: BodyStates | State, other: BodyStates | State) -> dict[str, Array]:
+    """Sizes (..., N) of the differences of two motions of bodies, as those of a run from another."""
+    names = {"step_position": "r", "step_velocity": "v", "step_rate": "omega"}
+    pairs = {quantity: getattr(one, name) - getattr(other, name) for quantity, name in names.items()}
+    sign = np.where(np.sum(one.p * other.p, axis=-1, keepdims=True) < 0, -1, 1)
+    pairs["step_attitude"] = 2 * (sign * one.p - other.p)
+    return {quantity: np.linalg.norm(np.asarray(x, float), axis=-1) for quantity, x in pairs.items()}
+
+
 def _errors(true: BodyStates, run: StepRun, count: int) -> dict[str, Array]:
     """Sizes (N,) of the differences."""
     found = _differences(true, run.trajectory, count)
@@ -466,11 +549,23 @@ class StepDeviations:
     errors: Array  # (steps, K)
     bounds: Array  # (steps, K) what rounding explains
     effects: Array  # (steps, K) of the accelerations on the quantity; 0 where they have none
+    # (steps,) why a step has no bound, by the condition of the motion alone; empty where all have one
+    left_out: NDArray[np.str_] = field(default_factory=lambda: np.array([], str))
 
     @property
     def ratios(self) -> Array:
-        """Errors over their bounds (steps, K)."""
+        """Errors over their bounds (steps, K); 0 at steps that have none."""
+        return np.where(self.is_left_out[:, None], 0.0, self.ratios_of_all)
+
+    @property
+    def ratios_of_all(self) -> Array:
+        """Errors (steps, K) over what the bounds would be, were they valid at every step."""
         return np.asarray(self.errors / np.maximum(self.bounds, TINY))
+
+    @property
+    def is_left_out(self) -> NDArray[np.bool_]:
+        """(steps,) whether a step has no bound."""
+        return self.left_out != "" if len(self.left_out) else np.zeros(len(self.errors), bool)
 
 
 def joined(parts: Sequence[StepDeviations]) -> StepDeviations:
@@ -480,7 +575,135 @@ def joined(parts: Sequence[StepDeviations]) -> StepDeviations:
     return StepDeviations(*(np.take_along_axis(np.array(x), worst, 0)[0] for x in columns))
 
 
-class RunSteps:
+class StepsFromSamples:
+    """The declared step from each of many samples, and what rounding explains in it."""
+
+    def __init__(
+        self, method: JointSpaceMethod, model: Model, charts: StepCharts, coordinates: Array,
+        velocities: Array, h: float, count: int,
+    ) -> None:  # fmt: skip
+        """Take the steps.
+
+        Args:
+            charts: of the coordinates.
+            coordinates: (S, Σ ·) of `Trajectory`.
+            velocities: (S, nv).
+            h: step [s].
+            count: steps start from so many of the samples; where there is one more, each ends at the next.
+
+        Raises:
+            EngineFailure: there are other coordinates than the mechanism has.
+
+        """
+        self.method, self.model, self.h, self.charts = method, model, h, charts
+        q, v = charts.divided(coordinates, velocities)
+        self.here = charts.bodies(q, v)
+        self.after = steps_in_charts(charts, [at[:count] for at in q], v[:count], [h], 1)[1]
+        rounded = self.here.rounded()
+        self.states = [State(**{name: x[i] for name, x in vars(rounded).items()}) for i in range(len(v))]
+        self.bounds = acceleration_bounds(method, model, self.states)
+        self.states_r, self.middle_cosine = rounded.r, charts.middle_cosine(q)
+        sizes = _sizes(rounded, self.bounds) | charts.coordinate_sizes(coordinates)
+        # Angles whose axes meet at the cosine c have rates of W/c and accelerations of (α + W²/c²)/c; their
+        # torques, too, are converted by a matrix of norm 1/c.
+        converted = 1 / np.maximum(self.middle_cosine, TINY)[:, None]
+        self.fastest = np.max(sizes["rate"], axis=-1)  # (S,) rad/s, W of all bodies
+        of_samples = _sample_bound(method, model, sizes)
+        self.of_samples = {name: x * converted for name, x in of_samples.items()}
+        between = {name: np.maximum(x[:count], x[-count:]) for name, x in sizes.items()}
+        of_torques = np.maximum(converted[:count], converted[-count:]) ** 4
+        self.of_step = {name: x * of_torques for name, x in step_bound(method, model, between, h, 1).items()}
+        self.of_totals = self._total_bounds(count)
+
+    def _total_bounds(self, count: int) -> dict[str, Array]:
+        """Bound the errors (count,) of energy [J] and angular momentum about the origin [kg m²/s].
+
+        Each is that of its sum, and what the moments do that rounding leaves in the equations of the joints,
+        as often as in a rate's bound: by their power; inner forces change no momentum, so that it is off by
+        these moments and the roundings of all bodies' rates.  Where a joint to the world has a moment about
+        the origin, it is off as all rates together.
+        """
+        kinetic, potential, sums, joint_terms, power = (
+            np.array([getattr(b, name) for b in self.bounds])
+            for name in (
+                "kinetic_energy",
+                "potential_energy",
+                "angular_momentum",
+                "joint_terms",
+                "joint_power",
+            )
+        )
+
+        def of_both_ends(x: Array) -> Array:
+            return np.asarray(np.maximum(x[:count], x[-count:]))
+
+        model, reach = self.model, np.linalg.norm(self.states_r, axis=-1)
+        share = ACCELERATION_FACTOR * self.h / np.maximum(self.middle_cosine, TINY) ** 4
+        energy, left = kinetic + potential + share * power, share * joint_terms
+        rates, own = self.of_step, np.zeros(count)
+        if _is_momentum_free(model):
+            rates = {name: of_both_ends(x) for name, x in self.of_samples.items()}
+            own = of_both_ends(left)
+        off = (model.mass * of_both_ends(reach) * rates["step_velocity"]).sum(-1)
+        off += rates["step_rate"] @ np.linalg.norm(model.inertia, axis=(1, 2))
+        return {"energy": of_both_ends(energy), "momentum": of_both_ends(sums) + own + off}
+
+    def mistake_ratios(self, model: Model, states: Sequence[State]) -> dict[str, float]:
+        """Compute what an engine with another mechanism would be off by, over what rounding explains.
+
+        Args:
+            model: the mechanism, with a mistake.
+            states: of the samples, in it.
+
+        Returns:
+            The largest by quantity of `RUN_UNITS`; of `run_mean` none.
+
+        """
+        charts = StepCharts(model, self.method, states)
+        q, v = charts.start()
+        ends = coordinates_after(charts, q, v, [self.h])
+        # the engine reports bodies of its mechanism at its coordinates, from which the declared step starts
+        declared = coordinates_after(self.charts, q, v, [self.h])
+        reported, true = charts.bodies(*ends), self.charts.bodies(*declared)
+        found = dict[str, float]()
+        for quantity, error in _body_differences(reported, true).items():
+            found[quantity.replace("step", "run")] = float(np.max(error / self.of_step[quantity]))
+        at_samples = _body_differences(charts.bodies(q, v), self.charts.bodies(q, v))
+        found["run_samples"] = max(float(np.max(x / self.of_samples[name])) for name, x in at_samples.items())
+        read = self.charts.bodies(*ends)
+        for name, bound in self.of_totals.items():
+            error = _sizes_of(getattr(read, name) - getattr(true, name))
+            found[f"run_{name}"] = float(np.max(error / np.maximum(bound, TINY)))
+        return found
+
+    def start_ratio(self, state: State) -> float:
+        """Compute by how much a first sample at another state would be off, over what rounding explains."""
+        off = _body_differences(state, self.states[0])
+        return max(float(np.max(x / (2 * self.of_samples[name][0]))) for name, x in off.items())
+
+
+def _directions(vectors: Array) -> Array:
+    """Unit vectors (..., 3); 0 of 0."""
+    size = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.asarray(vectors / np.where(size > 0, size, 1.0))
+
+
+def _is_momentum_free(model: Model) -> bool:
+    """Whether no joint to the world has a moment about the origin: balls and rods there, free bodies."""
+    roots = np.flatnonzero(model.body[: model.n, 0] < 0)
+    return not model.has_loops and all(
+        KINDS[model.kind[k]].holds_nothing or (model.kinds[k].is_spherical and not np.any(model.point[k, 0]))
+        for k in roots
+    )
+
+
+def _sizes_of(difference: Array) -> Array:
+    """Sizes (S,) of numbers (S,) or vectors (S, 3)."""
+    x = np.asarray(difference, float)
+    return np.asarray(np.abs(x) if x.ndim == 1 else np.linalg.norm(x, axis=-1))
+
+
+class RunSteps(StepsFromSamples):
     """Every step of a run: each of the engine's samples against the declared step from the one before.
 
     The step starts from the engine's own coordinates.  That they are those of the samples that it reports,
@@ -503,20 +726,11 @@ class RunSteps:
         """
         motion = run.trajectory
         assert motion.coordinates is not None and motion.velocities is not None
-        self.method, self.model, self.state, self.h, self.motion = method, model, state, h, motion
-        self.charts = StepCharts(model, method, [state], [run.angle_axes])
-        q, v = self.charts.divided(motion.coordinates, motion.velocities)
-        self.here = self.charts.bodies(q, v)
-        self.after = steps_in_charts(self.charts, [at[:-1] for at in q], v[:-1], [h], 1)[1]
-        rounded = self.here.rounded()
-        self.states = [State(**{name: x[i] for name, x in vars(rounded).items()}) for i in range(len(v))]
-        self.bounds = acceleration_bounds(method, model, self.states)
-        self.states_r, self.middle_cosine = rounded.r, self.charts.middle_cosine(q)
-        sizes = _sizes(rounded, self.bounds) | self.charts.coordinate_sizes(motion.coordinates)
-        at_rest = step_bound(method, model, sizes, 0.0, 0)
-        self.of_samples = {name: SAMPLE_FACTOR * np.maximum(x, TINY) for name, x in at_rest.items()}
-        between = {name: np.maximum(x[:-1], x[1:]) for name, x in sizes.items()}
-        self.of_step = step_bound(method, model, between, h, 1)
+        self.state, self.motion = state, motion
+        self.fastest_mode = np.nan  # 1/s, of the linearised equations along the run; of `compare`
+        charts = StepCharts(model, method, [state], [run.angle_axes])
+        count = len(motion.velocities) - 1
+        super().__init__(method, model, charts, motion.coordinates, motion.velocities, h, count)
 
     def compare(self) -> dict[str, StepDeviations]:
         """Compare every step.
@@ -539,65 +753,82 @@ class RunSteps:
             found[f"run_{name}"] = StepDeviations(
                 np.linalg.norm(difference, axis=-1), self.of_step[quantity], effects[name]
             )
-        kinetic, potential, momentum, moment = (
-            np.array([getattr(b, name) for b in bounds])
-            for name in ("kinetic_energy", "potential_energy", "angular_momentum", "joint_terms")
-        )
-        # momenta of bodies are not what joint-space engines compute: errors of rates add up in them
-        model, reach = self.model, np.linalg.norm(np.asarray(self.here.r[1:], float), axis=-1)
-        passed = (model.mass * reach * self.of_step["step_velocity"]).sum(-1)
-        passed += self.of_step["step_rate"] @ np.linalg.norm(model.inertia, axis=(1, 2))
-        energy, momentum = kinetic + potential, momentum + self.h * moment
-        for name, lost, size in (
-            ("energy", self.here.energy[1:] - self.after.energy, energy),
-            ("momentum", self.here.momentum[1:] - self.after.momentum, momentum),
-        ):
-            error = np.abs(lost) if lost.ndim == 1 else np.linalg.norm(np.asarray(lost, float), axis=-1)
-            largest = np.maximum(size[:-1], size[1:])[:, None]
-            largest = largest + (name == "momentum") * MOMENTUM_SHARE * passed[:, None]
+        for name in ("energy", "momentum"):
+            error = _sizes_of(getattr(self.here, name)[1:] - getattr(self.after, name))
+            parts = ("kinetic_energy", "potential_energy") if name == "energy" else ("angular_momentum",)
+            scale_of = np.array([sum(getattr(b, part) for part in parts) for b in bounds])
             found[f"run_{name}"] = StepDeviations(
-                np.asarray(error, float)[:, None], largest, size[1:, None] / (EPS * SUM_ROUNDING_FACTOR)
+                error[:, None],
+                self.of_totals[name][:, None],
+                scale_of[1:, None] / (EPS * SUM_ROUNDING_FACTOR),
             )
-        self._leave_out_coarse_steps(found)
+        left_out = self._left_out_steps()
+        found = {name: replace(x, left_out=left_out) for name, x in found.items()}
         found["run_mean"] = self._mean(off, found)
         found["run_samples"] = self._samples()
         return found
 
-    def _leave_out_coarse_steps(self, found: dict[str, StepDeviations]) -> None:
-        """Give no bound to steps that disagree where it does not hold.
+    def _left_out_steps(self) -> NDArray[np.str_]:
+        """Find the steps (steps,) for which no bound is given, and why; whether they agree plays no part.
 
         The step does not resolve the motion there, or bodies are far away against the mechanism's size, whose
-        positions are rounded, or angles are near the pose in which two of their axes are one.
+        positions are rounded, or angles are near the pose in which two of their axes are one: at a cosine
+        below `MIN_MIDDLE_COSINE`, or that a step changes by `MAX_COSINE_CHANGE` of itself.
+        The fastest rate is estimated at every `SAMPLE_STRIDE`-th sample and counts up to the next ones.
         """
-        wrong = np.any([np.any(~(x.ratios <= 1), axis=1) for x in found.values()], axis=0)
-        steps = np.flatnonzero(wrong)
-        if not len(steps):
-            return
-        ends = [self.states[n] for i in (0, 1) for n in steps + i]
+        some = _every_few(len(self.states))
         with np.errstate(all="ignore"):
-            rates = np.max(fastest_rates(self.model, ends).reshape(2, -1), axis=0)
+            rates = fastest_rates(self.model, [self.states[n] for n in some])
+        self.fastest_mode = float(np.max(rates))
+        # implicit steps divide by 1 − step × rate, and the rates may change between these samples
+        most = MAX_TURN / 2 if self.method.implicit_forces == "all" else MAX_TURN
+        fast = _spread(rates, some)[1:] * self.h > most
+        fast |= np.maximum(self.fastest[:-1], self.fastest[1:]) * self.h > most
         size = np.sum(stretched_length(self.model)) + np.max(np.linalg.norm(self.model.point, axis=2))
         far = np.max(np.linalg.norm(self.states_r, axis=-1), axis=-1) > MAX_DISTANCE * size
-        without = far | (self.middle_cosine < MIN_MIDDLE_COSINE)
-        left_out = (self.h * rates > MAX_TURN) | without[steps] | without[steps + 1]
-        for x in found.values():
-            x.bounds[steps[left_out]] = np.inf
+        cosine = self.middle_cosine
+        change = self.h * self.fastest / np.maximum(cosine, TINY)
+        singular = (cosine < 1) & ((cosine < MIN_MIDDLE_COSINE) | (change > MAX_COSINE_CHANGE * cosine))
+        reasons = (
+            (fast, f"step × fastest rate is above {most:g}"),
+            (far[:-1] | far[1:], f"a body is beyond {MAX_DISTANCE:g} sizes of the mechanism"),
+            (singular[:-1] | singular[1:], "an angle is too near its singular pose"),
+        )
+        return np.select([where for where, _ in reasons], [why for _, why in reasons], "")
 
     def _mean(self, off: dict[str, Array], found: dict[str, StepDeviations]) -> StepDeviations:
-        """Mean over the run of the deviations of rates along what the step changes, over what explains it.
+        """Mean over the run of the deviations of rates in one direction, over what explains it.
 
-        A mistake that is smaller than the rounding of one step has one direction in all of them.
+        A mistake that is smaller than the rounding of one step has one direction in all of them: that of what
+        the step changes (masses), of the rate (drag), or of an axis (of the world for velocities, as gravity
+        and forces; of the body for its rate, as moments).  What is rounded alike in all steps are constants.
+        In a bound of rates, 32 ε per joint: three constant rotations (of the joint in both bodies, of the
+        inertia's axes) of five roundings each, at most 16.  In 64 ε of each term of the equations: four
+        constant factors (a mass, two arms, an inertia), each off by at most three (stored, turned, summed),
+        12, at one stage of the three in `ACCELERATION_FACTOR`.  Chance is bounded with the probability
+        `MEAN_ALARM` by the empirical Bernstein inequality, from the sample variance and the largest deviation
+        (Maurer and Pontil, COLT 2009, theorem 4).
         """
-        before, means = self.here, list[Array]()
+        before, means, kept = self.here, list[Array](), ~found["run_rate"].is_left_out
+        n = np.count_nonzero(kept)
+        if n < 2:
+            none = np.zeros((1, self.model.n))
+            every = np.full_like(none, np.inf)
+            return StepDeviations(none, every, every, np.array(["no step has a bound"]))
+        often = np.log(4 / MEAN_ALARM)
         for name, field_name in (("rate", "omega"), ("velocity", "v")):
             change = np.asarray(getattr(self.after, field_name) - getattr(before, field_name)[:-1], float)
-            size = np.linalg.norm(change, axis=-1)
-            along = np.sum(off[f"step_{name}"] * change, -1) / np.where(size > 0, size, 1.0)
-            of_step, rounding = found[f"run_{name}"].bounds, self.of_samples[f"step_{name}"][:-1]
-            rounding = np.minimum(rounding / SAMPLE_FACTOR, of_step)
-            allowed = MEAN_ROUNDING * rounding + MEAN_ACCELERATION * (of_step - rounding)
-            allowed = np.mean(allowed + MEAN_SPREAD * of_step / np.sqrt(len(of_step)), axis=0)
-            means.append(np.abs(np.mean(along, axis=0)) / np.maximum(allowed, TINY))
+            own = np.asarray(getattr(before, field_name)[:-1], float)
+            deviations = off[f"step_{name}"][kept]
+            directed = [np.sum(deviations * x[kept], -1) for x in (_directions(change), _directions(own))]
+            along = np.stack([*directed, *np.moveaxis(deviations, -1, 0)], 1)  # (steps, 5, N)
+            of_step = found[f"run_{name}"].bounds[kept]
+            rounding = np.minimum(self.of_samples[f"step_{name}"][:-1][kept], of_step)
+            constant = CONSTANT_ROUNDINGS * rounding + CONSTANT_FACTORS * (of_step - rounding)
+            chance = np.std(along, axis=0, ddof=1) * np.sqrt(2 * often / n)
+            chance += 7 * 2 * np.max(np.abs(along), axis=0) * often / (3 * (n - 1))
+            allowed = np.mean(constant, axis=0) + chance
+            means += list(np.abs(np.mean(along, axis=0)) / np.maximum(allowed, TINY))
         mean = np.max(means, axis=0)[None]
         return StepDeviations(mean, np.ones_like(mean), np.full_like(mean, np.inf))
 
@@ -607,10 +838,9 @@ class RunSteps:
         count = np.arange(len(motion.t))
         off = _differences(self.here, motion, slice(None))
         ratios = [np.linalg.norm(x, axis=-1) / self.of_samples[name] for name, x in off.items()]
-        at_start = _differences(given, motion, 0)
-        for name, x in at_start.items():
+        for name, x in _differences(given, motion, 0).items():  # both are rounded
             ratios.append(np.zeros_like(ratios[0]))
-            ratios[-1][0] = np.linalg.norm(x, axis=-1) / self.of_samples[name][0]
+            ratios[-1][0] = np.linalg.norm(x, axis=-1) / (2 * self.of_samples[name][0])
         late = np.abs(motion.t - count * self.h)
         clock = late / (CLOCK_ROUNDINGS * EPS * self.h * (1 + count) ** 2)
         clock[-1] = np.inf if motion.steps != count[-1] else clock[-1]

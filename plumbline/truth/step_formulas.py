@@ -67,16 +67,34 @@ def steps_in_charts(
         singularity.
 
     """
-    method = tree.method
-    h = np.array(steps, LongDouble)[:, None] * LongDouble(method.step_factor) / method.substeps
     found = [tree.bodies(q, v)]
-    with np.errstate(all="ignore"):
-        for _ in range(count):
-            for _ in range(method.substeps):
-                tree.is_new_step = True
-                q, v = _STEPS[method.formula](tree, method, q, v, h)
+    for _ in range(count):
+        q, v = coordinates_after(tree, q, v, steps)
+        with np.errstate(all="ignore"):
             found.append(tree.bodies(q, v))
     return found
+
+
+def coordinates_after(
+    tree: StepCharts, q: Coordinates, v: Array, steps: Sequence[float]
+) -> tuple[Coordinates, Array]:
+    """Take one step of the declared method from coordinates.
+
+    Args:
+        v: (B, nv).
+        steps: B steps [s], or one.
+
+    Returns:
+        q and v after it; not finite where it leads into a singularity.
+
+    """
+    method = tree.method
+    h = np.array(steps, LongDouble)[:, None] * LongDouble(method.step_factor) / method.substeps
+    with np.errstate(all="ignore"):
+        for _ in range(method.substeps):
+            tree.is_new_step = True
+            q, v = _STEPS[method.formula](tree, method, q, v, h)
+    return q, v
 
 
 def fastest_rates(model: Model, states: Sequence[State], iterations: int = 12) -> Array:

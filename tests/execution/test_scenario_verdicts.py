@@ -160,3 +160,66 @@ def test_of_a_cell_whose_disagreements_are_all_recorded_only_the_scatter_is_meas
     (diagnosis,) = following
     *_, is_known = diagnosis.arguments
     assert diagnosis.key.kind == TaskKind.DIAGNOSIS and is_known is not searched
+
+
+def steps_of(bench, engine, integrator):
+    """The task of the steps of one integrator."""
+    (task,) = [
+        x
+        for x in bench.tasks()
+        if (x.key.kind, x.key.engine, x.key.integrator) == (TaskKind.STEP, engine, integrator)
+    ]
+    return task
+
+
+def two_of_a_family(has_all_studies, name="tumbling-rod"):
+    """A scenario whose family has a plainer one in the same run."""
+    chosen, other = loader.load_scenarios([name, "drag-rod"])
+    plan = Plan([chosen, other], ["mujoco"], random_state_count=1, has_all_studies=has_all_studies)
+    return plan, chosen
+
+
+@pytest.mark.parametrize("is_truth_first", [True, False])
+def test_a_study_of_low_order_is_left_to_the_night_where_steps_decide(engines, is_truth_first):
+    plan, chosen = two_of_a_family(has_all_studies=False)
+    assert plan.studied == {"single": "drag-rod"}
+    bench = ScenarioRun(plan, chosen, {"mujoco": engines["mujoco"]})
+    truth = next(x for x in bench.tasks() if x.key.kind == TaskKind.MOTION_TRUTH)
+    euler, rk4 = (outcome_of(steps_of(bench, "mujoco", name)) for name in ("Euler", "RK4"))
+    studies = []
+    for outcome in (outcome_of(truth), euler, rk4) if is_truth_first else (euler, rk4, outcome_of(truth)):
+        studies += [x.key.integrator for x in bench.on_outcome(outcome) if x.key.kind == TaskKind.TRAJECTORY]
+    assert studies == ["RK4"] and bench.left_to_the_night == 1
+    (row,) = [r for r in bench.findings().rows if (r.level, r.integrator) == ("trajectory", "Euler")]
+    assert row.verdict == "information" and "of this family the study of drag-rod runs" in row.reason
+
+
+def test_a_study_of_low_order_runs_where_its_limit_is_known_to_rounding(engines):
+    """A slow motion: tumbling-ball turns by 0.02 rad in the study's coarsest step, tumbling-rod by 0.07."""
+    plan, chosen = two_of_a_family(False, "tumbling-ball")
+    bench = ScenarioRun(plan, chosen, {"mujoco": engines["mujoco"]})
+    truth = next(x for x in bench.tasks() if x.key.kind == TaskKind.MOTION_TRUTH)
+    bench.on_outcome(outcome_of(truth))
+    steps = outcome_of(steps_of(bench, "mujoco", "Euler"))
+    (task,) = bench.on_outcome(steps)
+    assert (task.key.kind, task.key.integrator) == (TaskKind.TRAJECTORY, "Euler")
+
+
+def test_a_study_of_low_order_runs_where_steps_do_not_decide(engines):
+    plan, chosen = two_of_a_family(has_all_studies=False)
+    bench = ScenarioRun(plan, chosen, {"mujoco": engines["mujoco"]})
+    truth = next(x for x in bench.tasks() if x.key.kind == TaskKind.MOTION_TRUTH)
+    bench.on_outcome(outcome_of(truth))
+    lost = Outcome(steps_of(bench, "mujoco", "Euler").key, failure="crashed")
+    assert [x.key for x in bench.on_outcome(lost)] == [replace(lost.key, kind=TaskKind.TRAJECTORY)]
+    assert bench.left_to_the_night == 0
+
+
+def test_every_study_runs_at_night_and_on_the_plainest_scenario(engines):
+    for has_all_studies, name in ((True, "tumbling-rod"), (False, "drag-rod")):
+        plan, _ = two_of_a_family(has_all_studies)
+        (chosen,) = [s for s in plan.scenarios if s.name == name]
+        bench = ScenarioRun(plan, chosen, {"mujoco": engines["mujoco"]})
+        truth = next(x for x in bench.tasks() if x.key.kind == TaskKind.MOTION_TRUTH)
+        following = [x.key.integrator for x in bench.on_outcome(outcome_of(truth))]
+        assert following == ["Euler", "implicit", "implicitfast", "RK4"]
