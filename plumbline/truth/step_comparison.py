@@ -62,7 +62,6 @@ from plumbline.truth.step_formulas import (
     first_coordinate_acceleration,
     has_written_rows,
     joint_space_steps,
-    steps_in_charts,
 )
 
 STEP_ROUNDINGS = 32
@@ -339,31 +338,21 @@ def step_bound(
         By quantity the bounds (..., N), in its unit of `STEP_QUANTITIES`.
 
     """
-    rate, speed, turning, acceleration, torque = (
-        sizes[name] for name in ("rate", "speed", "angular_acceleration", "acceleration", "rod_torque")
+    rate, speed, turning, acceleration = (
+        sizes[name] for name in ("rate", "speed", "angular_acceleration", "acceleration")
     )
-    kinds, far = model.kind[: model.n], model.body[: model.n, 0]  # of the joints of the tree
-    path, slides = _paths(far), np.array([_slides(kind) for kind in kinds])
+    kinds, path = model.kind[: model.n], _paths(model.body[: model.n, 0])  # of the joints of the tree
     # an angle of x rad is rounded to ε |x|
     turned = ANGLE_ROUNDINGS * EPS * (sizes.get("turned", np.zeros(model.n)) @ path.T)
-    W, V, place = (np.max(np.where(path, x[..., None, :], 0.0), -1) for x in (rate, speed, sizes["place"]))
-    arm = path @ stretched_length(model) + place * bool(np.any(slides))
+    W, V = (np.max(np.where(path, x[..., None, :], 0.0), -1) for x in (rate, speed))
+    arm = _arms(model, sizes)
     links = [max(1, len(KINDS[kind].motions)) + KINDS[kind].holds_distance for kind in kinds]
     # Some engines normalise quaternions only beyond 1e-15; rotations have their lengths squared.
     stretched = np.minimum(sizes.get("stretched", np.zeros(model.n)), MAX_STRETCH)
     rounding = STEP_ROUNDINGS * EPS * (path @ np.array(links)) + 4 * (stretched @ path.T)
-    # Rates are kept relative to the link before: what rounding does to one link, and to the spin of a
-    # rod, reaches those beyond it once they have turned against it.
-    above, shifted = (
-        np.where(far >= 0, x[..., far], 0.0) for x in (turning, acceleration * (slides @ path > 0))
-    )
-    if method.coordinates == "joint rotations":
-        axial = method.rod_axial_inertia * np.trace(model.inertia, axis1=1, axis2=2)
-        # bodies on rods have inertia; of others there is no torque here
-        above = above + np.divide(torque, axial, out=np.zeros_like(torque), where=torque > 0)
-    leaked, passed = (count * np.minimum(1.0, h * W) * (x @ path.T) for x in (above, shifted))
-    omega = ACCELERATION_FACTOR * h * (turning + leaked) + rounding * W
-    velocity = ACCELERATION_FACTOR * h * (acceleration + leaked * arm + passed)
+    passed_on = _passed_on(method, model, sizes, h, count)
+    omega = ACCELERATION_FACTOR * h * (turning + passed_on["step_rate"]) + rounding * W
+    velocity = ACCELERATION_FACTOR * h * (acceleration + passed_on["step_velocity"])
     velocity += rounding * np.maximum(V, W * arm)
     free = np.array([KINDS[kind].holds_nothing for kind in kinds])
     if method.free_coordinates == "rigid motion":  # ṙ is kept in the body's axes, which turn
@@ -378,6 +367,36 @@ def step_bound(
         "step_attitude": count * h * omega + rounding + turned,
         "step_position": count * h * velocity + (rounding + turned) * arm,
     }
+
+
+def _arms(model: Model, sizes: dict[str, Array]) -> Array:
+    """Lengths (..., N) [m] from the world to each body."""
+    path, slides = _paths(model.body[: model.n, 0]), [_slides(kind) for kind in model.kind[: model.n]]
+    place = np.max(np.where(path, sizes["place"][..., None, :], 0.0), -1)
+    return np.asarray(path @ stretched_length(model) + place * any(slides))
+
+
+def _passed_on(
+    method: JointSpaceMethod, model: Model, sizes: dict[str, Array], h: float, count: int
+) -> dict[str, Array]:
+    """Bound the errors of accelerations (..., N) that relative rates pass on to the bodies beyond.
+
+    Rates are kept relative to the link before: what rounding does to one link, and to the spin of a rod,
+    reaches those beyond it once they have turned against it.
+    """
+    far = model.body[: model.n, 0]
+    path, slides = _paths(far), np.array([_slides(kind) for kind in model.kind[: model.n]])
+    W, torque = np.max(np.where(path, sizes["rate"][..., None, :], 0.0), -1), sizes["rod_torque"]
+    above, shifted = (
+        np.where(far >= 0, x[..., far], 0.0)
+        for x in (sizes["angular_acceleration"], sizes["acceleration"] * (slides @ path > 0))
+    )
+    if method.coordinates == "joint rotations":
+        axial = method.rod_axial_inertia * np.trace(model.inertia, axis1=1, axis2=2)
+        # bodies on rods have inertia; of others there is no torque here
+        above = above + np.divide(torque, axial, out=np.zeros_like(torque), where=torque > 0)
+    leaked, passed = (count * np.minimum(1.0, h * W) * (x @ path.T) for x in (above, shifted))
+    return {"step_rate": leaked, "step_velocity": leaked * _arms(model, sizes) + passed}
 
 
 def _sample_bound(method: JointSpaceMethod, model: Model, sizes: dict[str, Array]) -> dict[str, Array]:
@@ -471,7 +490,7 @@ def _slides(kind: Kind) -> bool:
     return KINDS[kind].is_unbounded
 
 
-def _pick(links: BodyStates, i: int) -> BodyStates:
+def _pick(links: BodyStates, i: int | slice) -> BodyStates:
     return BodyStates(*(getattr(links, name)[i] for name in BodyStates.__match_args__))
 
 
@@ -597,8 +616,11 @@ class StepsFromSamples:
         """
         self.method, self.model, self.h, self.charts = method, model, h, charts
         q, v = charts.divided(coordinates, velocities)
+        self.velocities = v
         self.here = charts.bodies(q, v)
-        self.after = steps_in_charts(charts, [at[:count] for at in q], v[:count], [h], 1)[1]
+        self.start = [at[:count] for at in q]
+        ends, self.declared = coordinates_after(charts, self.start, v[:count], [h])
+        self.after = charts.bodies(ends, self.declared)
         rounded = self.here.rounded()
         self.states = [State(**{name: x[i] for name, x in vars(rounded).items()}) for i in range(len(v))]
         self.bounds = acceleration_bounds(method, model, self.states)
@@ -613,15 +635,17 @@ class StepsFromSamples:
         between = {name: np.maximum(x[:count], x[-count:]) for name, x in sizes.items()}
         of_torques = np.maximum(converted[:count], converted[-count:]) ** 4
         self.of_step = {name: x * of_torques for name, x in step_bound(method, model, between, h, 1).items()}
-        self.of_totals = self._total_bounds(count)
+        self.is_of_one_pose = method.formula == "semi-implicit Euler" and method.implicit_forces != "all"
+        self.of_totals = self._total_bounds(count, between)
 
-    def _total_bounds(self, count: int) -> dict[str, Array]:
+    def _total_bounds(self, count: int, between: dict[str, Array]) -> dict[str, Array]:
         """Bound the errors (count,) of energy [J] and angular momentum about the origin [kg m²/s].
 
         Each is that of its sum, and what the moments do that rounding leaves in the equations of the joints,
         as often as in a rate's bound: by their power; inner forces change no momentum, so that it is off by
         these moments and the roundings of all bodies' rates.  Where a joint to the world has a moment about
-        the origin, it is off as all rates together.
+        the origin, it is off as all rates together.  The equations hold at one pose: in methods that use
+        those of several, or derivatives by the rates, what relative rates pass on changes both totals.
         """
         kinetic, potential, sums, joint_terms, power = (
             np.array([getattr(b, name) for b in self.bounds])
@@ -639,14 +663,18 @@ class StepsFromSamples:
 
         model, reach = self.model, np.linalg.norm(self.states_r, axis=-1)
         share = ACCELERATION_FACTOR * self.h / np.maximum(self.middle_cosine, TINY) ** 4
-        energy, left = kinetic + potential + share * power, share * joint_terms
+        energy, left = of_both_ends(kinetic + potential + share * power), of_both_ends(share * joint_terms)
+        reach, inertia = of_both_ends(reach), np.linalg.norm(model.inertia, axis=(1, 2))
+        passed_on = _passed_on(self.method, model, between, 0.0 if self.is_of_one_pose else self.h, 1)
+        passed_on = {name: of_both_ends(share)[:, None] * x for name, x in passed_on.items()}
+        energy += (model.mass * between["speed"] * passed_on["step_velocity"]).sum(-1)
+        energy += (between["rate"] * passed_on["step_rate"]) @ inertia
         rates, own = self.of_step, np.zeros(count)
         if _is_momentum_free(model):
-            rates = {name: of_both_ends(x) for name, x in self.of_samples.items()}
-            own = of_both_ends(left)
-        off = (model.mass * of_both_ends(reach) * rates["step_velocity"]).sum(-1)
-        off += rates["step_rate"] @ np.linalg.norm(model.inertia, axis=(1, 2))
-        return {"energy": of_both_ends(energy), "momentum": of_both_ends(sums) + own + off}
+            rates = {name: of_both_ends(self.of_samples[name]) + x for name, x in passed_on.items()}
+            own = left
+        off = (model.mass * reach * rates["step_velocity"]).sum(-1) + rates["step_rate"] @ inertia
+        return {"energy": energy, "momentum": of_both_ends(sums) + own + off}
 
     def mistake_ratios(self, model: Model, states: Sequence[State]) -> dict[str, float]:
         """Compute what an engine with another mechanism would be off by, over what rounding explains.
@@ -670,11 +698,29 @@ class StepsFromSamples:
             found[quantity.replace("step", "run")] = float(np.max(error / self.of_step[quantity]))
         at_samples = _body_differences(charts.bodies(q, v), self.charts.bodies(q, v))
         found["run_samples"] = max(float(np.max(x / self.of_samples[name])) for name, x in at_samples.items())
-        read = self.charts.bodies(*ends)
-        for name, bound in self.of_totals.items():
-            error = _sizes_of(getattr(read, name) - getattr(true, name))
-            found[f"run_{name}"] = float(np.max(error / np.maximum(bound, TINY)))
+        for name, error in self._total_errors(
+            q, ends[1], declared[1], self.charts.bodies(*ends), true
+        ).items():
+            found[f"run_{name}"] = float(np.max(error / np.maximum(self.of_totals[name], TINY)))
         return found
+
+    def _total_errors(
+        self, start: list[Array], rates: Array, declared: Array, read: BodyStates, true: BodyStates
+    ) -> dict[str, Array]:
+        """Differences (S,) of energy [J] and angular momentum [kg m²/s], within `_total_bounds`.
+
+        Where the equations of one pose make the step, the new rates count at that pose: at another, a
+        difference of relative rates that moves no body there moves those that have turned against each other.
+
+        Args:
+            start: coordinates at which the steps start.
+            rates: (S, nv) after them; ``declared``: by the formula.
+            read: the bodies after the steps; ``true``: by the formula.
+
+        """
+        if self.is_of_one_pose:
+            read, true = (self.charts.bodies(start, v) for v in (rates, declared))
+        return {name: _sizes_of(getattr(read, name) - getattr(true, name)) for name in self.of_totals}
 
     def start_ratio(self, state: State) -> float:
         """Compute by how much a first sample at another state would be off, over what rounding explains."""
@@ -753,8 +799,10 @@ class RunSteps(StepsFromSamples):
             found[f"run_{name}"] = StepDeviations(
                 np.linalg.norm(difference, axis=-1), self.of_step[quantity], effects[name]
             )
-        for name in ("energy", "momentum"):
-            error = _sizes_of(getattr(self.here, name)[1:] - getattr(self.after, name))
+        totals = self._total_errors(
+            self.start, self.velocities[1:], self.declared, _pick(self.here, slice(1, None)), self.after
+        )
+        for name, error in totals.items():
             parts = ("kinetic_energy", "potential_energy") if name == "energy" else ("angular_momentum",)
             scale_of = np.array([sum(getattr(b, part) for part in parts) for b in bounds])
             found[f"run_{name}"] = StepDeviations(

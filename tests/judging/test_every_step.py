@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from functools import cache
 from unittest.mock import patch
@@ -158,12 +159,26 @@ def random_mechanism(seed):
     return model, random_states(model, 1, seed)[0]
 
 
-@pytest.mark.parametrize("seed", [pytest.param(k, marks=SLOW * (k > 0)) for k in range(60)])
+def alarms(adapter, integrator, model, state):
+    rows = rows_of(adapter, integrator, model, [state])
+    return [r.reason for r in rows if r.verdict in (Verdict.DISAGREES, Verdict.FAILED)]
+
+
+# Of 300, from 60 on those at which aba loses digits, and of others the largest ratios.
+SEEDS = [*range(60), 82, 84, 132, 138, 148, 154, 166, 250, 286, 298]
+
+
+@pytest.mark.parametrize("seed", [pytest.param(k, marks=SLOW * (k > 0)) for k in SEEDS])
 def test_no_false_alarm_on_random_mechanisms(seed):
+    """Pinocchio's steps by aba lose digits on record: then those by crba and a dense solve have to agree."""
     model, state = random_mechanism(seed)
     for engine in ENGINES:
         adapter = load_adapter(engine)
         for integrator in [i for i in adapter.integrators if i.method is not None]:
-            rows = rows_of(adapter, integrator, model, [state])
-            alarms = [r.reason for r in rows if r.verdict in (Verdict.DISAGREES, Verdict.FAILED)]
-            assert not alarms, (seed, engine, integrator.name, alarms)
+            found = alarms(adapter, integrator, model, state)
+            if found and engine == "pinocchio":
+                own = sys.modules[type(adapter).__module__]
+                chain = own.PinocchioChain
+                with patch.object(own, "PinocchioChain", lambda model, _: chain(model, "crba")):  # noqa: B023
+                    found = alarms(adapter, integrator, model, state)
+            assert not found, (seed, engine, integrator.name, found)
