@@ -59,6 +59,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adapters.mujoco_surface import add_probes, surface_answer
+from adapters.mujoco_variants import (
+    HINGE_ANGLES,
+    HINGE_RATES,
+    HINGE_TURN,
+    HINGES,
+    VARIANTS,
+    Change,
+    is_constrained,
+)
 from plumbline.engines.metamorphic_hooks import MetamorphicHooks
 from plumbline.model import kinematics
 from plumbline.model.datatypes import (
@@ -176,6 +185,7 @@ class Mujoco(MetamorphicHooks):
         "solver, which has no formula; their limit is compared in motions"
     )
     welding_unsupported_reason = ""
+    variants = VARIANTS
 
     def version(self) -> str:
         """Return the version of the loaded library."""
@@ -183,17 +193,20 @@ class Mujoco(MetamorphicHooks):
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
         if self.is_soft(model):
-            soft = _SoftMechanism(model, self.option, self.body_pieces(model))
+            soft = _SoftMechanism(model, self.option, self.body_pieces(model), self._change)
             with _raise_on_warnings(soft.tree.d):
                 return [_rigid_limit(soft, state) for state in states]
-        chain = _MujocoChain(model, self.body_pieces(model), dense=self.option == DENSE)
+        chain = _MujocoChain(model, self.body_pieces(model), dense=self.option == DENSE, change=self._change)
         with _raise_on_warnings(chain.d):
             return [chain.quantities(state) for state in states]
 
     def is_soft(self, model: Model) -> bool:
         """Whether constraints hold it: loops, options of joints, pitches."""
-        has_pitch = any(kind.has_pitch for kind in model.kinds)
-        return model.has_loops or self.option in self.joint_options or has_pitch
+        return is_constrained(model) or self.option in self.joint_options
+
+    @property
+    def _change(self) -> Change:
+        return self.variant.change if self.variant else Change()
 
     def _surface(self, model: Model, states: Sequence[State]) -> list[SurfaceAnswer]:
         if self.is_soft(model):
@@ -297,8 +310,9 @@ class _MujocoChain:
         dense: bool = False,
         constraints: _Constraints | None = None,
         has_probes: bool = False,
+        change: Change = Change(),  # noqa: B008
     ) -> None:
-        spec = mujoco.MjSpec()
+        spec, self.change = mujoco.MjSpec(), change
         _compiler_options(spec).autolimits = False
         self.model, self.use_dense_solve = model, dense
         self.link_ids: list[int] = []
@@ -320,21 +334,24 @@ class _MujocoChain:
         _add_equalities(spec, links, constraints)
         if has_probes:
             add_probes(spec, links, model)
-        m = self.m = spec.compile()
+        m = change.describe(spec).compile()
         m.opt.gravity = model.gravity
         m.opt.disableflags = mujoco.mjtDisableBit.mjDSBL_CONTACT | _autoreset_flag()
         # After compiling: the compiler refuses massless bodies, and cannot adjust what it does not see.
         m.body_mass[:] = self.mass
-        m.body_inertia[:] = self.inertia
+        given = np.full(m.nbody, True) if not change.has_own_inertia else np.array(self.mass) == 0
+        m.body_inertia[given] = np.array(self.inertia)[given]
+        self.m = m
         self.effort = np.zeros(m.nv)
         self._set_elements()
-        d = self.d = mujoco.MjData(m)
+        d = mujoco.MjData(m)
         mujoco.mj_setConst(m, d)
         m.opt.tolerance, m.opt.solver = 0.0, mujoco.mjtSolver.mjSOL_NEWTON
         ties = constraints.ties
         m.tendon_length0[m.ntendon - len(ties) :] = [tie.length for tie in ties]
         # MuJoCo's own are of the reference pose, where free bodies are in one place
         m.tendon_invweight0[m.ntendon - len(ties) :] = [tie.softness for tie in ties]
+        m, d = self.m, self.d = change.remake(m, d)
         self.softness = tuple(np.copy(getattr(m, name)) for name in SOFTNESS)
         self.applied_wrenches = np.zeros((m.nbody, 6))
         self.applied_wrenches[self.link_ids, :3] = model.force
@@ -353,7 +370,8 @@ class _MujocoChain:
             pos, quat = (np.zeros(3), IDENTITY_QUATERNION) if kind.holds_nothing else (pos, quat)
             link = self._add_body(parent, pos, one.mass, *_principal_inertia(one.inertia), quat=quat)
             if kind.holds_nothing:
-                _set_attributes(link.add_joint(), type=mujoco.mjtJoint.mjJNT_FREE)
+                for joint in self.change.free_joints:
+                    _set_attributes(link.add_joint(), **joint)
             for what, axis in kind.motions:
                 along = kinematics.rotation_matrix(q_near)[:, axis]
                 _set_attributes(link.add_joint(), type=JOINT_TYPES[what], pos=near, axis=along)
@@ -378,8 +396,14 @@ class _MujocoChain:
             pos=pos, quat=quat, mass=1.0, inertia=np.ones(3), ipos=np.zeros(3), iquat=axes,
             explicitinertial=True,
         )  # fmt: skip
+        if mass and self.change.has_own_inertia:
+            turn = kinematics.rotation_matrix(axes)
+            J = turn * inertia @ turn.T
+            full = J[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+            _set_attributes(body, mass=mass, inertia=np.zeros(3), iquat=IDENTITY_QUATERNION, fullinertia=full)
         if joint is not None:
-            _set_attributes(body.add_joint(), type=mujoco.mjtJoint.mjJNT_BALL, pos=joint)
+            for one in self.change.ball_joints:
+                _set_attributes(body.add_joint(), pos=joint, **one)
             self.ball_ids.append(len(self.mass))
         self.mass.append(mass)
         self.inertia.append(inertia)
@@ -397,7 +421,8 @@ class _MujocoChain:
                 )
                 m.dof_armature[dofs], m.dof_damping[dofs] = model.armature[k, i], model.damping[k, i]
                 m.jnt_stiffness[joint], self.effort[dofs] = model.stiffness[k, i], model.effort[k, i]
-                m.qpos_spring[m.jnt_qposadr[joint] + np.arange(len(rest))] = rest
+                if model.stiffness[k, i]:
+                    m.qpos_spring[m.jnt_qposadr[joint] + np.arange(len(rest))] = rest
         springs = slice(len(model.spring_body))
         m.tendon_stiffness[springs], m.tendon_damping[springs] = model.spring_stiffness, model.spring_damping
         m.tendon_lengthspring[springs] = model.spring_length[:, None]
@@ -432,10 +457,12 @@ class _MujocoChain:
         first = m.body_jntadr[own]
         T = np.zeros((m.nv, E.shape[-1]))
         T[m.jnt_dofadr[first][:, None] + np.arange(3)] = E[own] - turn @ E[up]
-        mujoco.mj_resetData(m, d)
-        d.qpos[m.jnt_qposadr[first][:, None] + np.arange(4)] = kinematics.quaternion_product(
-            kinematics.quaternion_conjugate(q[up]), q[own]
-        )
+        self.change.reset(m, d)
+        relative = kinematics.quaternion_product(kinematics.quaternion_conjugate(q[up]), q[own])
+        if self.change.ball_joints is HINGES:
+            self._turn_hinges(relative, T)
+        else:
+            d.qpos[m.jnt_qposadr[first][:, None] + np.arange(4)] = relative
         for k, (b, rates) in enumerate(zip(self.link_ids, kinematics.own_rates(self.model), strict=True)):
             kind, count = self.model.kinds[k], rates.stop - rates.start
             if kind.holds_no_turn or kind.is_rigid:
@@ -448,12 +475,25 @@ class _MujocoChain:
         d.xfrc_applied, d.qfrc_applied = self.applied_wrenches, self.effort
         return np.asarray(T)
 
+    def _turn_hinges(self, relative: Array, T: Array) -> None:
+        """Set bodies on three hinges in place of a ball: the turn is the body's, the angles are constant."""
+        m, own = self.m, self.ball_ids
+        first = m.body_jntadr[own]
+        turn = kinematics.quaternion_product(relative, kinematics.quaternion_conjugate(HINGE_TURN))
+        before, near = kinematics.rotation_matrix(m.body_quat[own]), m.jnt_pos[first]
+        hang = m.body_pos[own] + np.matvec(before, near)
+        m.body_quat[own] = turn
+        m.body_pos[own] = hang - np.matvec(kinematics.rotation_matrix(turn), near)
+        self.d.qpos[m.jnt_qposadr[first][:, None] + np.arange(3)] = HINGE_ANGLES
+        rows = m.jnt_dofadr[first][:, None] + np.arange(3)
+        T[rows] = np.linalg.solve(HINGE_RATES, T[rows])
+
     def evaluate_forward(self, state: State) -> Array:
         """Evaluate the engine's forward dynamics, then declare its loads as applied ones; returns T."""
         m, d, link = self.m, self.d, self.link_ids
         T = self.set_state(state)
         m.opt.enableflags = mujoco.mjtEnableBit.mjENBL_ENERGY
-        mujoco.mj_forward(m, d)
+        self.change.forward(m, d)
         mujoco.mj_subtreeVel(m, d)
         if self.use_dense_solve:
             d.qacc = np.linalg.solve(_full_mass_matrix(m, d), d.qfrc_smooth + d.qfrc_constraint)
@@ -531,7 +571,13 @@ class _MujocoChain:
 class _SoftMechanism:
     """A mechanism that MuJoCo holds by soft constraints: loops closed, rods as ties, motions held."""
 
-    def __init__(self, model: Model, option: str, parts: BodyParts | None = None) -> None:
+    def __init__(
+        self,
+        model: Model,
+        option: str,
+        parts: BodyParts | None = None,
+        change: Change = Change(),  # noqa: B008
+    ) -> None:
         self.source, ties = model, list[_Tie]()
         self.rodless = rods_taken_out(model) if option == TENDONS else None
         rest = self.rodless.model if self.rodless else model
@@ -549,7 +595,7 @@ class _SoftMechanism:
         added = tuple(added_motions(self.opened, held))
         constraints = _Constraints(self.cut.ends if self.cut else (), added, pitches, tuple(ties))
         parts = None if self.cut else parts
-        self.tree = _MujocoChain(held, parts, option == DENSE, constraints)
+        self.tree = _MujocoChain(held, parts, option == DENSE, constraints, change=change)
 
     def state(self, state: State) -> State:
         """The state of the tree."""
@@ -605,11 +651,11 @@ def _rigid_limit(soft: _SoftMechanism, state: State) -> StateQuantities:
 
 def _three_limits(soft: _SoftMechanism, state: State, there: State, largest: float) -> list[dict[str, Array]]:
     """Extrapolate three sequences: rounding can spoil one, and is another in the next."""
-    found, refusals = list[dict[str, Array]](), list[Unsupported]()
+    found, refusals = list[dict[str, Array]](), list[Unsupported | EngineFailure]()
     for factor in SEQUENCES:
         try:
             found.append(_extrapolated(soft, state, there, factor * largest))
-        except Unsupported as refusal:
+        except (Unsupported, EngineFailure) as refusal:
             refusals.append(refusal)
         if len(found) == 3:
             return found

@@ -11,9 +11,10 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from copy import copy
 from dataclasses import dataclass, replace
 from operator import attrgetter
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from plumbline.engines.answers import (
     check_record,
     check_version,
 )
+from plumbline.engines.variants import Variant
 from plumbline.model.datatypes import (
     Array,
     BadInput,
@@ -120,6 +122,8 @@ class Adapter(ABC):
     moves_loops: ClassVar[bool] = False  # whether motions of mechanisms with loops are simulated
     loop_steps_unsupported_reason: ClassVar[str] = ""  # why single steps of such motions have no formula
     reproduction_template: ClassVar[str] = ""  # template of stand-alone scripts; without one there are none
+    variants: ClassVar[Sequence[Variant]] = ()  # other ways to ask the engine
+    variant: Variant | None = None  # the one in use
 
     @abstractmethod
     def version(self) -> str:
@@ -203,6 +207,12 @@ class Adapter(ABC):
         if not model.has_joint_moments:
             answers = [replace(answer, joint_moment=None) for answer in answers]
         return answers
+
+    def with_variant(self, variant: Variant) -> Self:
+        """Copy the adapter, set to one of its `variants`."""
+        other = copy(self)
+        other.variant = variant
+        return other
 
     def surface(self, model: Model, states: Sequence[State]) -> list[SurfaceAnswer]:
         """Evaluate what the engine reports besides the state quantities; errors are those of `evaluate`.

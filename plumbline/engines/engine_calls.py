@@ -7,7 +7,7 @@ in a local process, in another environment or on another machine.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass, field, replace
 from importlib import metadata
@@ -15,9 +15,10 @@ from io import StringIO
 
 import numpy as np
 
-from plumbline.engines.adapter import EngineInfo
+from plumbline.engines.adapter import Adapter, EngineInfo
 from plumbline.engines.environments import BASE_REQUIREMENTS, declared_attribute
 from plumbline.engines.registry import load_adapter
+from plumbline.engines.variants import VariantKind
 from plumbline.model.datatypes import (
     Array,
     Call,
@@ -51,6 +52,8 @@ class Evaluation:
     # what the engine reports besides: `SurfaceAnswer` with all of the first states in one array
     surface: SurfaceAnswer = field(default_factory=dict)
     surface_failure: str = ""  # what it did instead
+    # by kind and names of a variant the quantities at the first states, or what the engine did instead
+    variants: Mapping[VariantKind, Mapping[Call, list[StateQuantities] | str]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,6 +163,7 @@ def evaluate_states(engine: str, model: Model, states: Sequence[State]) -> Evalu
     except Exception as error:  # an engine may raise anything: its message belongs in the results
         failure = describe_exception(error)
     surface, surface_failure = dict[str, dict[Call, Array]](), ""
+    variants: dict[VariantKind, dict[Call, list[StateQuantities] | str]] = {}
     if quantities and not failure:
         try:
             surface = stack_answers(adapter.surface(model, states[:SURFACE_STATES]))
@@ -169,8 +173,34 @@ def evaluate_states(engine: str, model: Model, states: Sequence[State]) -> Evalu
             raise
         except Exception as error:  # as above
             surface_failure = describe_exception(error)
-    cpu_time = time.process_time() - begin
-    return Evaluation(quantities, unsupported, failure, cpu_time, gap, declared, surface, surface_failure)
+        variants = evaluate_variants(adapter, model, states[:SURFACE_STATES])
+    cpu_time, besides = time.process_time() - begin, (surface, surface_failure, variants)
+    return Evaluation(quantities, unsupported, failure, cpu_time, gap, declared, *besides)
+
+
+def evaluate_variants(
+    adapter: Adapter, model: Model, states: Sequence[State]
+) -> dict[VariantKind, dict[Call, list[StateQuantities] | str]]:
+    """Evaluate the state quantities by all variants of an engine that suit the mechanism.
+
+    Returns:
+        By kind and names the quantities, or the message of what the engine raised; refusals are left out.
+
+    """
+    found: dict[VariantKind, dict[Call, list[StateQuantities] | str]] = {}
+    for variant in adapter.variants:
+        if not variant.suits(model):
+            continue
+        by_names = found.setdefault(variant.kind, {})
+        try:
+            by_names[variant.names] = adapter.with_variant(variant).evaluate(model, states)
+        except Unsupported:
+            pass
+        except MemoryError:
+            raise
+        except Exception as error:  # as above
+            by_names[variant.names] = describe_exception(error)
+    return found
 
 
 def stack_answers(answers: Sequence[SurfaceAnswer]) -> dict[str, dict[Call, Array]]:

@@ -42,7 +42,7 @@ from plumbline.engines.declared_names import declared_integrators, declared_text
 from plumbline.engines.registry import ENGINES, IMPORTERS, USER_ENGINES
 from plumbline.importers.neutral_model import MODEL_UNITS
 from plumbline.judging.rows import Level, Row, Verdict
-from plumbline.judging.state_level import SINGULAR_POSE, STATE_UNITS
+from plumbline.judging.state_level import SINGULAR_POSE, STATE_UNITS, VARIANT_QUANTITIES
 from plumbline.measurements.relation_result import OTHER_FORMULATIONS, REPEATABILITY, UNEXPLAINED
 from plumbline.measurements.run_relations import REVERSED_IN_TIME
 from plumbline.measurements.state_relations import REDESCRIPTIONS, STATE_RELATIONS, WELDED_HALVES
@@ -526,6 +526,7 @@ def _quantities() -> set[str]:
         *STATE_UNITS,
         SINGULAR_POSE,
         *SURFACE_QUANTITIES,
+        *VARIANT_QUANTITIES,
         *MODEL_UNITS,
         *steps,
         *trajectory,

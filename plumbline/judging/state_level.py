@@ -6,10 +6,12 @@ The tolerance is `plumbline.truth.rounding_bound`; `MAX_RELATIVE_BOUND` limits h
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import get_args
 
 import numpy as np
 
 from plumbline.engines.engine_calls import Evaluation
+from plumbline.engines.variants import VariantKind
 from plumbline.judging.identity import state_fingerprints
 from plumbline.judging.rows import Columns, Deviation, JudgingResult, Row, RowContext, Verdict
 from plumbline.judging.surface_rows import judge_surface
@@ -28,6 +30,9 @@ STATE_UNITS = {
     "angular_momentum": "kg m²/s",
     "mass_matrix": "kg m²",
 }
+VARIANT_QUANTITIES = tuple(
+    f"{quantity}_by_{kind}" for kind in get_args(VariantKind) for quantity in STATE_UNITS
+)
 SINGULAR_POSE = "singular_pose"  # quantity of the row of an initial pose that is not compared
 TINY = float(np.finfo(float).tiny)  # replaces a bound of zero, so that an error of zero has the ratio 0
 
@@ -61,20 +66,68 @@ def judge_states(context: RowContext, truth: StateTruth, evaluation: Evaluation)
                 context.make_row("state", "-", quantity, Verdict.UNSUPPORTED, reason, unit, gap)
             )
             continue
-        deviation = _deviation(quantity, truth, evaluation)
-        worst, looseness = _worst_error_per_state(quantity, truth, deviation)
+        row, worst, deviation = _judge_quantity(context, quantity, truth, evaluation)
         names = {"scenario": context.scenario, "engine": context.engine, "quantity": quantity}
         result.tables.append(("states", names | worst))
-        row = _quantity_row(context, quantity, unit, worst, looseness, truth.method, evaluation.cpu_time)
-        if limit_error := float(np.max(_limit_errors(quantity, evaluation))):
-            share = f"; of it up to {limit_error:.2g} {unit} is the uncertainty of the engine's limit"
-            extra = row.extra | {"limit_error": limit_error}
-            row = replace(row, derivation=row.derivation + share, extra=extra)
         result.rows.append(row)
         if row.verdict == Verdict.DISAGREES:
             result.deviations[row.key] = deviation
     result.rows += judge_surface(context, truth, evaluation)
+    result.rows += judge_variants(context, truth, evaluation)
     return result
+
+
+def judge_variants(context: RowContext, truth: StateTruth, evaluation: Evaluation) -> list[Row]:
+    """Judge the state quantities of an engine by its variants, against the same truth.
+
+    Returns:
+        One row of the level surface per kind of variants and quantity, that of the variant which is off most;
+        one more per variant that failed.
+
+    """
+    rows = list[Row]()
+    for kind, answers in evaluation.variants.items():
+        found: dict[str, list[tuple[Row, str]]] = {}
+        for call, answer in answers.items():
+            names = ", ".join(call)
+            if isinstance(answer, str):
+                reason = f"by {names}: {answer}"
+                rows.append(context.make_row("surface", "-", "all", Verdict.FAILED, reason))
+                continue
+            first = slice(len(answer))
+            true = replace(truth, quantities=truth.quantities[first], bounds=truth.bounds[first])
+            other = replace(evaluation, quantities=answer)
+            for quantity in STATE_UNITS:
+                if (
+                    getattr(answer[0], quantity) is not None
+                    and getattr(true.quantities[0], quantity) is not None
+                ):
+                    row, _, _ = _judge_quantity(context, quantity, true, other)
+                    found.setdefault(quantity, []).append((row, names))
+        for quantity, judged in found.items():
+            judged.sort(key=lambda one: (one[0].verdict == Verdict.DISAGREES, one[0].ratio or 0.0))
+            row, names = judged[-1]
+            wrong = [by for one, by in judged[:-1] if one.verdict == Verdict.DISAGREES]
+            reason = f"by {names}: {row.reason}" + (f"; by {' and by '.join(wrong)} too" if wrong else "")
+            extra = row.extra | {"calls": float(len(judged))}
+            name = f"{quantity}_by_{kind}"
+            rows.append(replace(row, level="surface", quantity=name, reason=reason, extra=extra))
+    return rows
+
+
+def _judge_quantity(
+    context: RowContext, quantity: str, truth: StateTruth, evaluation: Evaluation
+) -> tuple[Row, Columns, Deviation]:
+    """The row of one quantity, per state the worst body, and the deviations."""
+    deviation = _deviation(quantity, truth, evaluation)
+    worst, looseness = _worst_error_per_state(quantity, truth, deviation)
+    unit = STATE_UNITS[quantity]
+    row = _quantity_row(context, quantity, unit, worst, looseness, truth.method, evaluation.cpu_time)
+    if limit_error := float(np.max(_limit_errors(quantity, evaluation))):
+        share = f"; of it up to {limit_error:.2g} {unit} is the uncertainty of the engine's limit"
+        extra = row.extra | {"limit_error": limit_error}
+        row = replace(row, derivation=row.derivation + share, extra=extra)
+    return row, worst, deviation
 
 
 def singular_pose_row(context: RowContext, value: float) -> Row:

@@ -9,43 +9,70 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
+from dataclasses import replace
 
 from plumbline.engines.engine_calls import SURFACE_STATES, Evaluation, evaluate_states
 from plumbline.engines.surface import SURFACES
-from plumbline.judging.rows import RowContext, Verdict
+from plumbline.judging.rows import Row, RowContext, Verdict
+from plumbline.judging.state_level import judge_variants
 from plumbline.judging.surface_rows import judge_surface
-from plumbline.model.datatypes import SurfaceAnswer
+from plumbline.measurements.state_relations import quantity_values
+from plumbline.model.datatypes import Call
 from plumbline.model.sampling import compared_states
 from plumbline.scenario.loader import load_scenarios
 from plumbline.truth.ground_truth import StateTruth, state_truth
 
 CHANGE = 1e-6  # relative
-MECHANISMS = ("rest", "double-rod-then-ball", "furuta", "sprung-slider-on-arm", "free-body-with-rotors")
+MECHANISMS = (
+    "rest", "double-rod-then-ball", "furuta", "sprung-slider-on-arm", "free-body-with-rotors",
+    "tree-of-seven", "universal-pendulum", "planar-top", "slider-crank",
+)  # fmt: skip
 _CONTEXT = RowContext("", "", "", "the engine", "")
 
 
-def exercised_names(truth: StateTruth, answer: SurfaceAnswer) -> dict[str, set[str]]:
-    """Change what each call returned, one call at a time, and see which rows turn red.
+def exercised_names(truth: StateTruth, evaluation: Evaluation) -> dict[str, set[str]]:
+    """Change what each call and each variant returned, one at a time, and see which rows turn red.
 
     Args:
         truth: with the truth of the surface.
-        answer: of the engine at the same states.
+        evaluation: of the engine at the same states.
 
     Returns:
         By name of the engine the quantities of these rows.
 
     """
     found = defaultdict[str, set[str]](set)
-    for quantity, calls in answer.items():
+    for quantity, calls in evaluation.surface.items():
         for call, value in calls.items():
-            before, after = (
-                judge_surface(_CONTEXT, truth, Evaluation([], None, None, 0.0, surface={quantity: {call: x}}))
+            rows = [
+                judge_surface(_CONTEXT, truth, replace(evaluation, surface={quantity: {call: x}}))
                 for x in (value, value * (1 + CHANGE))
-            )
-            if (before[0].verdict, after[0].verdict) == (Verdict.AGREES, Verdict.DISAGREES):
-                for name in call:
-                    found[name].add(quantity)
+            ]
+            _add_red_rows(found, call, *rows)
+    for kind, variants in evaluation.variants.items():
+        for call, answers in variants.items():
+            if isinstance(answers, str):
+                continue
+            changed = [
+                replace(one, **{q: getattr(one, q) * (1 + CHANGE) for q in quantity_values(one)})
+                for one in answers
+            ]
+            rows = [
+                judge_variants(_CONTEXT, truth, replace(evaluation, variants={kind: {call: x}}))
+                for x in (answers, changed)
+            ]
+            _add_red_rows(found, call, *rows)
     return found
+
+
+def _add_red_rows(found: dict[str, set[str]], call: Call, before: list[Row], after: list[Row]) -> None:
+    red = {
+        row.quantity
+        for was, row in zip(before, after, strict=True)
+        if (was.verdict, row.verdict) == (Verdict.AGREES, Verdict.DISAGREES)
+    }
+    for name in call if red else ():
+        found[name] |= red
 
 
 def main() -> None:
@@ -56,8 +83,8 @@ def main() -> None:
         states = compared_states(s.model, s.state, s.seed, SURFACE_STATES)[:SURFACE_STATES]
         truth = state_truth(s.model, states)
         for engine, names in found.items():
-            answer = evaluate_states(engine, s.model, states).surface
-            for name, quantities in exercised_names(truth, answer).items():
+            evaluation = evaluate_states(engine, s.model, states)
+            for name, quantities in exercised_names(truth, evaluation).items():
                 names[name] |= quantities
     written = {
         engine: {name: sorted(names[name]) for name in sorted(names)} for engine, names in found.items()

@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from plumbline.engines.engine_calls import Evaluation, evaluate_states, stack_answers
+from plumbline.engines.engine_calls import Evaluation, evaluate_states, evaluate_variants, stack_answers
 from plumbline.engines.registry import load_adapter
 from plumbline.engines.surface import SURFACES
 from plumbline.judging.rows import RowContext, Verdict
+from plumbline.judging.state_level import judge_variants
 from plumbline.judging.surface_rows import judge_surface
 from plumbline.model.random_mechanisms import random_tree
 from plumbline.model.sampling import random_states
@@ -49,7 +50,33 @@ def test_every_call_agrees_and_a_relative_change_of_1e_6_is_seen(engine, tree):
     found = verdicts(truth, answers)
     assert len(found) >= 10 and set(found.values()) == {Verdict.AGREES}, found
     calls = {name for by_call in answers.values() for call in by_call for name in call}
-    assert set(exercised_names(truth, answers)) == calls
+    evaluation = Evaluation([], None, None, 0.0, surface=answers)
+    assert set(exercised_names(truth, evaluation)) == calls
+
+
+def test_every_variant_agrees_and_a_relative_change_of_1e_6_is_seen(tree):
+    model, states, truth = tree
+    engine = "mujoco"
+    evaluation = Evaluation(
+        [], None, None, 0.0, variants=evaluate_variants(load_adapter(engine), model, states)
+    )
+    rows = judge_variants(WHO, truth, evaluation)
+    assert {row.verdict for row in rows} == {Verdict.AGREES}, [row.reason for row in rows]
+    names = {name for variants in evaluation.variants.values() for call in variants for name in call}
+    assert len(names) >= 5 and set(exercised_names(truth, evaluation)) == names
+
+
+def test_a_variant_that_fails_or_is_wrong_is_named(tree):
+    _, _, truth = tree
+    right = truth.quantities[:2]
+    wrong = [replace(one, acceleration=one.acceleration * 1.001) for one in right]
+    variants = {"option": {("a",): right, ("b", "c"): wrong, ("d",): "it crashed"}}
+    rows = judge_variants(WHO, truth, Evaluation([], None, None, 0.0, variants=variants))
+    bad = {row.quantity: row for row in rows if row.verdict != Verdict.AGREES}
+    assert set(bad) == {"all", "acceleration_by_option"} and len(rows) > 2
+    assert bad["all"].reason == "by d: it crashed" and bad["all"].verdict == Verdict.FAILED
+    reason = bad["acceleration_by_option"].reason
+    assert reason.startswith("by b, c: the acceleration of The engine is off by") and "too" not in reason
 
 
 def test_pinocchios_rates_of_composite_joints_disagree_and_nothing_else():

@@ -1,0 +1,26 @@
+"""Variants: other ways in which an engine is asked about the same mechanism at the same states.
+
+A variant is an option of the engine (a solver, another sequence of calls, data that are copied or used
+again) or a spelling of the mechanism (other joints, frames, forms of an inertia).  An adapter lists its own
+in one table; its build hook reads what each changes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from plumbline.model.datatypes import Call, Model
+
+VariantKind = Literal["option", "spelling"]
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One of them."""
+
+    kind: VariantKind
+    names: Call  # of the engine, that only this one uses
+    change: Any  # what the adapter's build does otherwise
+    suits: Callable[[Model], bool]  # the mechanisms that it is compared on
