@@ -18,7 +18,7 @@ import numpy as np
 from plumbline.engines.adapter import Adapter, EngineInfo
 from plumbline.engines.environments import BASE_REQUIREMENTS, declared_attribute
 from plumbline.engines.registry import load_adapter
-from plumbline.engines.variants import VariantKind
+from plumbline.engines.variants import NoAnswer, VariantKind
 from plumbline.model.datatypes import (
     Array,
     Call,
@@ -53,7 +53,9 @@ class Evaluation:
     surface: SurfaceAnswer = field(default_factory=dict)
     surface_failure: str = ""  # what it did instead
     # by kind and names of a variant the quantities at the first states, or what the engine did instead
-    variants: Mapping[VariantKind, Mapping[Call, list[StateQuantities] | str]] = field(default_factory=dict)
+    variants: Mapping[VariantKind, Mapping[Call, list[StateQuantities] | NoAnswer]] = field(
+        default_factory=dict
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +165,7 @@ def evaluate_states(engine: str, model: Model, states: Sequence[State]) -> Evalu
     except Exception as error:  # an engine may raise anything: its message belongs in the results
         failure = describe_exception(error)
     surface, surface_failure = dict[str, dict[Call, Array]](), ""
-    variants: dict[VariantKind, dict[Call, list[StateQuantities] | str]] = {}
+    variants: dict[VariantKind, dict[Call, list[StateQuantities] | NoAnswer]] = {}
     if quantities and not failure:
         try:
             surface = stack_answers(adapter.surface(model, states[:SURFACE_STATES]))
@@ -180,26 +182,26 @@ def evaluate_states(engine: str, model: Model, states: Sequence[State]) -> Evalu
 
 def evaluate_variants(
     adapter: Adapter, model: Model, states: Sequence[State]
-) -> dict[VariantKind, dict[Call, list[StateQuantities] | str]]:
+) -> dict[VariantKind, dict[Call, list[StateQuantities] | NoAnswer]]:
     """Evaluate the state quantities by all variants of an engine that suit the mechanism.
 
     Returns:
-        By kind and names the quantities, or the message of what the engine raised; refusals are left out.
+        By kind and names the quantities, or what the engine raised.
 
     """
-    found: dict[VariantKind, dict[Call, list[StateQuantities] | str]] = {}
+    found: dict[VariantKind, dict[Call, list[StateQuantities] | NoAnswer]] = {}
     for variant in adapter.variants:
         if not variant.suits(model):
             continue
         by_names = found.setdefault(variant.kind, {})
         try:
             by_names[variant.names] = adapter.with_variant(variant).evaluate(model, states)
-        except Unsupported:
-            pass
+        except Unsupported as refusal:
+            by_names[variant.names] = NoAnswer(str(refusal), is_refusal=True)
         except MemoryError:
             raise
         except Exception as error:  # as above
-            by_names[variant.names] = describe_exception(error)
+            by_names[variant.names] = NoAnswer(describe_exception(error), is_refusal=False)
     return found
 
 

@@ -24,3 +24,11 @@ class Variant:
     names: Call  # of the engine, that only this one uses
     change: Any  # what the adapter's build does otherwise
     suits: Callable[[Model], bool]  # the mechanisms that it is compared on
+
+
+@dataclass(frozen=True)
+class NoAnswer:
+    """What an engine did by a variant in place of an answer."""
+
+    message: str
+    is_refusal: bool  # by the engine or its adapter; else a failure

@@ -11,7 +11,7 @@ from typing import get_args
 import numpy as np
 
 from plumbline.engines.engine_calls import Evaluation
-from plumbline.engines.variants import VariantKind
+from plumbline.engines.variants import NoAnswer, VariantKind
 from plumbline.judging.identity import state_fingerprints
 from plumbline.judging.rows import Columns, Deviation, JudgingResult, Row, RowContext, Verdict
 from plumbline.judging.surface_rows import judge_surface
@@ -31,7 +31,7 @@ STATE_UNITS = {
     "mass_matrix": "kg m²",
 }
 VARIANT_QUANTITIES = tuple(
-    f"{quantity}_by_{kind}" for kind in get_args(VariantKind) for quantity in STATE_UNITS
+    f"{quantity}_by_{kind}" for kind in get_args(VariantKind) for quantity in ("all", *STATE_UNITS)
 )
 SINGULAR_POSE = "singular_pose"  # quantity of the row of an initial pose that is not compared
 TINY = float(np.finfo(float).tiny)  # replaces a bound of zero, so that an error of zero has the ratio 0
@@ -82,17 +82,17 @@ def judge_variants(context: RowContext, truth: StateTruth, evaluation: Evaluatio
 
     Returns:
         One row of the level surface per kind of variants and quantity, that of the variant which is off most;
-        one more per variant that failed.
+        one more per kind where variants failed or were refused.
 
     """
     rows = list[Row]()
     for kind, answers in evaluation.variants.items():
         found: dict[str, list[tuple[Row, str]]] = {}
+        missing = list[tuple[NoAnswer, str]]()
         for call, answer in answers.items():
             names = ", ".join(call)
-            if isinstance(answer, str):
-                reason = f"by {names}: {answer}"
-                rows.append(context.make_row("surface", "-", "all", Verdict.FAILED, reason))
+            if isinstance(answer, NoAnswer):
+                missing.append((answer, f"by {names}: {answer.message}"))
                 continue
             first = slice(len(answer))
             true = replace(truth, quantities=truth.quantities[first], bounds=truth.bounds[first])
@@ -112,6 +112,11 @@ def judge_variants(context: RowContext, truth: StateTruth, evaluation: Evaluatio
             extra = row.extra | {"calls": float(len(judged))}
             name = f"{quantity}_by_{kind}"
             rows.append(replace(row, level="surface", quantity=name, reason=reason, extra=extra))
+        if missing:  # refusals are shown too: what was not compared is no agreement
+            is_refused = all(answer.is_refusal for answer, _ in missing)
+            verdict = Verdict.INFORMATION if is_refused else Verdict.FAILED
+            reason = "; ".join(text for _, text in missing)
+            rows.append(context.make_row("surface", "-", f"all_by_{kind}", verdict, reason))
     return rows
 
 

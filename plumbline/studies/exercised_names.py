@@ -13,6 +13,7 @@ from dataclasses import replace
 
 from plumbline.engines.engine_calls import SURFACE_STATES, Evaluation, evaluate_states
 from plumbline.engines.surface import SURFACES
+from plumbline.engines.variants import NoAnswer
 from plumbline.judging.rows import Row, RowContext, Verdict
 from plumbline.judging.state_level import judge_variants
 from plumbline.judging.surface_rows import judge_surface
@@ -51,7 +52,7 @@ def exercised_names(truth: StateTruth, evaluation: Evaluation) -> dict[str, set[
             _add_red_rows(found, call, *rows)
     for kind, variants in evaluation.variants.items():
         for call, answers in variants.items():
-            if isinstance(answers, str):
+            if isinstance(answers, NoAnswer):
                 continue
             changed = [
                 replace(one, **{q: getattr(one, q) * (1 + CHANGE) for q in quantity_values(one)})

@@ -8,6 +8,7 @@ import pytest
 from plumbline.engines.engine_calls import Evaluation, evaluate_states, evaluate_variants, stack_answers
 from plumbline.engines.registry import load_adapter
 from plumbline.engines.surface import SURFACES
+from plumbline.engines.variants import NoAnswer
 from plumbline.judging.rows import RowContext, Verdict
 from plumbline.judging.state_level import judge_variants
 from plumbline.judging.surface_rows import judge_surface
@@ -70,11 +71,14 @@ def test_a_variant_that_fails_or_is_wrong_is_named(tree):
     _, _, truth = tree
     right = truth.quantities[:2]
     wrong = [replace(one, acceleration=one.acceleration * 1.001) for one in right]
-    variants = {"option": {("a",): right, ("b", "c"): wrong, ("d",): "it crashed"}}
+    variants = {"option": {("a",): right, ("b", "c"): wrong, ("d",): NoAnswer("it crashed", False)}}
+    variants["spelling"] = {("e",): NoAnswer("not so", True)}
     rows = judge_variants(WHO, truth, Evaluation([], None, None, 0.0, variants=variants))
     bad = {row.quantity: row for row in rows if row.verdict != Verdict.AGREES}
-    assert set(bad) == {"all", "acceleration_by_option"} and len(rows) > 2
-    assert bad["all"].reason == "by d: it crashed" and bad["all"].verdict == Verdict.FAILED
+    assert set(bad) == {"all_by_option", "acceleration_by_option", "all_by_spelling"} and len(rows) > 3
+    failed, refused = bad["all_by_option"], bad["all_by_spelling"]
+    assert (failed.verdict, failed.reason) == (Verdict.FAILED, "by d: it crashed")
+    assert (refused.verdict, refused.reason) == (Verdict.INFORMATION, "by e: not so")
     reason = bad["acceleration_by_option"].reason
     assert reason.startswith("by b, c: the acceleration of The engine is off by") and "too" not in reason
 
