@@ -91,6 +91,26 @@ def add_point_spring(mbs: Any, model: Model, i: int, markers: list[Any]) -> None
     )
 
 
+def written_items(mbs: Any) -> list[tuple[str, dict[str, Any]]]:
+    """Return the items of a system in the order of their numbers: kind, and parameters but for drawing."""
+    found = []
+    for kind in ("Node", "Object", "Marker", "Load", "Sensor"):
+        for i in range(getattr(mbs.systemData, f"NumberOf{kind}s")()):
+            item = getattr(mbs, f"Get{kind}")(i)
+            is_own = {k: k[0] != "V" and not k.endswith(("HT", "UserFunction")) for k in item}
+            found.append((kind, {k: _plain(value) for k, value in item.items() if is_own[k]}))
+    return found
+
+
+def _plain(value: Any) -> Any:
+    """Return lists and numbers in place of arrays and numbers of items."""
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, list | tuple):
+        return [_plain(each) for each in value]
+    return value if isinstance(value, bool | int | float | str) else int(value)
+
+
 @contextlib.contextmanager
 def initialized_solver(solver: Any, mbs: Any, settings: Any) -> Iterator[None]:
     """Initialise a solver for a single evaluation, and finalise it at the end.

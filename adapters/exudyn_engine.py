@@ -44,6 +44,7 @@ from adapters.exudyn_common import (
     run_solver,
     set_linear_solver,
     silence_engine,
+    written_items,
 )
 from adapters.exudyn_surface import Probes
 from plumbline.model.datatypes import (
@@ -324,6 +325,25 @@ class Exudyn(ExudynAdapter):
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
         with silence_engine():
             return [_evaluate_state(ExudynChain(model, at, self.body_pieces(model))) for at in states]
+
+    def written(self, model: Model, state: State) -> dict[str, Any]:
+        """Return the items of the assembled system, and what the read-out needs, of one state."""
+        with silence_engine():
+            chain = ExudynChain(model, state)
+            _, _, C = _system_matrices(chain)
+        used = np.flatnonzero(np.any(C != 0, axis=1))
+        if model.has_loops:
+            used = used[independent_rows(C[used])]
+        rates = np.zeros((0, 0)) if model.has_loops else _coordinate_rate_map(model, state)
+        fields = {"qdot": chain.qdot.ravel(), "p": state.p, "A": rotation_matrix(state.p), "used": used}
+        fields |= {"elastic": np.array(elastic_energy(model, state)), "joint_rates": rates}
+        fields |= {"gravity": model.gravity, "proximal": model.proximal, "near": model.body[:, 1]}
+        joints = [None if joint is None else int(joint) for joint in chain.joints]
+        pushes = [(k, int(item), is_push, axis.tolist()) for k, item, is_push, axis in chain.connectors]
+        parts = {"items": written_items(chain.mbs), "joints": joints, "pushes": pushes}
+        held = [chain.joint_rows(k) for k in range(len(joints))]
+        bodies = {"nodes": [*map(int, chain.nodes)], "bodies": [*map(int, chain.piece_bodies)], "held": held}
+        return parts | bodies | {"fields": fields}
 
     def _surface(self, model: Model, states: Sequence[State]) -> list[SurfaceAnswer]:
         found = list[SurfaceAnswer]()

@@ -48,7 +48,7 @@ for bit.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
 from types import MappingProxyType
@@ -200,6 +200,24 @@ class Mujoco(MetamorphicHooks):
         with _raise_on_warnings(chain.d):
             return [chain.quantities(state) for state in states]
 
+    def written(self, model: Model, state: State) -> dict[str, Any]:
+        """Return the MJCF, the numbers that it lacks, and what the read-out needs, of one state."""
+        soft = _SoftMechanism(model, "", has_text=True) if self.is_soft(model) else None
+        tree = soft.tree if soft else _MujocoChain(model, has_text=True)
+        there = soft.state(state) if soft else state
+        rates, loads = tree.set_state(there), ("proximal", "force", "moment", "drag_force", "drag_moment")
+        fields = {name: getattr(tree.d, name).copy() for name in ("qpos", "qvel", "qfrc_applied")}
+        fields |= {name: getattr(tree.model, name) for name in (*loads, "gravity")}
+        fields |= {"link": np.array(tree.link_ids), "joint_rates": rates}
+        if soft:
+            largest = _usable_regularisation(soft, state, there)
+            fields["scales"] = largest / RATIO ** np.arange(REGULARISATIONS)
+        place = soft.cut.place if soft and soft.cut else np.arange(len(model.kind))
+        fields |= {"bodies": place[: model.n], "joints": place}
+        return {"text": tree.text, "numbers": tree.numbers, "softness": SOFTNESS, "ratio": RATIO} | {
+            "fields": fields
+        }
+
     def is_soft(self, model: Model) -> bool:
         """Whether constraints hold it: loops, options of joints, pitches."""
         return is_constrained(model) or self.option in self.joint_options
@@ -311,6 +329,7 @@ class _MujocoChain:
         constraints: _Constraints | None = None,
         has_probes: bool = False,
         change: Change = Change(),  # noqa: B008
+        has_text: bool = False,
     ) -> None:
         spec, self.change = mujoco.MjSpec(), change
         _compiler_options(spec).autolimits = False
@@ -334,7 +353,8 @@ class _MujocoChain:
         _add_equalities(spec, links, constraints)
         if has_probes:
             add_probes(spec, links, model)
-        m = change.describe(spec).compile()
+        spec = change.describe(spec)
+        m = spec.compile()
         m.opt.gravity = model.gravity
         m.opt.disableflags = mujoco.mjtDisableBit.mjDSBL_CONTACT | _autoreset_flag()
         # After compiling: the compiler refuses massless bodies, and cannot adjust what it does not see.
@@ -344,9 +364,10 @@ class _MujocoChain:
         self.m = m
         self.effort = np.zeros(m.nv)
         self._set_elements()
+        m.opt.tolerance, m.opt.solver = 0.0, mujoco.mjtSolver.mjSOL_NEWTON
+        self.text, self.numbers = model_text(spec, m) if has_text else ("", {})
         d = mujoco.MjData(m)
         mujoco.mj_setConst(m, d)
-        m.opt.tolerance, m.opt.solver = 0.0, mujoco.mjtSolver.mjSOL_NEWTON
         ties = constraints.ties
         m.tendon_length0[m.ntendon - len(ties) :] = [tie.length for tie in ties]
         # MuJoCo's own are of the reference pose, where free bodies are in one place
@@ -577,6 +598,7 @@ class _SoftMechanism:
         option: str,
         parts: BodyParts | None = None,
         change: Change = Change(),  # noqa: B008
+        has_text: bool = False,
     ) -> None:
         self.source, ties = model, list[_Tie]()
         self.rodless = rods_taken_out(model) if option == TENDONS else None
@@ -595,7 +617,7 @@ class _SoftMechanism:
         added = tuple(added_motions(self.opened, held))
         constraints = _Constraints(self.cut.ends if self.cut else (), added, pitches, tuple(ties))
         parts = None if self.cut else parts
-        self.tree = _MujocoChain(held, parts, option == DENSE, constraints, change=change)
+        self.tree = _MujocoChain(held, parts, option == DENSE, constraints, change=change, has_text=has_text)
 
     def state(self, state: State) -> State:
         """The state of the tree."""
@@ -647,6 +669,15 @@ def _rigid_limit(soft: _SoftMechanism, state: State) -> StateQuantities:
     }
     values: dict[str, Any] = {name: x if x.ndim else float(x) for name, x in limits[0].items()}
     return StateQuantities(**values, limit_error=errors)
+
+
+def _usable_regularisation(soft: _SoftMechanism, state: State, there: State) -> float:
+    """Find the largest from which the answers can be extrapolated."""
+    for largest in LARGEST_REGULARISATIONS:
+        with suppress(Unsupported, EngineFailure):
+            _extrapolated(soft, state, there, largest)
+            return largest
+    raise Unsupported("no regularisation of MuJoCo's constraints can be extrapolated from")
 
 
 def _three_limits(soft: _SoftMechanism, state: State, there: State, largest: float) -> list[dict[str, Array]]:
@@ -793,6 +824,27 @@ def _raise_on_warnings(d: Any) -> Iterator[None]:
         mujoco.set_mju_user_warning(before)
     if texts or any(warning.number for warning in d.warning):
         raise EngineFailure(f"MuJoCo warned by t = {d.time:g} s: {texts[0] if texts else 'no text'}")
+
+
+def model_text(spec: Any, m: Any) -> tuple[str, dict[str, Any]]:
+    """Return a spec as MJCF, and the numbers of its compiled model that the text does not give.
+
+    Args:
+        m: compiled, and changed since then.
+
+    """
+    text = spec.to_xml()
+    other = mujoco.MjModel.from_xml_string(text)
+    numbers: dict[str, Any] = {}
+    for prefix, own, read in (("", m, other), ("opt.", m.opt, other.opt)):
+        for name in dir(own):
+            value = getattr(own, name)
+            is_input = name[0] != "_" and (name[-1] != "0" or name == "qpos0")  # others: by mj_setConst
+            if not is_input or not isinstance(value, int | float | np.ndarray):
+                continue
+            if not np.array_equal(value, getattr(read, name)):
+                numbers[prefix + name] = np.array(value)
+    return text, numbers
 
 
 # -- older versions ----------------------------------------------------------------------------------

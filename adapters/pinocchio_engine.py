@@ -84,7 +84,8 @@ from plumbline.model.step_methods import JointSpaceMethod, classical_runge_kutta
 from plumbline.model.welding import BodyParts, undivided_bodies
 
 ROD_AXIAL_INERTIA = 1 / 3  # of a rod about its own axis, over the trace of the inertia that it carries
-PROXIMAL_DAMPING, MAX_PROXIMAL_STEPS = 1e-8, 50  # of constraintDynamics: any damping from 1e-12 to 1e-3 does
+# Of constraintDynamics: accuracy, damping (any from 1e-12 to 1e-3 does), largest number of steps.
+PROXIMAL_SETTINGS = 1e-15, 1e-8, 50
 MAX_DENSE_JOINTS = 10  # joints up to which their 3 × 3 blocks are solved faster as one matrix
 JOINT_MODELS = {
     "turn": (pin.JointModelRX, pin.JointModelRY, pin.JointModelRZ),
@@ -390,7 +391,7 @@ class PinocchioChain:
         engine, data = self.pin_model, self.data
         push = torque + pin.nonLinearEffects(engine, data, q, v)
         push -= pin.rnea(engine, data, q, v, self.zero_torque, self.fext)
-        settings = pin.ProximalSettings(1e-15, PROXIMAL_DAMPING, MAX_PROXIMAL_STEPS)
+        settings = pin.ProximalSettings(*PROXIMAL_SETTINGS)
         a = pin.constraintDynamics(engine, data, q, v, push, self.welds, self.weld_data, settings).copy()
         for (b, c), solved in zip(self.ends, self.weld_data, strict=True):
             force = solved.contact_force  # on b, in the frame of b and c
@@ -474,6 +475,29 @@ class PinocchioChain:
             **energies_and_momentum(engine, data, q, v, elastic_energy(self.source_model, state)),
             mass_matrix=rates.T @ pin.crba(engine, data, q) @ rates,
         )
+
+    def written(self, state: State) -> dict[str, Any]:
+        """Return joints, bodies and welds, and the state with its loads and torques, as numbers."""
+        engine, model, (q, v) = self.pin_model, self.source_model, self.coordinates(state)
+        self.loads = list(self.constant_loads)
+        self._add_up_loads()
+        self.update_loads(q, v)
+        joints = []
+        for j in range(1, engine.njoints):
+            placement, inertia = _placed(engine.jointPlacements[j]), _numbers(engine.inertias[j])
+            joints.append((int(engine.parents[j]), _joint_call(engine.joints[j]), placement, inertia))
+        bodies = [(j, _placed(at)) for j, at in zip(self.body_joints, self.placements, strict=True)]
+        welds = [[bodies[k] for k in pair] for pair in self.ends]
+        fields = {"gravity": model.gravity, "q": q, "v": v, "torque": self.joint_torque(q, v)}
+        fields |= {"armature": engine.armature.copy(), "loads": np.array([f.vector for f in self.fext])}
+        fields |= {"elastic": np.array(elastic_energy(model, state)), "joint_rates": self.rate_map(state, q)}
+        place = np.arange(len(model.kind))
+        settings: dict[str, Any] = {"proximal": PROXIMAL_SETTINGS, "algorithm": self.algorithm}
+        parts = {"joints": joints, "bodies": bodies, "welds": welds}
+        reason = "scripts do not part the bodies that Pinocchio merges at a weld"
+        if any(kind.is_rigid for kind in model.kinds):
+            settings["missing"] = dict.fromkeys(("joint_reaction", "joint_moment"), reason)
+        return parts | settings | {"fields": fields | {"bodies": place[: model.n], "joints": place}}
 
     def rate_map(self, state: State, q: Float[Array, "nq"]) -> Float[Array, "nv nu"]:
         """Map ν = (udot of rods, ω′ of bodies or rates of joints) to the engine's velocity.
@@ -598,6 +622,24 @@ class PinocchioChain:
         return found
 
 
+def _placed(placement: pin.SE3) -> tuple[Array, Array]:
+    """Return rotation and translation of a placement."""
+    return placement.rotation.copy(), placement.translation.copy()
+
+
+def _numbers(inertia: pin.Inertia) -> tuple[float, Array, Array]:
+    return inertia.mass, inertia.lever.copy(), inertia.inertia.copy()
+
+
+def _joint_call(joint: Any) -> str:
+    """Return the call that makes a joint."""
+    own = joint.extract()
+    number = repr(own.pitch) if hasattr(own, "pitch") else ""
+    calls = [f"pin.{joint.shortname()}({number})"]
+    calls += [f".addJoint({_joint_call(part)})" for part in getattr(own, "joints", ())]
+    return "".join(calls)
+
+
 def _joint_turns(model: Model, k: int, x: Array) -> Array:
     """Return the quaternions (T, 4) of joint k at coordinates x (T, ≥ motions), its own axes."""
     turn = np.tile([1.0, 0.0, 0.0, 0.0], (len(x), 1))
@@ -671,6 +713,15 @@ class Pinocchio(PinocchioAdapter):
             return [cut.source_quantities(tree.quantities(cut.state(state))) for state in states]
         chain = PinocchioChain(model, self.option or self.usual_algorithm, self.body_pieces(model))
         return [chain.quantities(state) for state in states]
+
+    def written(self, model: Model, state: State) -> dict[str, Any]:
+        """Return the numbers of the engine's model at a state, see `PinocchioChain.written`."""
+        if not model.has_loops:
+            return PinocchioChain(model, self.usual_algorithm).written(state)
+        cut = cut_open(model)
+        found = PinocchioChain(cut.model, self.usual_algorithm, ends=cut.ends).written(cut.state(state))
+        found["fields"] |= {"bodies": cut.place[: model.n], "joints": cut.place}
+        return found
 
     def _surface(self, model: Model, states: Sequence[State]) -> list[SurfaceAnswer]:
         chain = PinocchioChain(model, self.usual_algorithm)

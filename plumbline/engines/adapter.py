@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass, replace
 from operator import attrgetter
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -207,6 +207,18 @@ class Adapter(ABC):
         if not model.has_joint_moments:
             answers = [replace(answer, joint_moment=None) for answer in answers]
         return answers
+
+    def written(self, model: Model, state: State) -> dict[str, Any]:
+        """Write what the engine itself holds of a mechanism at a state, for a stand-alone script.
+
+        Returns:
+            What the template of the engine's scripts takes; ``fields`` are its arrays by name.
+
+        Raises:
+            Unsupported: with a sentence that says what is missing.
+
+        """
+        raise Unsupported(f"the adapter of {self.title} writes no mechanisms for scripts")
 
     def with_variant(self, variant: Variant) -> Self:
         """Copy the adapter, set to one of its `variants`."""

@@ -182,7 +182,8 @@ class StateMeasure:
             return None
         offered = [q for q in self.quantities if getattr(answers, q) is not None]
         found, right = ({q: np.asarray(getattr(x, q), float) for q in offered} for x in (answers, truth))
-        bound = {q: np.asarray(allowed.tolerance(q), float) for q in offered}
+        uncertain = answers.limit_error or {}
+        bound = {q: np.asarray(allowed.tolerance(q), float) + uncertain.get(q, 0.0) for q in offered}
         ratio = _largest_ratio(found, right, bound)
         return StateEvidence(case, ratio, self.engine.name, right, bound, certified, self.variant)
 

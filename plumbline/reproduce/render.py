@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 import textwrap
+from dataclasses import replace
 from functools import cache, partial
 from itertools import pairwise
 from pathlib import Path
@@ -23,7 +24,7 @@ from plumbline.engines.environments import declared_attribute
 from plumbline.measurements.order_and_limit import ORDER_MARGIN
 from plumbline.measurements.relation_result import OPTION_PREFIX, OTHER_FORMULATIONS
 from plumbline.measurements.state_relations import WELDED_HALVES
-from plumbline.model.datatypes import Array, Model, State
+from plumbline.model.datatypes import Array, Model, State, Unsupported
 from plumbline.model.invariants import LONG_RUN_QUANTITIES
 from plumbline.model.kinematics import (
     quaternion_conjugate,
@@ -41,7 +42,6 @@ from plumbline.reproduce.measure import (
     StateEvidence,
     StepEvidence,
 )
-from plumbline.reproduce.shrink import ReproductionCase
 from plumbline.truth.step_comparison import CONSTRAINED_QUANTITIES, RUN_QUANTITIES
 
 TEMPLATES = Path(__file__).parent / "templates"
@@ -75,20 +75,33 @@ FIELD_COMMENTS = {  # of a chain's literals, in the order of the script
 }
 
 
-def render_script(row: dict[str, Any], evidence: Evidence) -> str:
+def render_script(row: dict[str, Any], evidence: Evidence, system: dict[str, Any] | None = None) -> str:
     """Render the script that shows a disagreement.
 
     Args:
+        system: what the engine holds of the mechanism at the state, by `Adapter.written`; None where the
+            script builds a chain of rods and balls itself.
         row: the stored row; its texts are written as escaped comments, whatever characters they hold.
         evidence: the shrunk case, with what is expected there.
 
+    Raises:
+        Unsupported: the script cannot show what is in dispute; the message is the reason.
+
     """
+    missing = system.get("missing", {}) if system else {}
+    shown = {q: x for q, x in evidence.expected.items() if q not in missing}
+    if evidence.expected and not shown:
+        raise Unsupported(missing[next(iter(evidence.expected))])
+    evidence = replace(evidence, expected=shown)
     try:
         version = Version(str(row["engine_version"]))
     except InvalidVersion:
         version = Version("9999")
     model, shows, variant = evidence.case.model, _KINDS[type(evidence)], getattr(evidence, "variant", "")
+    derived = {} if system else vars(evidence.case.state) | _derived_fields(model, evidence.case.state)
     context = {
+        "system": system,
+        "fields": system["fields"] if system else {**vars(model), **derived},
         "row": row,
         "evidence": evidence,
         "shows": shows,  # the template of what is compared
@@ -106,7 +119,7 @@ def render_script(row: dict[str, Any], evidence: Evidence) -> str:
         "margin": ORDER_MARGIN,
         "older": lambda than: version < Version(than),
     }
-    return _space_functions(_template(evidence.engine).render(context))
+    return _space_functions(_template(evidence.engine, "-system" if system else "").render(context))
 
 
 def no_script_reason(engine: str, row: dict[str, Any]) -> str:
@@ -142,12 +155,18 @@ def no_script_reason(engine: str, row: dict[str, Any]) -> str:
     return "" if is_known else f"scripts of {engine} cannot show {relation!r}"
 
 
+def is_at_state(row: dict[str, Any]) -> bool:
+    """Whether a row compares the usual answers of an engine at a state."""
+    return row["level"] == "state" or row["quantity"] in {*TRANSFORMS, *OTHER_FORMULATIONS}
+
+
 _KINDS: dict[type, str] = {StateEvidence: "state", MotionEvidence: "motion", StepEvidence: "step"}
 
 
-def _template(engine: str) -> Template:
+def _template(engine: str, of: str = "") -> Template:
     """The template that the engine's adapter names."""
-    return template_environment().get_template(f"{declared_attribute(engine, 'reproduction_template')}.py.j2")
+    name = f"{declared_attribute(engine, 'reproduction_template')}{of}.py.j2"
+    return template_environment().get_template(name)
 
 
 @cache
@@ -160,7 +179,8 @@ def template_environment() -> Environment:
         "ascii": ascii,
         "comment": _comment,
         "wrap": partial(textwrap.fill, width=LINE, break_long_words=False, break_on_hyphens=False),
-        "chain": _chain,
+        "namespace": _namespace,
+        "literal": lambda value: _literal(np.asarray(value)),
         "table": _table,
         "halves": _halves,
     }
@@ -187,14 +207,15 @@ def _space_functions(code: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _chain(case: ReproductionCase, name: str, code: str) -> str:
-    """Write the fields of a chain that the code uses."""
-    values = {**vars(case.model), **vars(case.state), **_derived_fields(case.model, case.state)}
-    used = [field for field in FIELD_COMMENTS if re.search(rf"\bc\.{field}\b", code)]
+def _namespace(values: dict[str, Array], name: str, code: str) -> str:
+    """Write the fields that the code uses."""
+    order = {**FIELD_COMMENTS, **values}
+    used = [field for field in order if field in values and re.search(rf"\bc\.{field}\b", code)]
     lines = []
     for f in used:
-        before, after = f"    {f}=np.array(", f"),  # {FIELD_COMMENTS[f]}"
-        lines.append(before + _literal(values[f], "    ", LINE - len(before + after)) + after)
+        comment = f"),  # {FIELD_COMMENTS[f]}" if f in FIELD_COMMENTS else "),"
+        before = f"    {f}=np.array("
+        lines.append(before + _literal(np.asarray(values[f]), "    ", LINE - len(before + comment)) + comment)
     return "\n".join([f"{name} = SimpleNamespace(", *lines, ")"])
 
 

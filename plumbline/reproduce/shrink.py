@@ -15,9 +15,9 @@ from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
-from plumbline.model.datatypes import Array, Model, State
+from plumbline.model.datatypes import JOINT_ELEMENTS, Array, Model, State
 from plumbline.model.equivalent import bodies_between
-from plumbline.model.kinematics import complete_state, state_from_minimal
+from plumbline.model.kinematics import complete_state
 from plumbline.processes.exceptions import PlumblineError
 
 CLEAR_RATIO = 10.0  # a shrunk case exceeds its tolerance this many times, or half as often as the original
@@ -63,8 +63,8 @@ class ReproductionCase:
     @property
     def content(self) -> tuple[object, ...]:
         """Every number of the case, hashable: equal for equal cases."""
-        state = (getattr(self.state, name) for name in ("p", "omega", "u", "udot"))
-        numbers = tuple(np.asarray(x).tobytes() for x in (*self.model.fields.values(), *state))
+        fields = (*self.model.fields.values(), *vars(self.state).values())
+        numbers = tuple(np.asarray(x).tobytes() for x in fields)
         return (*numbers, self.until, self.steps)
 
 
@@ -205,10 +205,10 @@ def _changed_once(change: _Change, case: ReproductionCase) -> Iterator[Reproduct
 
 def _changed(case: ReproductionCase, model: Model | None = None, **coordinates: Array) -> ReproductionCase:
     """Return a case with another model or other minimal coordinates, on its constraint manifold."""
-    new, state = model or case.model, case.state
-    given = {name: getattr(state, name) for name in ("p", "omega", "u", "udot")} | coordinates
-    given |= {name: given[name] * new.rods[:, None] for name in ("u", "udot")}
-    return replace(case, model=new, state=state_from_minimal(new, **given))
+    new, state = model or case.model, replace(case.state, **coordinates)
+    rods = new.rods[: new.n, None]
+    state = replace(state, u=state.u * rods, udot=state.udot * rods)
+    return replace(case, model=new, state=complete_state(new, state))
 
 
 def _with_fields(**make: Callable[[Array], Array]) -> _Change:
@@ -220,7 +220,8 @@ def _with_fields(**make: Callable[[Array], Array]) -> _Change:
 
 def _with_rates(make: Callable[[Array], Array]) -> _Change:
     """Change the rates of bodies and rods."""
-    return lambda case: _changed(case, omega=make(case.state.omega), udot=make(case.state.udot))
+    names = ("omega", "udot", "xdot", "v")
+    return lambda case: _changed(case, None, **{name: make(getattr(case.state, name)) for name in names})
 
 
 def _with_attitudes(*quaternions: list[float]) -> _Change:
@@ -244,6 +245,7 @@ def _simplifications(model: Model) -> Iterator[_Change]:
     numbers = [
         _with_fields(force=zero, moment=zero),
         _with_fields(drag_force=zero, drag_moment=zero),
+        *(_with_fields(**{name: zero}) for name in JOINT_ELEMENTS),
         _with_fields(gravity=lambda g: np.array([0.0, 0.0, -10.0])),
         *(
             _with_fields(**{name: lambda x: np.repeat(x[:1], len(x), 0)})
