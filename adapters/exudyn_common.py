@@ -91,24 +91,32 @@ def add_point_spring(mbs: Any, model: Model, i: int, markers: list[Any]) -> None
     )
 
 
-def written_items(mbs: Any) -> list[tuple[str, dict[str, Any]]]:
-    """Return the items of a system in the order of their numbers: kind, and parameters but for drawing."""
+def written_items(mbs: Any) -> list[tuple[str, dict[str, str]]]:
+    """Return the items of a system in the order of their numbers: kind, and parameters as code."""
     found = []
     for kind in ("Node", "Object", "Marker", "Load", "Sensor"):
         for i in range(getattr(mbs.systemData, f"NumberOf{kind}s")()):
             item = getattr(mbs, f"Get{kind}")(i)
-            is_own = {k: k[0] != "V" and not k.endswith(("HT", "UserFunction")) for k in item}
-            found.append((kind, {k: _plain(value) for k, value in item.items() if is_own[k]}))
+            own = [k for k in item if not k.startswith(("V", "temp"))]
+            own = [k for k in own if not k.endswith(("HT", "HTs", "UserFunction"))]
+            found.append((kind, {k: _code(item[k]) for k in own}))
     return found
 
 
-def _plain(value: Any) -> Any:
-    """Return lists and numbers in place of arrays and numbers of items."""
+def _code(value: Any) -> str:
+    """Return Python code of a parameter; numbers of items are integers."""
     if isinstance(value, np.ndarray):
-        return value.tolist()
+        return repr(value.tolist())
     if isinstance(value, list | tuple):
-        return [_plain(each) for each in value]
-    return value if isinstance(value, bool | int | float | str) else int(value)
+        return f"[{', '.join(map(_code, value))}]"
+    if isinstance(value, bool | int | float | str):
+        return repr(value)
+    kind = type(value).__name__
+    if kind in ("Vector3DList", "Matrix3DList"):
+        return f"exu.{kind}({_code([np.array(value[i]) for i in range(len(value))])})"
+    if kind == "MatrixContainer":
+        return _code(np.array(value.Convert2DenseMatrix()))
+    return f"exu.{value}" if hasattr(value, "__members__") else repr(int(value))
 
 
 @contextlib.contextmanager

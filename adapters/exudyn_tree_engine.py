@@ -48,6 +48,7 @@ from adapters.exudyn_common import (
     set_linear_solver,
     set_rk44,
     silence_engine,
+    written_items,
 )
 from plumbline.model.datatypes import (
     Array,
@@ -458,6 +459,18 @@ class ExudynTree(ExudynAdapter):
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
         with silence_engine():
             return [_evaluate_state(_KinematicTree(model, state)) for state in states]
+
+    def written(self, model: Model, state: State) -> dict[str, Any]:
+        """Return the items of the assembled system, and what the read-out needs, of one state."""
+        with silence_engine():
+            tree = _KinematicTree(model, state)
+            gravity = np.array(tree.mbs.GetObjectParameter(tree.tree, "gravity"))
+            found = written_items(tree.mbs)
+        fields = {"rates": tree.initial_angle_rates, "joint_rates": tree.linkage.W, "gravity": gravity}
+        fields |= {"frames": tree.body_axes_of_links, "A": tree.linkage.attitude, "mass": model.mass}
+        fields |= {"inertia": model.inertia, "elastic": np.array(elastic_energy(model, state))}
+        sensors = {str(output).split(".")[-1]: [*map(int, own)] for output, own in tree.sensors.items()}
+        return {"items": found, "sensors": sensors, "fields": fields}
 
     def _simulate(
         self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float

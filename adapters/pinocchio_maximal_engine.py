@@ -23,7 +23,7 @@ The option "inverse of the KKT matrix" solves the same rows with the engine's in
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import pinocchio as pin
@@ -38,10 +38,10 @@ from adapters.pinocchio_common import (
     point_acceleration,
     translation,
 )
-from plumbline.model.datatypes import Array, Model, State, StateQuantities, Unsupported
+from plumbline.model.datatypes import Array, Indices, Model, State, StateQuantities, Unsupported
 from plumbline.model.kinematics import JointFrame, joint_coordinates, rotation_matrix, velocity_jacobian
 from plumbline.model.loops import independent_rows
-from plumbline.model.welding import BodyParts
+from plumbline.model.welding import BodyParts, undivided_bodies
 
 MAX_BODIES = 30  # bodies; the engine's workspace grows with N³: 0.4 GB here, 1.5 GB at 50
 
@@ -72,40 +72,64 @@ class _FreeFlyerSystem:
             self.contacts.append(pin.RigidConstraintModel(kind, self.pin_model, *ends, frame))
             self.contact_data.append(self.contacts[-1].createData())
         self.data = self.pin_model.createData()
+        self.allowed = np.zeros((len(model.kind), 6))  # accelerations that the joints' rates cause
         init_constraint_dynamics(self.pin_model, self.data, self.contacts, self.contact_data)
 
-    def quantities(self, state: State) -> StateQuantities:
-        """Return all state quantities at one state."""
-        engine, data, model = self.pin_model, self.data, self.source_model
+    def _coordinates(self, state: State) -> tuple[Array, Array, Array, Array]:
+        """Return q, v and τ, and v of unit rates."""
+        model, turn = self.source_model, rotation_matrix(state.p)
         self.u, self.udot, self.x, self.xdot = joint_coordinates(model, state)
-        turn = rotation_matrix(state.p)
         local = np.matvec(turn.mT, state.v)
         q = np.hstack([state.r, np.roll(state.p, -1, axis=1)]).ravel()
         v = np.hstack([local, state.omega]).ravel()
         force = np.matvec(turn.mT, model.force) - model.drag_force[:, None] * local
         moment = model.moment - model.drag_moment[:, None] * state.omega
-        tau = np.hstack([force, moment]).ravel()
+        rates = velocity_jacobian(model, state)
+        rates.reshape(model.n, 6, -1)[:, :3] = turn.mT @ rates.reshape(model.n, 6, -1)[:, :3]
+        return q, v, np.hstack([force, moment]).ravel(), rates
+
+    def quantities(self, state: State) -> StateQuantities:
+        """Return all state quantities at one state."""
+        engine, data, model = self.pin_model, self.data, self.source_model
+        turn, (q, v, tau, rates) = rotation_matrix(state.p), self._coordinates(state)
         if self.use_kkt_inverse or model.has_loops or not all(kind.is_spherical for kind in model.kinds):
-            reaction, moment = self._solve_constraint_rows(state, q, v, tau)
+            reaction, moment, _ = self._solve_constraint_rows(state, q, v, tau)
         else:
             pin.constraintDynamics(engine, data, q, v, tau, self.contacts, self.contact_data)
             reaction = np.matvec(turn, [contact.contact_force.linear for contact in self.contact_data])
             moment = np.zeros_like(reaction)
         a = data.ddq.reshape(-1, 6)
-        w = velocity_jacobian(model, state)
-        w.reshape(model.n, 6, -1)[:, :3] = turn.mT @ w.reshape(model.n, 6, -1)[:, :3]
         inertia = pin.crba(engine, data, q)
         return StateQuantities(
-            acceleration=np.matvec(turn, a[:, :3] + np.cross(state.omega, local)),
+            acceleration=np.matvec(turn, a[:, :3] + np.cross(state.omega, v.reshape(-1, 6)[:, :3])),
             angular_acceleration=a[:, 3:].copy(),
             joint_reaction=reaction,
             joint_moment=moment,
-            mass_matrix=w.T @ inertia @ w,
+            mass_matrix=rates.T @ inertia @ rates,
             **energies_and_momentum(engine, data, q, v),
         )
 
-    def _solve_constraint_rows(self, state: State, q: Array, v: Array, tau: Array) -> tuple[Array, Array]:
-        """Solve with rows built here into ``data.ddq``; return the joints' forces and moments (N, 3)."""
+    def written(self, state: State) -> dict[str, Any]:
+        """Return bodies, joints' points and directions, and the state with its loads, as numbers."""
+        model = self.source_model
+        self.quantities(state)
+        q, v, tau, rates = self._coordinates(state)
+        kept = self._solve_constraint_rows(state, q, v, tau)[2]
+        fields = {"q": q, "v": v, "torque": tau, "joint_rates": rates, "kept": kept}
+        fields |= {"gravity": model.gravity, "omega": state.omega, "A": rotation_matrix(state.p)}
+        fields |= {"mass": model.mass, "inertia": model.inertia}
+        joints = []
+        for k, (kind, bodies) in enumerate(zip(model.kinds, model.body + 1, strict=True)):
+            bend = model.length[k] * self.udot[k] @ self.udot[k] if kind.holds_distance else 0.0
+            ends = list(zip(bodies.tolist(), model.point[k], strict=True))
+            joints.append((ends, self._held_directions(k, state), self.allowed[k], bend, kind.has_attitude))
+        uses_contacts = all(kind.is_spherical for kind in model.kinds) and not model.has_loops
+        return {"joints": joints, "contacts": uses_contacts, "fields": fields}
+
+    def _solve_constraint_rows(
+        self, state: State, q: Array, v: Array, tau: Array
+    ) -> tuple[Array, Array, Indices]:
+        """Solve with rows built here into ``data.ddq``; return forces, moments (N, 3) and rows used."""
         engine, data, model = self.pin_model, self.data, self.source_model
         pin.forwardKinematics(engine, data, q, v, np.zeros(engine.nv))
         pin.computeJointJacobians(engine, data, q)
@@ -134,7 +158,7 @@ class _FreeFlyerSystem:
             multiplier[kept] = data.lambda_c
         parts = np.split(multiplier, np.cumsum([len(held) for held in directions])[:-1])
         wrench = np.array([held.T @ part for held, part in zip(directions, parts, strict=True)])
-        return wrench[:, :3], wrench[:, 3:]
+        return wrench[:, :3], wrench[:, 3:], kept
 
     def _relative_motion(self, k: int, state: State) -> tuple[Array, Array]:
         """Jacobian (6, nv) of joint k, and its acceleration at v̇ = 0 less what allowed rates cause.
@@ -154,6 +178,7 @@ class _FreeFlyerSystem:
             for f in frames
         )  # fmt: skip
         jacobian, drift = j_near - j_far, drift_near - drift_far
+        self.allowed[k] = 0.0
         if model.kinds[k].has_attitude:
             return jacobian, drift
         placements = [data.oMf[f] for f in frames]
@@ -165,11 +190,11 @@ class _FreeFlyerSystem:
         joint = JointFrame(model, k, placements[1].rotation)
         for (_, along, about), rate in zip(joint.axes(self.x[k]), self.xdot[k], strict=False):
             if along is not None:
-                drift[:3] -= 2 * np.cross(spin, along * rate)
+                self.allowed[k, :3] += 2 * np.cross(spin, along * rate)
             if about is not None:
-                drift[3:] -= np.cross(carried, about * rate)
+                self.allowed[k, 3:] += np.cross(carried, about * rate)
                 carried = carried + about * rate
-        return jacobian, drift
+        return jacobian, drift - self.allowed[k]
 
     def _held_directions(self, k: int, state: State) -> Array:
         """Rows (c, 6) of the near point's velocity and of the angular velocity that joint k holds."""
@@ -211,6 +236,10 @@ class PinocchioMaximal(PinocchioAdapter):
     }
     builds_trees = True
     options = loop_options = ("inverse of the KKT matrix",)
+
+    def written(self, model: Model, state: State) -> dict[str, Any]:
+        """Return the numbers of the engine's model at a state, see `_FreeFlyerSystem.written`."""
+        return _FreeFlyerSystem(model, undivided_bodies(model)).written(state)
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
         if model.n > MAX_BODIES:

@@ -31,8 +31,19 @@ def case_of(scenario):
     return ReproductionCase(found.model, found.state)
 
 
-@pytest.mark.parametrize("engine", ["mujoco", "pinocchio", "exudyn"])
-@pytest.mark.parametrize("scenario", ["loaded-tree", "four-bar", "sprung-hinge"])
+THROUGHOUT = [
+    (engine, scenario)
+    for engine in ("mujoco", "pinocchio", "exudyn")
+    for scenario in ("loaded-tree", "four-bar", "sprung-hinge")
+]
+OTHERS = [
+    ("pinocchio-maximal", "loaded-tree"),
+    ("pinocchio-maximal", "four-bar"),
+    ("exudyn-tree", "sprung-hinge"),
+]
+
+
+@pytest.mark.parametrize(("engine", "scenario"), [*THROUGHOUT, *OTHERS])
 def test_a_script_gives_the_recorded_numbers(engine, scenario, tmp_path):
     """On a tree, on a loop and on a mechanism with springs, in a process that has no Plumbline."""
     case = case_of(scenario)
@@ -43,7 +54,7 @@ def test_a_script_gives_the_recorded_numbers(engine, scenario, tmp_path):
     script = render_script(stored_row(engine), replace(evidence, expected=recorded), system)
     assert "plumbline" not in script
     found = run_alone(script, tmp_path)
-    assert len(found) == len(recorded) - len(system.get("missing", ())) >= 6 and max(found) < 0.1
+    assert len(found) == len(recorded) - len(system.get("missing", ())) >= 5 and max(found) < 0.1
     other = {q: x * (1 + 1e-7) for q, x in recorded.items()}
     wrong = render_script(stored_row(engine), replace(evidence, expected=other), system)
     assert max(run_alone(wrong, tmp_path)) > 1
@@ -66,4 +77,4 @@ def test_what_a_script_cannot_show_is_a_sentence():
     with pytest.raises(Unsupported, match="merges at a weld"):
         render_script(row, evidence, write_mechanism("pinocchio", case.model, case.state))
     with pytest.raises(Unsupported, match="writes no mechanisms"):
-        write_mechanism("exudyn-tree", case.model, case.state)
+        write_mechanism("reference", case.model, case.state)
