@@ -97,7 +97,7 @@ def written_items(mbs: Any) -> list[tuple[str, dict[str, str]]]:
     for kind in ("Node", "Object", "Marker", "Load", "Sensor"):
         for i in range(getattr(mbs.systemData, f"NumberOf{kind}s")()):
             item = getattr(mbs, f"Get{kind}")(i)
-            own = [k for k in item if not k.startswith(("V", "temp"))]
+            own = [k for k in item if not k.startswith(("V", "temp", "name"))]
             own = [k for k in own if not k.endswith(("HT", "HTs", "UserFunction"))]
             found.append((kind, {k: _code(item[k]) for k in own}))
     return found

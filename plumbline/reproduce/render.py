@@ -74,6 +74,26 @@ FIELD_COMMENTS = {  # of a chain's literals, in the order of the script
     "unit_omega": "and of the bodies",
 }
 
+SYSTEM_COMMENTS = FIELD_COMMENTS | {  # of what an engine holds, where it is not a chain's literal
+    "q": "coordinates of the engine's joints",
+    "v": "their rates",
+    "torque": "N m or N, on them",
+    "loads": "N and N m, force and moment on each of the engine's joints, in its frame",
+    "joint_rates": "rates of the engine's coordinates at unit rates of the mechanism's",
+    "bodies": "which of the engine's bodies, for each of the mechanism's",
+    "joints": "which of the engine's joints",
+    "elastic": "J, energy of springs",
+    "unique": "projectors: the part of each joint's force and moment / arm that is unique",
+    "arm": "m",
+    "link": "MuJoCo's numbers of the bodies",
+    "scales": "of MuJoCo's own regularisation",
+    "qdot": "m/s and 1/s, rates of positions and quaternions",
+    "near": "the body that hangs by each joint",
+    "used": "rows of constraints that do not depend on others",
+    "rates": "of the engine's coordinates",
+    "frames": "rotations, engine's link to body",
+}
+
 
 def render_script(row: dict[str, Any], evidence: Evidence, system: dict[str, Any] | None = None) -> str:
     """Render the script that shows a disagreement.
@@ -101,6 +121,7 @@ def render_script(row: dict[str, Any], evidence: Evidence, system: dict[str, Any
     derived = {} if system else vars(evidence.case.state) | _derived_fields(model, evidence.case.state)
     context = {
         "system": system,
+        "comments": SYSTEM_COMMENTS if system else FIELD_COMMENTS,
         "fields": system["fields"] if system else {**vars(model), **derived},
         "row": row,
         "evidence": evidence,
@@ -207,15 +228,13 @@ def _space_functions(code: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _namespace(values: dict[str, Array], name: str, code: str) -> str:
+def _namespace(values: dict[str, Array], name: str, code: str, comments: dict[str, str]) -> str:
     """Write the fields that the code uses."""
-    order = {**FIELD_COMMENTS, **values}
-    used = [field for field in order if field in values and re.search(rf"\bc\.{field}\b", code)]
+    used = [f for f in {**comments, **values} if f in values and re.search(rf"\bc\.{f}\b", code)]
     lines = []
     for f in used:
-        comment = f"),  # {FIELD_COMMENTS[f]}" if f in FIELD_COMMENTS else "),"
-        before = f"    {f}=np.array("
-        lines.append(before + _literal(np.asarray(values[f]), "    ", LINE - len(before + comment)) + comment)
+        before, after = f"    {f}=np.array(", "),  # " + comments[f] if f in comments else "),"
+        lines.append(before + _literal(np.asarray(values[f]), "    ", LINE - len(before + after)) + after)
     return "\n".join([f"{name} = SimpleNamespace(", *lines, ")"])
 
 

@@ -1,6 +1,9 @@
 """Scripts of mechanisms that are no chains: what an engine holds, written out, gives the recorded numbers."""
 
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -31,6 +34,7 @@ def case_of(scenario):
     return ReproductionCase(found.model, found.state)
 
 
+ROOT, RUFF = Path(__file__).resolve().parents[2], Path(sys.executable).parent / "ruff"
 THROUGHOUT = [
     (engine, scenario)
     for engine in ("mujoco", "pinocchio", "exudyn")
@@ -54,6 +58,10 @@ def test_a_script_gives_the_recorded_numbers(engine, scenario, tmp_path):
     script = render_script(stored_row(engine), replace(evidence, expected=recorded), system)
     assert "plumbline" not in script
     found = run_alone(script, tmp_path)
+    for options in (["check", "--ignore", "D,E501"], ["format", "--diff"]):
+        command = [RUFF, *options, "--no-cache", "--config", ROOT / "pyproject.toml", tmp_path / "script.py"]
+        done = subprocess.run(command, capture_output=True, text=True)
+        assert done.returncode == 0, done.stdout
     assert len(found) == len(recorded) - len(system.get("missing", ())) >= 5 and max(found) < 0.1
     other = {q: x * (1 + 1e-7) for q, x in recorded.items()}
     wrong = render_script(stored_row(engine), replace(evidence, expected=other), system)
