@@ -482,18 +482,24 @@ class PinocchioChain:
         self.loads = list(self.constant_loads)
         self._add_up_loads()
         self.update_loads(q, v)
-        joints = []
-        for j in range(1, engine.njoints):
-            placement, inertia = _placed(engine.jointPlacements[j]), _numbers(engine.inertias[j])
-            joints.append((int(engine.parents[j]), _joint_call(engine.joints[j]), placement, inertia))
+        joints = [
+            (int(engine.parents[j]), _joint_call(engine.joints[j]), _placed(engine.jointPlacements[j]))
+            for j in range(1, engine.njoints)
+        ]
         bodies = [(j, _placed(at)) for j, at in zip(self.body_joints, self.placements, strict=True)]
+        masses = [
+            (*body, m, J) for body, m, J in zip(bodies, model.mass.tolist(), model.inertia, strict=True)
+        ]
+        for k in np.flatnonzero(model.rods[: model.n]).tolist():
+            axial = np.diag([0.0, 0.0, ROD_AXIAL_INERTIA * np.trace(model.inertia[k])])
+            masses.append((self.body_joints[k] - 1, (np.eye(3), np.zeros(3)), 0.0, axial))
         welds = [[bodies[k] for k in pair] for pair in self.ends]
         fields = {"gravity": model.gravity, "q": q, "v": v, "torque": self.joint_torque(q, v)}
         fields |= {"armature": engine.armature.copy(), "loads": np.array([f.vector for f in self.fext])}
         fields |= {"elastic": np.array(elastic_energy(model, state)), "joint_rates": self.rate_map(state, q)}
         place = np.arange(len(model.kind))
         settings: dict[str, Any] = {"proximal": PROXIMAL_SETTINGS, "algorithm": self.algorithm}
-        parts = {"joints": joints, "bodies": bodies, "welds": welds}
+        parts = {"joints": joints, "masses": masses, "bodies": bodies, "welds": welds}
         reason = "scripts do not part the bodies that Pinocchio merges at a weld"
         if any(kind.is_rigid for kind in model.kinds):
             settings["missing"] = dict.fromkeys(("joint_reaction", "joint_moment"), reason)
@@ -625,10 +631,6 @@ class PinocchioChain:
 def _placed(placement: pin.SE3) -> tuple[Array, Array]:
     """Return rotation and translation of a placement."""
     return placement.rotation.copy(), placement.translation.copy()
-
-
-def _numbers(inertia: pin.Inertia) -> tuple[float, Array, Array]:
-    return inertia.mass, inertia.lever.copy(), inertia.inertia.copy()
 
 
 def _joint_call(joint: Any) -> str:

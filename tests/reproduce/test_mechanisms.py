@@ -27,6 +27,10 @@ BIASED_PINOCCHIO = """import pinocchio
 real = pinocchio.crba
 pinocchio.crba = lambda *all: real(*all) * 1.0001
 """
+HEAVY_PINOCCHIO = """import pinocchio
+real = pinocchio.Inertia
+pinocchio.Inertia = lambda mass, *more: real(1.0001 * mass, *more)
+"""
 
 
 def case_of(scenario):
@@ -68,14 +72,15 @@ def test_a_script_gives_the_recorded_numbers(engine, scenario, tmp_path):
     assert max(run_alone(wrong, tmp_path)) > 1
 
 
-def test_a_defect_is_shown_by_the_script_of_a_smaller_tree(tmp_path):
+@pytest.mark.parametrize("lines", [BIASED_PINOCCHIO, HEAVY_PINOCCHIO], ids=["solution", "masses"])
+def test_a_defect_is_shown_by_the_script_of_a_smaller_tree(lines, tmp_path):
     case = case_of("loaded-tree")
     found = Disagreement(EngineClient("pinocchio"), "state", ("acceleration",), "-", case, 50.0, 2.0)
-    with defective(BIASED_PINOCCHIO):
+    with defective(lines):
         script, reason = make_script(found, stored_row("pinocchio", level="state"))
     assert script, reason
     assert script.count("model.addJoint(") < len(case.model.kind)
-    assert max(run_alone(script, tmp_path, before=BIASED_PINOCCHIO)) > 1
+    assert max(run_alone(script, tmp_path, before=lines)) > 1
     assert max(run_alone(script, tmp_path)) < 1
 
 
