@@ -11,7 +11,7 @@ from dataclasses import replace
 from itertools import combinations
 
 from plumbline.judging.rows import Deviation, Level, Row, Verdict
-from plumbline.judging.state_level import STATE_UNITS
+from plumbline.judging.state_level import STATE_UNITS, VARIANT_QUANTITIES
 from plumbline.model.invariants import LIMITS
 
 # What is compared with the truth; steps are with each method's formula, relations with the engine itself.
@@ -73,15 +73,21 @@ def doubt_truth(
         replace(
             row,
             verdict=Verdict.HARNESS_FAILED,
-            reason=doubtful[row.level, row.quantity],
+            reason=doubt,
             diagnosis="; ".join(filter(None, (row.reason, row.diagnosis))),
         )
-        if (row.level, row.quantity) in doubtful
+        if (doubt := doubtful.get(_truth_of(row)))
         and row.verdict == Verdict.DISAGREES
         and row.known_issue is None
         else row
         for row in rows
     ]
+
+
+def _truth_of(row: Row) -> tuple[str, str]:
+    """Level and quantity of the truth that a row is compared with."""
+    is_variant = row.level == "surface" and row.quantity in VARIANT_QUANTITIES
+    return ("state", VARIANT_QUANTITIES[row.quantity]) if is_variant else (row.level, row.quantity)
 
 
 def _describe_doubt(rows: Sequence[Row], are_alike: bool) -> str:

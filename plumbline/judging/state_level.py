@@ -30,9 +30,9 @@ STATE_UNITS = {
     "angular_momentum": "kg m²/s",
     "mass_matrix": "kg m²",
 }
-VARIANT_QUANTITIES = tuple(
-    f"{quantity}_by_{kind}" for kind in get_args(VariantKind) for quantity in ("all", *STATE_UNITS)
-)
+VARIANT_QUANTITIES = {  # and the quantity whose truth is theirs
+    f"{quantity}_by_{kind}": quantity for kind in get_args(VariantKind) for quantity in ("all", *STATE_UNITS)
+}
 SINGULAR_POSE = "singular_pose"  # quantity of the row of an initial pose that is not compared
 TINY = float(np.finfo(float).tiny)  # replaces a bound of zero, so that an error of zero has the ratio 0
 

@@ -103,7 +103,8 @@ def test_engines_agree_on_mechanisms_that_cannot_move(name, engine):
     states = compared_states(s.model, s.state, s.seed, 3)
     truth, answer = state_truth(s.model, states), evaluate_states(engine, s.model, states)
     rows = judge_states(RowContext(name, "own", engine, engine, "1"), truth, answer).rows
-    assert {row.verdict for row in rows} == {"agrees"} and len(rows) == 7
+    assert {row.verdict for row in rows if row.level == "surface"} <= {"agrees"}
+    assert [row.verdict for row in rows if row.level == "state"] == ["agrees"] * 7
 
 
 def test_rates_that_almost_fit_are_set_to_zero_and_others_are_refused():
