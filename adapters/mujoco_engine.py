@@ -616,7 +616,7 @@ class _SoftMechanism:
         pitches = tuple(float(length) if kind.has_pitch else 0.0 for kind, length in pairs)
         added = tuple(added_motions(self.opened, held))
         constraints = _Constraints(self.cut.ends if self.cut else (), added, pitches, tuple(ties))
-        parts = None if self.cut else parts
+        parts = None if self.cut or self.rodless else parts  # whose bodies are in another order
         self.tree = _MujocoChain(held, parts, option == DENSE, constraints, change=change, has_text=has_text)
 
     def state(self, state: State) -> State:

@@ -17,6 +17,7 @@ from plumbline.model.sampling import random_states
 from plumbline.truth.rounding_bound import state_rounding_bound
 from tests.helpers import engine_process as worker
 from tests.helpers import newton_euler, pendulums
+from tests.helpers.catalogue import catalogue_scenarios
 from tests.helpers.refinement import extrapolated, observed_orders
 
 pytest.importorskip("mujoco")
@@ -175,6 +176,11 @@ def test_equalities_in_place_of_joints_give_the_same_answers(option, seed):
     for model, at in ((loop, state), (tree, *random_states(tree, 1, seed))):
         at = at_rest(model, at) if option == "tendon equalities" else at
         assert worst_ratio(model, at, option) <= 1
+
+
+def test_bodies_that_come_in_another_order_without_rods_keep_their_masses():
+    scenario = catalogue_scenarios()["tree-of-seven"]
+    assert worst_ratio(scenario.model, at_rest(scenario.model, scenario.state), "tendon equalities") <= 1
 
 
 def test_a_tendon_at_a_wrong_point_is_seen():
