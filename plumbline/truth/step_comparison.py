@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from plumbline.equations.arithmetic import floats
 from plumbline.equations.tree import Tree
-from plumbline.model.datatypes import KINDS, Array, Kind, Model, State, StepRun, Trajectory
+from plumbline.model.datatypes import KINDS, Array, Model, State, StepRun, Trajectory
 from plumbline.model.kinematics import (
     angular_velocity,
     complete_state,
@@ -371,7 +371,7 @@ def step_bound(
 
 def _arms(model: Model, sizes: dict[str, Array]) -> Array:
     """Lengths (..., N) [m] from the world to each body."""
-    path, slides = _paths(model.body[: model.n, 0]), [_slides(kind) for kind in model.kind[: model.n]]
+    path, slides = _paths(model.body[: model.n, 0]), [kind.is_unbounded for kind in model.kinds[: model.n]]
     place = np.max(np.where(path, sizes["place"][..., None, :], 0.0), -1)
     return np.asarray(path @ stretched_length(model) + place * any(slides))
 
@@ -385,7 +385,7 @@ def _passed_on(
     reaches those beyond it once they have turned against it.
     """
     far = model.body[: model.n, 0]
-    path, slides = _paths(far), np.array([_slides(kind) for kind in model.kind[: model.n]])
+    path, slides = _paths(far), np.array([kind.is_unbounded for kind in model.kinds[: model.n]])
     W, torque = np.max(np.where(path, sizes["rate"][..., None, :], 0.0), -1), sizes["rod_torque"]
     above, shifted = (
         np.where(far >= 0, x[..., far], 0.0)
@@ -484,10 +484,6 @@ def _paths(far: NDArray[np.intp]) -> NDArray[np.bool_]:
     for k, above in enumerate(far):
         path[k] |= path[above] & (above >= 0)
     return path
-
-
-def _slides(kind: Kind) -> bool:
-    return KINDS[kind].is_unbounded
 
 
 def _pick(links: BodyStates, i: int | slice) -> BodyStates:
