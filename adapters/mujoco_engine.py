@@ -683,10 +683,12 @@ def _usable_regularisation(soft: _SoftMechanism, state: State, there: State) -> 
 def _three_limits(soft: _SoftMechanism, state: State, there: State, largest: float) -> list[dict[str, Array]]:
     """Extrapolate three sequences: rounding can spoil one, and is another in the next."""
     found, refusals = list[dict[str, Array]](), list[Unsupported | EngineFailure]()
+    # An option's solver may lose digits in one sequence; of MuJoCo's own way a wrong order is a failure.
+    lost = Unsupported if soft.tree.change == Change() else (Unsupported, EngineFailure)
     for factor in SEQUENCES:
         try:
             found.append(_extrapolated(soft, state, there, factor * largest))
-        except (Unsupported, EngineFailure) as refusal:
+        except lost as refusal:
             refusals.append(refusal)
         if len(found) == 3:
             return found
