@@ -22,6 +22,7 @@ from plumbline.model.datatypes import Array, Call, Float, Model, Unsupported
 from plumbline.model.kinematics import quaternion_conjugate, quaternion_product, rotation_matrix
 
 HINGE_ANGLES = np.array([0.4, -0.7, 1.1])  # rad, about x, y, z in turn: far from singular ones
+ROUNDING = 1e-12  # of principal moments that an engine finds by itself
 FRAME_POINT, FRAME_TURN = np.array([0.3, -0.2, 0.5]), np.array([1.0, 2.0, 3.0, 4.0]) / np.sqrt(30.0)
 
 
@@ -182,16 +183,13 @@ def _oriented(kind: str, field: str, convert: Callable[[Array], Array]) -> Calla
     return describe
 
 
-def _euler_angles(q: Float[Array, "4"]) -> Float[Array, "3"]:
-    """Angles about x, y, z in turn, intrinsic."""
+def euler_angles(q: Float[Array, "4"]) -> Float[Array, "3"]:
+    """Angles about x, y, z in turn, intrinsic; exact at quarter turns about y, too, where the first may be any."""
     R = rotation_matrix(q / np.linalg.norm(q))
-    return np.array(
-        [
-            np.arctan2(-R[1, 2], R[2, 2]),
-            np.arctan2(R[0, 2], np.hypot(R[0, 0], R[0, 1])),
-            np.arctan2(-R[0, 1], R[0, 0]),
-        ]
-    )
+    first = np.arctan2(-R[1, 2], R[2, 2])
+    c, s = np.cos(first), np.sin(first)
+    rest = np.array([[1, 0, 0], [0, c, s], [0, -s, c]]) @ R  # the turns about y and z
+    return np.array([first, np.arctan2(rest[0, 2], rest[2, 2]), np.arctan2(rest[1, 0], rest[1, 1])])
 
 
 def _axis_angle(q: Float[Array, "4"]) -> Float[Array, "4"]:
@@ -212,8 +210,10 @@ def _has_free_balls(model: Model) -> bool:
 
 
 def _has_inertia(model: Model) -> bool:
-    """Whether no body is a point mass, whose inertia MuJoCo's compiler refuses."""
-    return _is_free(model) and not model.lacks_inertia
+    """Whether no body is a point mass or flat to rounding, whose full inertia MuJoCo's compiler refuses."""
+    moments = np.linalg.eigvalsh(model.inertia)
+    is_flat = moments[:, 2] >= (1 - ROUNDING) * (moments[:, 0] + moments[:, 1])
+    return _is_free(model) and not np.any(is_flat)
 
 
 def _has_free_bodies(model: Model) -> bool:
@@ -253,7 +253,7 @@ VARIANTS = (
     _free(
         "spelling",
         ("mjtOrientation.mjORIENTATION_EULER", "MjsOrientation"),
-        describe=_oriented("EULER", "euler", _euler_angles),
+        describe=_oriented("EULER", "euler", euler_angles),
     ),
     _free(
         "spelling",

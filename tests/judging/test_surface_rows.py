@@ -12,6 +12,7 @@ from plumbline.engines.variants import NoAnswer
 from plumbline.judging.rows import RowContext, Verdict
 from plumbline.judging.state_level import judge_variants
 from plumbline.judging.surface_rows import judge_surface
+from plumbline.model.kinematics import quaternion_product, rotation_matrix
 from plumbline.model.random_mechanisms import random_tree
 from plumbline.model.sampling import random_states
 from plumbline.studies.exercised_names import exercised_names
@@ -65,6 +66,19 @@ def test_every_variant_agrees_and_a_relative_change_of_1e_6_is_seen(tree):
     assert {row.verdict for row in rows} == {Verdict.AGREES}, [row.reason for row in rows]
     names = {name for variants in evaluation.variants.values() for call in variants for name in call}
     assert len(names) >= 5 and set(exercised_names(truth, evaluation)) == names
+
+
+def test_variants_of_flat_bodies_and_of_frames_turned_by_quarters_agree():
+    model, _ = mechanism(("hinge",))
+    about_x, about_y = np.array([0.8, 0.6, 0.0, 0.0]), np.array([1.0, 0.0, 1.0, 0.0]) / np.sqrt(2)
+    turn = np.broadcast_to(np.stack([quaternion_product(about_x, about_y), [1.0, 0, 0, 0]]), model.turn.shape)
+    plates = np.stack([R @ np.diag([0.1, 0.2, 0.3]) @ R.T for R in rotation_matrix(model.turn[:, 0])])
+    model = replace(model, turn=turn, inertia=(plates + plates.swapaxes(1, 2)) / 2)
+    states = random_states(model, 3, 1)
+    truth = state_truth(model, states)
+    variants = evaluate_variants(load_adapter("mujoco"), model, states)
+    rows = judge_variants(WHO, truth, Evaluation([], None, None, 0.0, variants=variants))
+    assert {row.verdict for row in rows} == {Verdict.AGREES}, [row.reason for row in rows]
 
 
 def test_a_variant_that_fails_or_is_wrong_is_named(tree):
