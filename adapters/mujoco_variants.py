@@ -184,7 +184,7 @@ def _oriented(kind: str, field: str, convert: Callable[[Array], Array]) -> Calla
 
 
 def euler_angles(q: Float[Array, "4"]) -> Float[Array, "3"]:
-    """Angles about x, y, z in turn, intrinsic; exact at quarter turns about y, too, where the first may be any."""
+    """Angles about x, y, z in turn, intrinsic; the first may be any at quarter turns about y, and is kept."""
     R = rotation_matrix(q / np.linalg.norm(q))
     first = np.arctan2(-R[1, 2], R[2, 2])
     c, s = np.cos(first), np.sin(first)
