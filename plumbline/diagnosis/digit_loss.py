@@ -29,7 +29,7 @@ from plumbline.model.step_methods import JointSpaceMethod
 from plumbline.processes.exceptions import PlumblineError, describe_exception
 from plumbline.truth.ground_truth import StateTruth
 from plumbline.truth.rounding_bound import RoundingBound, state_rounding_bound
-from plumbline.truth.step_comparison import FormulaSteps
+from plumbline.truth.step_comparison import RESIDUAL_STEPS, FormulaSteps
 
 COPIES = 8
 TURN = 1e-6  # rad
@@ -184,7 +184,7 @@ def measure_step_scatter(
         errors = []
         for turned, turned_state in problems:
             run = ask(step, turned, turned_state)
-            formula = FormulaSteps(method, turned, [turned_state], [(0, h, run.angle_axes)])
+            formula = FormulaSteps(method, turned, [turned_state], [(0, h, run.angle_axes)], [RESIDUAL_STEPS])
             errors.append(formula.residuals(method, [run]))
         return _scatter(np.array(errors[1:]), errors[0])
     except REFUSALS:

@@ -32,10 +32,12 @@ from plumbline.model.step_methods import (
 from plumbline.truth.step_comparison import (
     RESIDUAL_STEPS,
     FormulaSteps,
+    Place,
     Runs,
     RunSteps,
     compare_parts,
     quadrature_residuals,
+    step_counts,
 )
 
 MIN_DIAGNOSABLE_RATIO = 8.0  # in bounds: a smaller difference may be explained by chance
@@ -88,11 +90,13 @@ def explain_disagreeing_steps(
     if isinstance(method, ConstrainedMethod) or causes not in ((), (UNEXPLAINED,)):
         return Diagnosis(causes)
     runs = [(a.state, a.step, a.run) for a in answer.attempts if a.run is not None]
-    ratios = []
-    for index, h, run in runs:
-        found = FormulaSteps(method, model, states, [(index, h, run.angle_axes)]).compare([run])
-        ratios.append(max(max(c.ratios, default=0.0) for c in found.values()))
-    index, h, _ = runs[int(np.argmax(ratios))]
+    starts = [(index, h, run.angle_axes) for index, h, run in runs]
+    taken = max(len(run.trajectory.t) - 1 for *_, run in runs)
+    counts = [count for count in step_counts(method) if count <= taken]
+    found = FormulaSteps(method, model, states, starts, counts).compare([run for *_, run in runs])
+    compared = [pair for c in found.values() for pair in zip(c.ratios, c.places, strict=True)]
+    _, worst = max(compared, key=lambda pair: pair[0], default=(0.0, Place(*runs[0][:2], 1)))
+    index, h = worst.state, worst.step
 
     def step(model: Model, state: State) -> StepRun:
         return adapter.step(model, state, integrator, h, RESIDUAL_STEPS)
@@ -108,7 +112,8 @@ def _worst_steps(
 ) -> tuple[list[State], StepEvaluation]:
     """The steps of a run that are furthest off, each as one from a state of its own."""
     steps = RunSteps(method, model, state, h, run)
-    ratios = np.max([np.max(steps.compare()[name].ratios, axis=1) for name in RUN_STEP_QUANTITIES], axis=0)
+    found = steps.compare()
+    ratios = np.max([np.max(found[name].ratios, axis=1) for name in RUN_STEP_QUANTITIES], axis=0)
     worst = np.sort(np.argsort(ratios)[-STEPS_OF_A_RUN:])
     motion, attempts = run.trajectory, list[StepAttempt]()
     for index, n in enumerate(worst.tolist()):
