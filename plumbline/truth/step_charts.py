@@ -112,6 +112,7 @@ class StepCharts:
         axes = np.array([a for a in angle_axes if a is not None], LongDouble).reshape(len(u), -1, 3)
         rest = iter(np.moveaxis(axes, 1, 0) if method.coordinates == "joint angles" else ())
         self.charts: list[_Chart] = []
+        self.joint_axes: dict[tuple[int, int], Array] = {}
         self.of_body: list[int] = []
         self.of_rod: dict[int, int] = {}
         for k, name in enumerate(model.kind):
@@ -340,7 +341,7 @@ class StepCharts:
         if forces == "joint dampers":  # as rotors of inertia h c
             added = factor * h[..., None] * self.model.damping
             damped = replace(self.model, armature=self.model.armature + added)
-            return self._solved(q, v, damped)[0]
+            return self._solved(q, v, damped if np.any(self.model.damping) else None)[0]
         if forces == "applied" and not own and not self.model.is_dissipative:
             return self.acceleration(q, v)
         M, D = self._mass_matrix(q), np.zeros((*v.shape, self.nv), LongDouble)
@@ -360,13 +361,13 @@ class StepCharts:
         self, q: list[Array], v: Array, damped: Model | None = None
     ) -> tuple[Array, Solution, _MovingTree]:
         """v̇ with the loops closed; ``damped`` has further rotors."""
-        tree = _MovingTree(self, q, v)
+        tree = _MovingTree(self, q, v, None if self.ends else damped)
         wrenches = tree.closing_wrenches(self.ends)
         found = tree.solve(wrenches)
-        shares = tree.closing_shares(self.ends, found) if self.ends else None
-        if damped is not None:
-            found = _MovingTree(self, q, v, damped).solve(wrenches)
-        if shares is not None:
+        if self.ends:
+            shares = tree.closing_shares(self.ends, found)
+            if damped is not None:
+                found = _MovingTree(self, q, v, damped).solve(wrenches)
             found = found.combined(lambda x: x @ shares)
         return tree.velocity_rates(found), found, tree
 
@@ -519,6 +520,12 @@ class _MovingTree(Tree):
         self.rods: dict[int, tuple[Array, Array]] = {}  # u and u̇
         self.axes: dict[int, tuple[list[Array], Array]] = {}  # by chart: of its angles; α at q̈ = 0 of them
         super().__init__(floats(LongDouble), model or charts.model, charts.state)
+
+    def joint_axes(self, k: int, side: int) -> Any:
+        known = self.charts.joint_axes  # the same at all coordinates
+        if (k, side) not in known:
+            known[k, side] = super().joint_axes(k, side)
+        return known[k, side]
 
     def coordinate(self, k: int, i: int) -> tuple[Any, Any]:
         at = self.charts.of_body[k]

@@ -267,10 +267,14 @@ class FormulaSteps:
 
     def _bounds_after(self, i: int, count: int) -> _EndBounds:
         """Rounding bounds at both ends of a run's first steps, and those of the steps; computed once."""
-        if (i, count) not in self._end_bounds:
-            (index, h), end = self.places[i], self.true[i][count].rounded()
-            ends = self.bounds[index], acceleration_bounds(self.method, self.model, [end])[0]
-            self._end_bounds[i, count] = ends, self.step_bound((self.starts[i], end), ends, h, count)
+        if (i, count) not in self._end_bounds:  # of all runs that go through at once
+            runs = [j for j in range(len(self.places)) if j == i or self.growth[j, count] < MAX_GROWTH]
+            states = [self.true[j][count].rounded() for j in runs]
+            bounds = acceleration_bounds(self.method, self.model, states)
+            for j, end, after in zip(runs, states, bounds, strict=True):
+                index, h = self.places[j]
+                ends = self.bounds[index], after
+                self._end_bounds[j, count] = ends, self.step_bound((self.starts[j], end), ends, h, count)
         return self._end_bounds[i, count]
 
     def step_bound(
