@@ -10,6 +10,7 @@ perturbations of the motion grow.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import lru_cache
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from plumbline.model.invariants import attitude_error, position_error
 from plumbline.model.kinematics import angular_velocity, stretched_length
 from plumbline.processes.exceptions import describe_exception
 from plumbline.truth.ground_truth import RUN_ROUNDING
-from plumbline.truth.rounding_bound import state_rounding_bound
+from plumbline.truth.rounding_bound import remembered_rounding_bound
 
 REVERSED_IN_TIME = "reversed in time"
 STEP_DIVISORS = 1, 4, 16  # of the step, tried one after the other where an implicit integrator fails
@@ -97,7 +98,7 @@ def _loop_acceleration(model: Model, state: State) -> float:
     """The largest angular acceleration [rad/s²] of bodies in loops, which may start from rest; of trees 0."""
     if not model.has_loops:
         return 0.0
-    return float(np.max(state_rounding_bound(model, state).scale["angular_acceleration"]))
+    return float(np.max(remembered_rounding_bound(model, state).scale["angular_acceleration"]))
 
 
 def _check_time_reversal(
@@ -188,14 +189,20 @@ def run_tolerance(integrator: Integrator, model: Model, state: State, end: float
     ):  # a residual is small compared with the heaviest body's, F = m a of a light one
         of_step = integrator.solver_rtol * float(np.max(model.mass) / np.min(model.mass))
     driven = _loop_acceleration(model, state) * end
-    bound, (_, spin, speed) = state_rounding_bound(model, state), characteristic_scales(model, state, driven)
+    bound = remembered_rounding_bound(model, state)
+    _, spin, speed = characteristic_scales(model, state, driven)
     pushed = end * max(np.max(bound.acceleration) / speed, np.max(bound.angular_acceleration) / spin)
+    return (RUN_ROUNDING + of_step * float(np.sqrt(steps)) + pushed) * _growth(model, state, end)
+
+
+@lru_cache(maxsize=8)  # all integrators of an engine run for the same times
+def _growth(model: Model, state: State, end: float) -> float:
+    """The largest growth of perturbations up to a time [s]."""
     from plumbline.truth.predictability_horizon import (
         perturbation_growth,  # with SciPy: not in a run's own process
     )
 
-    growth = perturbation_growth(model, state, np.array([0.0, end / 2, end]))
-    return float((RUN_ROUNDING + of_step * np.sqrt(steps) + pushed) * np.max(growth))
+    return float(np.max(perturbation_growth(model, state, np.array([0.0, end / 2, end]))))
 
 
 def characteristic_scales(model: Model, state: State, driven: float = 0.0) -> tuple[float, float, float]:
