@@ -38,7 +38,9 @@ from numpy.typing import NDArray
 from reference_impl.euler_parameters import I3, A, B, G, L, dot, outer
 from reference_impl.mechanism import AnyArray, Indices, Int, Mechanism, Shaped
 
-VECTORS = "ijkxyzXYZd"  # what rows are products of
+VECTORS = "XYZxyzijkd"  # what rows are products of: axes of the near and the far body and of the world, and d
+Z_FAR, IS_D = 5, 9  # places of the last axis of a body, and of d
+PITCH_AXES = "yxX"  # in which the angle of a joint with a pitch is found
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,15 +118,23 @@ class _RowLayout:
     joint: Int[Indices, "c"]  # the joint of each row
     near: Int[Indices, "c"]  # its near body
     far: Int[Indices, "c"]  # its far body, −1 the world
-    pitched: NDArray[np.intp]  # joints with a pitch
-    pitch_rows: NDArray[np.intp]  # their rows zᵀd
+    # rows that are a component of d: their numbers, and joint and component of each
+    point_rows: NDArray[np.intp]
+    point_at: tuple[NDArray[np.intp], NDArray[np.intp]]
+    # axes that rows are made of, by joint: their sides, 0 near and 1 far, and joints
+    axis_at: tuple[NDArray[np.intp], NDArray[np.intp]]
+    axes: Shaped[AnyArray, "a 3"]  # in their bodies; 0 for the world
+    B_of_axes: Shaped[AnyArray, "a 4 4"]
+    world_axes: Shaped[AnyArray, "a 3"]  # axes where the far body is the world, else 0
+    # rows that are products of two axes, or of an axis and d: their numbers, joints and places in the axes
+    axis_rows: NDArray[np.intp]
+    axis_pairs: Int[Indices, "2 k"]
+    slide_rows: NDArray[np.intp]
+    slide_joint: NDArray[np.intp]
+    slide_axis: NDArray[np.intp]
+    pitch_rows: NDArray[np.intp]  # of joints with a pitch their rows zᵀd
+    pitch_axes: Int[Indices, "3 h"]  # places of their axes y, x and X
     pitch: Shaped[AnyArray, "h"]  # m/rad
-    product_rows: Int[Indices, "k"]  # the rows that are products of `factors`
-    factors: Int[Indices, "2 k"]  # u and w of these rows, places in VECTORS
-    turned: Int[Indices, "t"]  # joints that have axes
-    axes: Shaped[AnyArray, "2 t 3 3"]  # h and f in the near and far body, rows; 0 for the world
-    B_of_axes: Shaped[AnyArray, "2 t 3 4 4"]  # B of the axes
-    world_axes: Shaped[AnyArray, "t 3 3"]  # f where the far body is the world, else 0
 
 
 @lru_cache(maxsize=64)  # mechanisms are never changed, and a run uses the same one ten thousand times
@@ -133,16 +143,26 @@ def _row_layout(mechanism: Mechanism) -> _RowLayout:
     world = far < 0
     s = np.stack([mechanism.point[:, 1], np.where(world[:, None], 0, mechanism.point[:, 0])])
     joint = joint_of_rows(mechanism)
-    pairs = [pair for kind in mechanism.kinds for pair in kind.rows]
-    is_rod = np.array([pair == ("d", "d") for pair in pairs], bool)
-    rods = joint[is_rod]
-    used = [{name for pair in kind.rows for name in pair} for kind in mechanism.kinds]
-    turned = np.array([k for k, names in enumerate(used) if names & set("xyzXYZ")], np.intp)
-    f, h = np.moveaxis(A(mechanism.turn[turned]).swapaxes(-1, -2), 1, 0)  # rows: the axes
-    axes = np.stack([h, np.where(world[turned, None, None], 0, f)])
-    factors = [[VECTORS.index(name) for name in pair] for pair in pairs if pair != ("d", "d")]
+    codes = [(VECTORS.index(u), VECTORS.index(w)) for kind in mechanism.kinds for u, w in kind.rows]
+    u, w = np.array(codes, np.intp).reshape(-1, 2).T
+    rod_rows, points, slides, turns = (
+        np.flatnonzero(where)
+        for where in (u == IS_D, (u > Z_FAR) & (u < IS_D), (u <= Z_FAR) & (w == IS_D), w <= Z_FAR)
+    )
     has_pitch = np.array([kind.has_pitch for kind in mechanism.kinds], bool)
-    is_along = np.array([pair == ("z", "d") for pair in pairs], bool) & has_pitch[joint]
+    helical = slides[(u[slides] == Z_FAR) & has_pitch[joint[slides]]]
+    # each row's axes, and those in which a pitch's angle is found, by joint and place in VECTORS
+    used = [(slides, u[slides]), (turns, u[turns]), (turns, w[turns])]
+    used += [(helical, np.full(len(helical), VECTORS.index(name))) for name in PITCH_AXES]
+    keys, place = np.unique(
+        np.concatenate([(Z_FAR + 1) * joint[rows] + code for rows, code in used]), return_inverse=True
+    )
+    slide_axis, of_turns, of_pitch = np.split(place, np.cumsum([len(slides), 2 * len(turns)]))
+    k, code = np.divmod(keys, Z_FAR + 1)
+    side, number = np.divmod(code, 3)
+    turned = A(mechanism.turn[k, 1 - side])[np.arange(len(k)), :, number]
+    is_world = ((side == 1) & world[k])[:, None]
+    axes, rods = np.where(is_world, 0, turned), joint[rod_rows]
     return _RowLayout(
         bodies=np.stack([near, np.maximum(far, 0)]),
         s=s,
@@ -150,19 +170,24 @@ def _row_layout(mechanism: Mechanism) -> _RowLayout:
         world_point=np.where(world[:, None], mechanism.point[:, 0], 0),
         point_squares=dot(s, s).sum(0) - mechanism.length**2,
         rods=slice(None) if len(rods) == len(mechanism.kind) else rods,
-        rod_rows=np.flatnonzero(is_rod),
+        rod_rows=rod_rows,
         joint=joint,
         near=near[joint],
         far=far[joint],
-        pitched=joint[is_along],
-        pitch_rows=np.flatnonzero(is_along),
-        pitch=mechanism.length[joint[is_along]],
-        product_rows=np.flatnonzero(~is_rod),
-        factors=np.array(factors, np.intp).reshape(-1, 2).T,
-        turned=turned,
+        point_rows=points,
+        point_at=(joint[points], u[points] - Z_FAR - 1),
+        axis_at=(side, k),
         axes=axes,
         B_of_axes=B(axes),
-        world_axes=np.where(world[turned, None, None], f, 0),
+        world_axes=np.where(is_world, turned, 0),
+        axis_rows=turns,
+        axis_pairs=of_turns.reshape(2, -1),
+        slide_rows=slides,
+        slide_joint=joint[slides],
+        slide_axis=slide_axis,
+        pitch_rows=helical,
+        pitch_axes=of_pitch.reshape(3, -1),
+        pitch=mechanism.length[joint[helical]],
     )
 
 
@@ -191,7 +216,8 @@ def constraint_rows(
     xdot = v[near] - of_far_body(v, far)
     both = np.stack([q, qdot])
     turn = G(both)
-    (H_near, H_far), (H_near_rate, H_far_rate) = turn @ fixed.B + outer(s, both)  # H, Ḣ (D4)
+    H = turn @ fixed.B + outer(s, both)
+    (H_near, H_far), (H_near_rate, H_far_rate) = H  # H, Ḣ (D4)
     b, a = _matrix_vector(A(q), s)
     d = x + b - a
 
@@ -213,63 +239,55 @@ def constraint_rows(
         )
         r_near[row] = 2 * d[k]
         p_near[row], p_far[row] = 4 * _vector_matrix(y, H_near[k]), -4 * _vector_matrix(z, H_far[k])
-    if len(fixed.product_rows):
-        row = fixed.product_rows
-        H_d = np.stack([[H_near, H_far], [H_near_rate, H_far_rate]])
-        vectors = _factor_vectors(fixed, d, xdot, both, H_d)
-        places = fixed.joint[row], fixed.factors
-        C[row], gamma[row], r_near[row], p_near[row], p_far[row] = _product_rows(places, vectors)
+    if len(fixed.point_rows) or len(fixed.slide_rows):
+        swing, bend = 2 * _matrix_vector(H, qdot)
+        d_bias = bend[0] - bend[1]
+    if len(fixed.point_rows):
+        row, at = fixed.point_rows, fixed.point_at
+        C[row], gamma[row], r_near[row] = d[at], -d_bias[at], I3[at[1]]
+        p_near[row], p_far[row] = 2 * H_near[at], -2 * H_far[at]
+    if len(fixed.axes):
+        axes = _axis_vectors(fixed, q, qdot)
+        row = fixed.axis_rows
+        C[row], gamma[row], p_near[row], p_far[row] = _axis_products(axes, *fixed.axis_pairs)
+    if len(fixed.slide_rows):
+        row, k, i = fixed.slide_rows, fixed.slide_joint, fixed.slide_axis
+        u, of_p, rate, bias = (x[i] for x in axes)
+        d_rate = (xdot + swing[0] - swing[1])[k]
+        C[row], r_near[row] = dot(u, d[k]), u
+        gamma[row] = -(dot(u, d_bias[k]) + dot(d[k], bias) + 2 * dot(rate, d_rate))
+        p_near[row] = _vector_matrix(u, 2 * H_near[k])
+        p_far[row] = _vector_matrix(u, -2 * H_far[k]) + _vector_matrix(d[k], of_p)
     if len(fixed.pitch_rows):
         row, h = fixed.pitch_rows, fixed.pitch
-        angle, *parts = _turns_about_z(fixed.pitched, vectors, C[row], h)
+        angle, *parts = _turns_about_z(fixed.pitch_axes, axes, C[row], h)
         C[row] -= h * angle
         for found, part in zip((gamma, p_near, p_far), parts, strict=True):
             found[row] -= (h * part.T).T
     return ConstraintRows(fixed.joint, fixed.near, fixed.far, C, r_near, p_near, p_far, gamma, d)
 
 
-def _factor_vectors(
-    fixed: _RowLayout, d: AnyArray, xdot: AnyArray, both: AnyArray, H_d: AnyArray
-) -> tuple[AnyArray, ...]:
-    """The vectors of VECTORS of every joint (J, 10, 3), ∂/∂p of the near and far body, rates and ũ (L1)."""
-    n, q, qdot = len(d), both[0], both[1]
-    value, rate, bias = (np.zeros((n, len(VECTORS), 3), d.dtype) for _ in range(3))
-    of_p = np.zeros((2, n, len(VECTORS), 3, 4), d.dtype)  # near, far
-    value[:, :3] = I3
-    H, H_rate = H_d
-    swing, bend = (2 * _matrix_vector(h, qdot) for h in (H, H_rate))  # (2, J, 3): near, far
-    value[:, 9], rate[:, 9], bias[:, 9] = d, xdot + swing[0] - swing[1], bend[0] - bend[1]
-    of_p[0, :, 9], of_p[1, :, 9] = 2 * H[0], -2 * H[1]
-    k = fixed.turned
-    if len(k):
-        t = fixed.axes
-        qk, qdotk = q[:, k, None], qdot[:, k, None]  # (2, t, 1, 4)
-        axis_H, axis_H_rate = (G(x) @ fixed.B_of_axes + outer(t, x) for x in (qk, qdotk))
-        turned = _matrix_vector(A(qk), t)
-        for side, at in ((0, slice(6, 9)), (1, slice(3, 6))):
-            value[k, at] = turned[side] + (fixed.world_axes if side else 0)
-            of_p[side, k, at] = 2 * axis_H[side]
-            rate[k, at] = 2 * _matrix_vector(axis_H[side], qdotk[side])
-            bias[k, at] = 2 * _matrix_vector(axis_H_rate[side], qdotk[side])
-    return value, of_p, rate, bias
+def _axis_vectors(fixed: _RowLayout, q: AnyArray, qdot: AnyArray) -> tuple[AnyArray, ...]:
+    """The axes that rows are made of (a, 3), ∂/∂p of their bodies, rates and ũ (L1)."""
+    at, t = fixed.axis_at, fixed.axes
+    p, pdot = q[at], qdot[at]
+    H, H_rate = (G(x) @ fixed.B_of_axes + outer(t, x) for x in (p, pdot))
+    rate, bias = (2 * _matrix_vector(h, pdot) for h in (H, H_rate))
+    return _matrix_vector(A(p), t) + fixed.world_axes, 2 * H, rate, bias
 
 
 def _turns_about_z(
-    joint: NDArray[np.intp], vectors: tuple[AnyArray, ...], shift: AnyArray, pitch: AnyArray
+    places: NDArray[np.intp], axes: tuple[AnyArray, ...], shift: AnyArray, pitch: AnyArray
 ) -> tuple[AnyArray, ...]:
     """φ, −φ̈₀, φ_p near and φ_p far of joints, with full turns that are nearest to their shifts."""
-    s, c = (
-        _product_rows((joint, np.array([[VECTORS.index(x)] for x in pair])), vectors) for pair in ("yX", "xX")
-    )
+    y, x, X = places
+    s, c = (_axis_products(axes, i, X) for i in (y, x))
     square = s[0] ** 2 + c[0] ** 2
-    value, _, rates, _ = vectors
-    iy, ix, iX = (VECTORS.index(x) for x in "yxX")
-    s_rate, c_rate = (
-        dot(rates[joint, i], value[joint, iX]) + dot(value[joint, i], rates[joint, iX]) for i in (iy, ix)
-    )
+    value, _, rates, _ = axes
+    s_rate, c_rate = (dot(rates[i], value[X]) + dot(value[i], rates[X]) for i in (y, x))
     rate = (c[0] * s_rate - s[0] * c_rate) / square
     bend = (c[0] * s[1] - s[0] * c[1] + 2 * rate * (s[0] * s_rate + c[0] * c_rate)) / square
-    near, far = (((c[0] * s[i].T - s[0] * c[i].T) / square).T for i in (3, 4))
+    near, far = (((c[0] * s[i].T - s[0] * c[i].T) / square).T for i in (2, 3))
     angle, full = np.arctan2(s[0].real, c[0].real), 2 * np.pi
     turns = np.divide(shift.real, pitch, out=angle.copy(), where=pitch != 0) - angle
     angle = angle + full * np.round(turns / full)
@@ -278,16 +296,14 @@ def _turns_about_z(
     return angle, bend, near, far
 
 
-def _product_rows(
-    places: tuple[NDArray[np.intp], NDArray[np.intp]], vectors: tuple[AnyArray, ...]
+def _axis_products(
+    axes: tuple[AnyArray, ...], far: NDArray[np.intp], near: NDArray[np.intp]
 ) -> tuple[AnyArray, ...]:
-    """C, γ, C_r near, C_p near and C_p far of products, by their joints and factors (L2, L3)."""
-    value, of_p, rate, bias = vectors
-    k, (iu, iw) = places
-    u, w = value[k, iu], value[k, iw]
-    p_near, p_far = (_vector_matrix(u, x[k, iw]) + _vector_matrix(w, x[k, iu]) for x in of_p)
-    gamma = -(dot(u, bias[k, iw]) + dot(w, bias[k, iu]) + 2 * dot(rate[k, iu], rate[k, iw]))
-    return dot(u, w), gamma, u * (iw == 9)[:, None], p_near, p_far
+    """C, γ, C_p near and C_p far of products of a far and a near axis (L2, L3)."""
+    value, of_p, rate, bias = axes
+    u, w = value[far], value[near]
+    gamma = -(dot(u, bias[near]) + dot(w, bias[far]) + 2 * dot(rate[far], rate[near]))
+    return dot(u, w), gamma, _vector_matrix(u, of_p[near]), _vector_matrix(w, of_p[far])
 
 
 def _matrix_vector(matrix: AnyArray, vector: AnyArray) -> AnyArray:
