@@ -18,8 +18,20 @@ from plumbline.diagnosis.digit_loss import Evaluate, Problem, find_digit_loss, m
 from plumbline.diagnosis.edits import Edit
 from plumbline.diagnosis.fit import ACCEPTED_RATIO, Difference, Explanation, Mask, Search
 from plumbline.diagnosis.needs import find_needs
-from plumbline.diagnosis.outputs import Outputs, error_ratio
-from plumbline.diagnosis.prediction import QUANTITIES, SUMS, VECTORS, WRENCHES, Answers, Case, View
+from plumbline.diagnosis.outputs import Outputs
+from plumbline.diagnosis.prediction import (
+    QUANTITIES,
+    SUMS,
+    VECTORS,
+    WRENCHES,
+    Answers,
+    Case,
+    View,
+    error_ratio,
+    error_ratios,
+    tolerances,
+    values_of,
+)
 from plumbline.diagnosis.readings import other_branches
 from plumbline.diagnosis.terms import Terms, force_places, is_spanned
 from plumbline.engines.registry import load_adapter
@@ -29,12 +41,9 @@ from plumbline.truth.ground_truth import StateTruth
 
 MIN_DIAGNOSABLE_RATIO = 8.0  # in bounds: of hundreds of fitted causes, some explain less by chance
 MAX_LOCATED = 4  # states at which the difference is looked for with one thing taken away
-LOOP_VIEWS = (
-    View(are_bodies_kept=True),
-    # an engine's forces that close an open loop act on both ends, its own wrenches count them at one
-    View((*VECTORS[:2], *SUMS), end_rows="twists"),
-)
-JUDGED = (*QUANTITIES, "mass_matrix")
+BODIES_KEPT = View(are_bodies_kept=True)
+# an engine's forces that close an open loop act on both ends, its own wrenches count them at one
+ENDS_BY_TWISTS = View((*VECTORS[:2], *SUMS), end_rows="twists")
 
 
 def explain_disagreement(
@@ -77,20 +86,6 @@ def state_count(model: Model) -> int:
     return 6 if model.n <= 6 else 4 if model.n <= 12 else 2
 
 
-def error_ratios(reported: Sequence[StateQuantities], truth: StateTruth, quantity: str) -> Array:
-    """Return the errors (S,) of a quantity in bounds, of the worst body; 0 where there is none."""
-    found = np.zeros(len(reported))
-    for i, (answer, true, bound) in enumerate(zip(reported, truth.quantities, truth.bounds, strict=True)):
-        value, right = getattr(answer, quantity), getattr(true, quantity)
-        if value is None or right is None:
-            continue
-        limit = np.asarray(bound.tolerance(quantity)) + (answer.limit_error or {}).get(quantity, 0.0)
-        off = np.asarray(value, float) - right
-        off = np.linalg.norm(off, axis=-1) if quantity in (*VECTORS, "angular_momentum") else np.abs(off)
-        found[i] = np.max(off / np.maximum(limit, np.finfo(float).tiny), initial=0.0)
-    return np.nan_to_num(found, nan=np.inf)
-
-
 class _Diagnosing:
     """One diagnosis: the difference at states that show it, and what was tried."""
 
@@ -98,10 +93,10 @@ class _Diagnosing:
         self, model: Model, reported: Sequence[StateQuantities], truth: StateTruth, evaluate: Evaluate | None
     ) -> None:
         self.model, self.reported, self.truth, self.evaluate = model, reported, truth, evaluate
-        self.ratios = {q: error_ratios(reported, truth, q) for q in JUDGED}
-        worst = np.max([self.ratios[q] for q in QUANTITIES], axis=0)
-        self.largest = float(np.max(worst))
-        order = np.argsort(-worst).tolist()
+        self.ratios = {q: error_ratios(reported, truth, q) for q in QUANTITIES}
+        self.worst = np.max(list(self.ratios.values()), axis=0)
+        self.largest = float(np.max(self.worst))
+        order = np.argsort(-self.worst).tolist()
         count = state_count(model)
         first = order[: (count + 1) // 2]
         rest = order[len(first) :]
@@ -143,8 +138,9 @@ class _Diagnosing:
         return (
             found
             or self._single(View(), are_sums_apart=True)
-            or (self._single_of_loops() if set(VECTORS[:2]) & set(wrong) else ())
+            or self._single_of_loops(BODIES_KEPT, wrong)
             or self._two_or_more(wrong)
+            or self._single_of_loops(ENDS_BY_TWISTS, wrong)  # says nothing of wrenches
             or self._forces()
             or self._partly(wrong)
             or (self._unexplained(wrong),)
@@ -198,13 +194,11 @@ class _Diagnosing:
         found = self._proved(view, found, mask)
         return self._named(found) if found else ()
 
-    def _single_of_loops(self) -> tuple[Cause, ...]:
+    def _single_of_loops(self, view: View, wrong: Sequence[str]) -> tuple[Cause, ...]:
         """The same of engines that take a state of a mechanism with loops in another way."""
-        for view in LOOP_VIEWS if self.model.has_loops else ():
-            for are_sums_apart in (False, True):
-                if found := self._single(view, are_sums_apart):
-                    return found
-        return ()
+        if not self.model.has_loops or not set(VECTORS[:2]) & set(wrong):
+            return ()
+        return self._single(view) or self._single(view, are_sums_apart=True)
 
     def _named(self, found: Sequence[Explanation]) -> tuple[Cause, ...]:
         """The causes of the first explanation, with those from which the data cannot distinguish them."""
@@ -256,7 +250,10 @@ class _Diagnosing:
     # -- causes in outputs ---------------------------------------------------------------------------
 
     def _at(self, quantity: str, quantities: Sequence[StateQuantities], shift: int = 0) -> Array:
-        return np.array([np.asarray(getattr(quantities[i - shift], quantity), float) for i in self.places])
+        return values_of([quantities[i - shift] for i in self.places], quantity)
+
+    def _bounds(self, quantity: str) -> Array:
+        return tolerances([self.truth.bounds[i] for i in self.places], quantity)
 
     def outputs(self, case: Case | None = None, right: Answers | None = None) -> Outputs:
         """The table of outputs at the states, of the truth or of an altered mechanism."""
@@ -267,7 +264,7 @@ class _Diagnosing:
             case or Case(self.model, stack_states([truth.states[i] for i in self.places])),
             true if right is None else true | {q: x for q, x in right.items() if q in true},
             {q: self._at(q, truth.quantities, 1) for q in names},
-            {q: np.array([np.asarray(truth.bounds[i].tolerance(q)) for i in self.places]) for q in names},
+            {q: self._bounds(q) for q in names},
         )
 
     def _name_outputs(self, quantities: Sequence[str], outputs: Outputs) -> dict[str, Cause]:
@@ -307,8 +304,8 @@ class _Diagnosing:
         return ()
 
     def _explains(self, quantity: str, right: Array) -> bool:
-        bounds = np.array([np.asarray(self.truth.bounds[i].tolerance(quantity)) for i in self.places])
-        return error_ratio(self._at(quantity, self.reported) - right, bounds) <= ACCEPTED_RATIO
+        off = self._at(quantity, self.reported) - right
+        return error_ratio(off, self._bounds(quantity)) <= ACCEPTED_RATIO
 
     def _altered(self, search: Search, found: Explanation) -> tuple[Case | None, Answers]:
         """The mechanism with a cause, and the quantities that follow."""
@@ -392,9 +389,8 @@ class _Diagnosing:
     def with_needs(self, causes: Sequence[Cause]) -> list[Cause]:
         """Say of what is unexplained what its difference needs; quantities with other needs apart."""
         assert self.evaluate
-        worst = np.max([self.ratios[q] for q in QUANTITIES], axis=0)
         count = min(MAX_LOCATED, state_count(self.model))
-        states = [self.truth.states[i] for i in self.order[:count] if worst[i] > 1]
+        states = [self.truth.states[i] for i in self.order[:count] if self.worst[i] > 1]
         found = list[Cause]()
         for cause in causes:
             if cause.kind != "unexplained" or cause.change:

@@ -14,8 +14,7 @@ from typing import ParamSpec, TypeVar
 import numpy as np
 
 from plumbline.diagnosis.cause import Cause, CauseKind, quantity_words
-from plumbline.diagnosis.outputs import error_ratio
-from plumbline.diagnosis.prediction import QUANTITIES, Answers, Predictor, View
+from plumbline.diagnosis.prediction import QUANTITIES, Answers, Predictor, View, error_ratio, error_ratios
 from plumbline.model.datatypes import Array, EngineFailure, Model, State, StateQuantities, StepRun
 from plumbline.model.equivalent import (
     BODY_VECTORS,
@@ -41,6 +40,7 @@ MIN_GROWTH = 4.0  # of the error in rounding bounds, from half of the bodies to 
 REFUSALS = (PlumblineError, ArithmeticError, np.linalg.LinAlgError)
 
 Evaluate = Callable[[Model, list[State]], list[StateQuantities]]
+Turns = tuple[Array, Array]  # unit quaternions of rotations of the world and of all bodies
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
@@ -105,17 +105,13 @@ class Problem:
         quantities: Sequence[str] = QUANTITIES,
     ) -> Problem:
         """Choose the state and the quantities that the engine offers."""
-        true = truth.quantities
-        names = [
-            q for q in quantities if getattr(reported[0], q) is not None and getattr(true[0], q) is not None
-        ]
-        problems = []
-        for answer, exact, bound, state in zip(reported, true, truth.bounds, truth.states, strict=True):
-            right = {q: np.asarray(getattr(exact, q), float) for q in names}
-            error = {q: np.asarray(getattr(answer, q), float) - right[q] for q in names}
-            problems.append(cls(model, state, error, right, bound))
-        wrong = [p for p in problems if not p.ratio() <= 1] or problems
-        return max(wrong, key=lambda problem: np.nan_to_num(problem.ratio(), nan=0.0))
+        ratios = np.max([error_ratios(reported, truth, q) for q in quantities], axis=0)
+        at = int(np.argmax(np.nan_to_num(ratios, posinf=0.0)))
+        answer, true = reported[at], truth.quantities[at]
+        names = [q for q in quantities if all(getattr(x, q) is not None for x in (answer, true))]
+        right = {q: np.asarray(getattr(true, q), float) for q in names}
+        error = {q: np.asarray(getattr(answer, q), float) - right[q] for q in names}
+        return cls(model, truth.states[at], error, right, truth.bounds[at])
 
     def ratio(self) -> float:
         """The largest error in bounds."""
@@ -154,10 +150,18 @@ def measure_scatter(problem: Problem, evaluate: Evaluate) -> float | None:
         The median distance of the errors from their mean, over their size; None where the engine fails.
 
     """
-    try:
-        return _measure_scatter(problem, evaluate)
-    except REFUSALS:
-        return None
+
+    def error(turns: Turns | None) -> Array:
+        if turns is None:
+            ask(evaluate, problem.model, [problem.state])  # what an engine keeps is then of this problem
+            return problem.weighted(problem.error)
+        turned, state = _turned(problem.model, problem.state, turns)
+        (answer,) = ask(evaluate, turned, [state])
+        values = {name: np.asarray(getattr(answer, name), float)[None] for name in problem.right}
+        values = unrotate(unrotate(values, WORLD_VECTORS, turns[0]), BODY_VECTORS, turns[1])
+        return problem.weighted({name: x[0] - problem.right[name] for name, x in values.items()})
+
+    return _scatter(error)
 
 
 def measure_step_scatter(
@@ -173,57 +177,45 @@ def measure_step_scatter(
         As `measure_scatter`.
 
     """
+
+    def error(turns: Turns | None) -> Array:  # turning it back would change it by the angle only
+        turned, start = (model, state) if turns is None else _turned(model, state, turns)
+        run = ask(step, turned, start)
+        formula = FormulaSteps(method, turned, [start], [(0, h, run.angle_axes)], [RESIDUAL_STEPS])
+        return formula.residuals(method, [run])
+
+    return _scatter(error)
+
+
+def _turned(model: Model, state: State, turns: Turns) -> tuple[Model, State]:
+    return rotate_body_frames(*rotate_world(model, state, turns[0]), turns[1])
+
+
+def _scatter(error: Callable[[Turns | None], Array]) -> float | None:
+    """Median distance of errors of turned problems from their mean over their median length.
+
+    0 where they are not finite, or all much shorter than that of the problem: then it is not they that
+    scatter; None where the engine refuses a problem.
+    """
     rng = np.random.default_rng(0)
-    problems = [(model, state)]
-    problems += [
-        rotate_body_frames(*rotate_world(model, state, _tiny_rotation(rng)), _tiny_rotation(rng))
-        for _ in range(COPIES)
-    ]
     try:
-        # turning an error back would change it by the angle only
-        errors = []
-        for turned, turned_state in problems:
-            run = ask(step, turned, turned_state)
-            formula = FormulaSteps(method, turned, [turned_state], [(0, h, run.angle_axes)], [RESIDUAL_STEPS])
-            errors.append(formula.residuals(method, [run]))
-        return _scatter(np.array(errors[1:]), errors[0])
+        own = error(None)
+        errors = np.array([error((_tiny_rotation(rng), _tiny_rotation(rng))) for _ in range(COPIES)])
     except REFUSALS:
         return None
-
-
-def _measure_scatter(problem: Problem, evaluate: Evaluate) -> float:
-    model, state = problem.model, problem.state
-    rng = np.random.default_rng(0)
-    errors = []
-    ask(evaluate, model, [state])  # what an engine keeps of the call before is then of this problem
-    for _ in range(COPIES):
-        world, body = (_tiny_rotation(rng) for _ in range(2))
-        turned, turned_state = rotate_body_frames(*rotate_world(model, state, world), body)
-        (answer,) = ask(evaluate, turned, [turned_state])
-        values = {name: np.asarray(getattr(answer, name), float)[None] for name in problem.right}
-        values = unrotate(unrotate(values, WORLD_VECTORS, world), BODY_VECTORS, body)
-        errors.append(problem.weighted({name: x[0] - problem.right[name] for name, x in values.items()}))
-    return _scatter(np.array(errors), problem.weighted(problem.error))
+    largest = float(max(np.max(np.abs(errors)), np.max(np.abs(own))))
+    if not 0 < largest < np.inf:
+        return 0.0
+    errors, own = errors / largest, own / largest
+    distances = np.linalg.norm(errors - np.mean(errors, axis=0), axis=1)
+    length = float(np.median(np.linalg.norm(errors, axis=1)))
+    return float(np.median(distances)) / length if length > MIN_COPY_ERROR * np.linalg.norm(own) else 0.0
 
 
 def _tiny_rotation(rng: np.random.Generator) -> Array:
     """Unit quaternion of a rotation by `TURN` about a random axis."""
     axis = rng.normal(size=3)
     return np.array([np.cos(TURN / 2), *(np.sin(TURN / 2) * axis / np.linalg.norm(axis))])
-
-
-def _scatter(errors: Array, error: Array) -> float:
-    """Median distance of vectors (COPIES, K) from their mean over their median length.
-
-    0 where they are not finite, or all much shorter than ``error`` (K,): then it is not they that scatter.
-    """
-    largest = float(max(np.max(np.abs(errors)), np.max(np.abs(error))))
-    if not 0 < largest < np.inf:
-        return 0.0
-    errors, error = errors / largest, error / largest
-    distances = np.linalg.norm(errors - np.mean(errors, axis=0), axis=1)
-    length = float(np.median(np.linalg.norm(errors, axis=1)))
-    return float(np.median(distances)) / length if length > MIN_COPY_ERROR * np.linalg.norm(error) else 0.0
 
 
 def _ratios(problem: Problem, evaluate: Evaluate) -> dict[int, float]:

@@ -17,6 +17,7 @@ from plumbline.model.datatypes import JOINT_ELEMENTS, SPRING_FIELDS, Array, Mode
 from plumbline.model.kinematics import quaternion_exponential, quaternion_product, rotation_matrix
 
 ASKEW = 1e-6  # of a direction: it lies along an axis but for rounding
+NumberChange = Callable[[Case, Array], Case]
 LENGTHS = (" m", " rad")  # units of a mechanism's geometry, by which loops may open
 WORDS = {"rest": "rest position", "force": "applied force", "moment": "applied moment",
          "drag_force": "drag force", "drag_moment": "drag moment", "omega": "angular velocity ω′",
@@ -35,10 +36,9 @@ class Edit:
     """
 
     cause: Cause
-    change: Callable[[Case, Array], Case] | None = None
+    change: NumberChange | None = None
     scale: float = 1.0  # natural size of a change of x
     can_vanish: bool = True  # whether factors 0, 2 and −1 are possible
-    fields: tuple[str, ...] = ()  # of the model, of which numbers are changed
     effect: Array | None = None
 
     @property
@@ -62,7 +62,7 @@ def field(case: Case, name: str) -> Array:
     return np.asarray(getattr(case.state if hasattr(case.state, name) else case.model, name))
 
 
-def at_place(name: str, at: tuple[Any, ...]) -> Callable[[Case, Array], Case]:
+def at_place(name: str, at: tuple[Any, ...]) -> NumberChange:
     """Replace one number of a field, or one vector."""
 
     def change(case: Case, x: Array) -> Case:
@@ -75,7 +75,7 @@ def at_place(name: str, at: tuple[Any, ...]) -> Callable[[Case, Array], Case]:
     return change
 
 
-def scaled(names: Sequence[str], where: Array, part: Any = 1.0) -> Callable[[Case, Array], Case]:
+def scaled(names: Sequence[str], where: Array, part: Any = 1.0) -> NumberChange:
     """Multiply fields by a factor: at places of a mask, and there only parts of them."""
 
     def change(case: Case, x: Array) -> Case:
@@ -89,12 +89,12 @@ def scaled(names: Sequence[str], where: Array, part: Any = 1.0) -> Callable[[Cas
     return change
 
 
-def added(name: str, where: Array) -> Callable[[Case, Array], Case]:
+def added(name: str, where: Array) -> NumberChange:
     """Add an amount to a field at places of a mask."""
     return lambda case, x: with_fields(case, **{name: field(case, name) + x[0] * where})
 
 
-def turned(k: int, side: int, axes: Array) -> Callable[[Case, Array], Case]:
+def turned(k: int, side: int, axes: Array) -> NumberChange:
     """Turn the axes of a joint in one body by a rotation vector in themselves, of components along axes."""
 
     def change(case: Case, x: Array) -> Case:
@@ -106,7 +106,7 @@ def turned(k: int, side: int, axes: Array) -> Callable[[Case, Array], Case]:
     return change
 
 
-def _turned_attitude(k: int, axis: int) -> Callable[[Case, Array], Case]:
+def _turned_attitude(k: int, axis: int) -> NumberChange:
     def change(case: Case, x: Array) -> Case:
         values = case.state.p.copy()
         values[:, k] = quaternion_product(values[:, k], quaternion_exponential(x[0] * np.eye(3)[axis] / 2))
@@ -115,7 +115,7 @@ def _turned_attitude(k: int, axis: int) -> Callable[[Case, Array], Case]:
     return change
 
 
-def _shifted_centre(k: int, axis: int) -> Callable[[Case, Array], Case]:
+def _shifted_centre(k: int, axis: int) -> NumberChange:
     """Displace a centre of mass: what is attached to the body moves the other way."""
 
     def change(case: Case, x: Array) -> Case:
@@ -127,7 +127,7 @@ def _shifted_centre(k: int, axis: int) -> Callable[[Case, Array], Case]:
     return change
 
 
-def _shifted_slide(k: int) -> Callable[[Case, Array], Case]:
+def _shifted_slide(k: int) -> NumberChange:
     """Count a slide's coordinate, spring included, from a point further along its axis."""
 
     def change(case: Case, x: Array) -> Case:
@@ -147,7 +147,7 @@ def gyroscopic_moment(case: Case) -> Array:
     return np.cross(omega, np.matvec(case.model.inertia, omega))
 
 
-def _gyroscopic(where: Array) -> Callable[[Case, Array], Case]:
+def _gyroscopic(where: Array) -> NumberChange:
     def change(case: Case, x: Array) -> Case:
         less = (x[0] - 1) * where[:, None] * gyroscopic_moment(case)
         return with_fields(case, moment=case.model.moment - less)
@@ -173,26 +173,28 @@ def _number(
 ) -> Edit:  # fmt: skip
     general = general or WORDS.get(name, name)
     cause = Cause("number", term, place, nominal=(value,), unit=unit, general=general)
-    return Edit(cause, at_place(name, at), scale, can_vanish, (name,))
+    return Edit(cause, at_place(name, at), scale, can_vanish)
+
+
+def _shift(
+    term: str, place: str, change: NumberChange, scale: float, unit: str = "", general: str = ""
+) -> Edit:  # fmt: skip
+    """What is 0 where it is right."""
+    return Edit(Cause("number", term, place, nominal=(0.0,), unit=unit, general=general), change, scale)
 
 
 def _factor(
-    term: str, place: str, change: Callable[[Case, Array], Case], can_vanish: bool = True,
-    fields: tuple[str, ...] = (), kind: CauseKind = "number", general: str = "",
+    term: str, place: str, change: NumberChange, can_vanish: bool = True, general: str = "",
+    kind: CauseKind = "number",
 ) -> Edit:  # fmt: skip
     cause = Cause(kind, term, place, nominal=(1.0,), unit="×", general=general)
-    return Edit(cause, change, 1.0, can_vanish, fields)
+    return Edit(cause, change, 1.0, can_vanish)
 
 
 def _gravity(model: Model) -> Iterator[Edit]:
     size = float(np.linalg.norm(model.gravity)) or 1.0
     if np.count_nonzero(model.gravity) > 1:  # else it is a component
-        yield _factor(
-            "size of gravity",
-            "",
-            lambda case, x: with_fields(case, gravity=x[0] * case.model.gravity),
-            general="gravity",
-        )
+        yield _factor("size of gravity", "", _all(("gravity",)), general="gravity")
     for i, axis in enumerate("xyz"):
         value = float(model.gravity[i])
         yield _number(f"{axis} component of gravity", "", "gravity", (i,), value, size, UNITS["gravity"])
@@ -214,12 +216,10 @@ def _bodies(model: Model) -> Iterator[Edit]:
                 yield _number(f"{WORDS[name]} {axis}", place, name, (k, i), value, weight, UNITS[name])
             if not model.kinds[k].holds_nothing:
                 term = "centre of mass"
-                cause = Cause("number", f"{term} {axis}", place, nominal=(0.0,), unit=" m", general=term)
-                yield Edit(cause, _shifted_centre(k, i), length)
+                yield _shift(f"{term} {axis}", place, _shifted_centre(k, i), length, " m", term)
             if model.kinds[k].has_attitude:
-                term = f"attitude about {axis}"
-                cause = Cause("number", term, place, nominal=(0.0,), unit=" rad", general="attitude")
-                yield Edit(cause, _turned_attitude(k, i), 1.0)
+                change = _turned_attitude(k, i)
+                yield _shift(f"attitude about {axis}", place, change, 1.0, " rad", "attitude")
         for name, weight in (("drag_force", mass), ("drag_moment", trace)):
             if not getattr(model, name)[k]:
                 yield _number(WORDS[name], place, name, (k,), 0.0, weight, UNITS[name])
@@ -246,9 +246,8 @@ def _joints(model: Model) -> Iterator[Edit]:
     for i in range(len(model.spring_body)):
         for name in SPRING_FIELDS[2:]:
             value = float(getattr(model, name)[i])
-            yield _number(
-                WORDS[name], f"spring {i + 1}", name, (i,), value, abs(value) or 1.0, general=OF_SPRINGS[name]
-            )
+            place, size = f"spring {i + 1}", abs(value) or 1.0
+            yield _number(WORDS[name], place, name, (i,), value, size, general=OF_SPRINGS[name])
     for k, kind in enumerate(model.kinds):
         if kind.holds_nothing:
             continue
@@ -258,19 +257,16 @@ def _joints(model: Model) -> Iterator[Edit]:
             size, can_vanish = abs(value) or 0.1, not kind.holds_distance
             yield _number(own, place, "length", (k,), value, size, unit, can_vanish, general=own)
         if kind.motions and kind.motions[0][0] == "slide" and _shift_is_askew(model, k):
-            cause = Cause("number", "origin of the slide", place, nominal=(0.0,), unit=" m")
-            yield Edit(cause, _shifted_slide(k), 0.1)
+            yield _shift("origin of the slide", place, _shifted_slide(k), 0.1, " m")
         for side, where in enumerate(("far", "near")):
             for axis in range(3):
                 value = float(model.point[k, side, axis])
-                term = f"{where} point {'xyz'[axis]}"
-                general = f"{where} point"
-                yield _number(term, place, "point", (k, side, axis), value, 0.1, " m", general=general)
+                term, at = f"{where} point", (k, side, axis)
+                yield _number(f"{term} {'xyz'[axis]}", place, "point", at, value, 0.1, " m", general=term)
                 if not kind.has_attitude and (side == 0 or not kind.is_rigid):  # equal to a far turn
                     term, side_place = f"turn about {'xyz'[axis]} of the axes", f"{place} in the {where} body"
-                    general = "turn of the axes"
-                    cause = Cause("number", term, side_place, nominal=(0.0,), unit=" rad", general=general)
-                    yield Edit(cause, turned(k, side, np.eye(3)[[axis]]), 0.1)
+                    change = turned(k, side, np.eye(3)[[axis]])
+                    yield _shift(term, side_place, change, 0.1, " rad", "turn of the axes")
 
 
 def _shift_is_askew(model: Model, k: int) -> bool:
@@ -330,19 +326,13 @@ def _factors(case: Case) -> Iterator[Edit]:
         for k in places if one.is_of_each else []:
             if is_several[k] or not is_number:
                 change = scaled(one.names, np.arange(len(has)) == k, one.part)
-                yield _factor(
-                    one.term,
-                    f"{SINGULAR[one.things]} {k + 1}",
-                    change,
-                    one.can_vanish,
-                    one.names,
-                    general=one.general,
-                )
+                place = f"{SINGULAR[one.things]} {k + 1}"
+                yield _factor(one.term, place, change, one.can_vanish, one.general)
         for first in places[: len(places) - 1 if one.is_from_one_on else min(len(places) - 1, 1)]:
             where = has & (np.arange(len(has)) >= first)
             which = f"all {one.things}" if first == places[0] else f"{one.things} {first + 1} to {len(has)}"
             change = scaled(one.names, where, one.part)
-            yield _factor(one.term, which, change, one.can_vanish, one.names, general=one.general)
+            yield _factor(one.term, which, change, one.can_vanish, one.general)
     for name in JOINT_ELEMENTS:
         values = getattr(model, name)
         for what in ("slide", "turn"):
@@ -351,7 +341,7 @@ def _factors(case: Case) -> Iterator[Edit]:
                 mask = np.zeros(values.shape)
                 mask[tuple(np.transpose(chosen))] = 1.0
                 change = scaled((name,), np.ones(len(mask)), mask)
-                yield _factor(WORDS.get(name, name), f"all {what}s", change, fields=(name,))
+                yield _factor(WORDS.get(name, name), f"all {what}s", change)
     rates = [name for name in ("omega", "udot", "xdot") if np.any(_entries(case, name, 1.0))]
     if len(rates) > 1:
         yield _factor("rates of every kind", "", scaled(rates, np.ones(model.n)))
@@ -373,7 +363,7 @@ def _entries(case: Case, name: str, part: Any) -> Array:
     return np.asarray(np.count_nonzero(values * part, axis=tuple(range(1, values.ndim))))
 
 
-def _all(names: Sequence[str]) -> Callable[[Case, Array], Case]:
+def _all(names: Sequence[str]) -> NumberChange:
     return lambda case, x: with_fields(case, **{name: x[0] * field(case, name) for name in names})
 
 
@@ -385,20 +375,16 @@ def _what(model: Model, at: tuple[int, int]) -> str:
 
 def _absent(model: Model) -> Iterator[Edit]:
     """One amount in all places of what the mechanism has nowhere."""
-    for name, scale in (
-        ("drag_force", float(np.max(model.mass))),
-        ("drag_moment", float(np.max(model.inertia))),
-    ):
+    sizes = {"drag_force": float(np.max(model.mass)), "drag_moment": float(np.max(model.inertia))}
+    for name, scale in sizes.items():
         if model.n > 1 and not np.any(getattr(model, name)):
-            cause = Cause("number", WORDS[name], "all bodies", nominal=(0.0,), unit=UNITS[name])
-            yield Edit(cause, added(name, np.ones(model.n)), scale)
+            yield _shift(WORDS[name], "all bodies", added(name, np.ones(model.n)), scale, UNITS[name])
     where = np.zeros(model.armature.shape)
     for at in coordinates(model):
         where[at] = 1.0
     for name in ("armature", "damping"):
         if np.sum(where) > 1 and not np.any(getattr(model, name)):
-            cause = Cause("number", name, "all joints", nominal=(0.0,))
-            yield Edit(cause, added(name, where), float(np.max(model.inertia)))
+            yield _shift(name, "all joints", added(name, where), float(np.max(model.inertia)))
 
 
 def vector_edits(model: Model) -> Iterator[Edit]:

@@ -10,14 +10,23 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from plumbline.diagnosis.cause import FACTORS, Cause
 from plumbline.diagnosis.edits import LENGTHS, Edit, number_edits, vector_edits
-from plumbline.diagnosis.prediction import VECTORS, Answers, Case, Predictor, View
-from plumbline.diagnosis.readings import reading_edits
+from plumbline.diagnosis.prediction import (
+    VECTORS,
+    Answers,
+    Case,
+    Predictor,
+    View,
+    tolerances,
+    values_of,
+)
+from plumbline.diagnosis.readings import change_key, reading_edits
 from plumbline.diagnosis.terms import Terms
 from plumbline.model.datatypes import Array, Model, State, StateQuantities
 from plumbline.truth.ground_truth import StateTruth
@@ -28,7 +37,7 @@ ACCEPTED_SHARE = 1e-6  # of the difference; evaluating in doubles leaves 1e-10 o
 STEP = 1e-5  # of an edit's scale, in slopes
 MIN_SIMILARITY = 0.3  # cosine between the difference and an edit's slope, to be fitted at all
 MAX_CANDIDATES = 24
-MAX_PAIRS = 16
+MAX_PAIRS = 48
 MAX_STEPS = 12
 MIN_SIGNIFICANT = 3.0  # an amount must differ from its nominal by this many times its resolution
 MIN_PROGRESS = 0.9  # of what is left, in a step
@@ -59,25 +68,17 @@ class Difference:
         places: Sequence[int],
     ) -> None:
         """Compare at the states of some places."""
-        self.names = [
-            q for q in view.quantities
-            if all(getattr(x[i], q) is not None for x in (reported, truth.quantities) for i in places)
-        ]  # fmt: skip
-        off, weights, quantities, states = [], [], [], []
-        for q in self.names:
-            for s, i in enumerate(places):
-                wrong = np.asarray(getattr(reported[i], q), float) - getattr(truth.quantities[i], q)
-                bound = np.asarray(truth.bounds[i].tolerance(q)) + (reported[i].limit_error or {}).get(q, 0.0)
-                off.append(wrong.ravel())
-                weights.append(
-                    np.broadcast_to(bound[..., None] if wrong.ndim else bound, wrong.shape).ravel()
-                )
-                quantities += [q] * wrong.size
-                states += [s] * wrong.size
-        bounds = np.concatenate(weights)
-        self.quantity, self.state = np.array(quantities), np.array(states)
+        given, true = ([x[i] for i in places] for x in (reported, truth.quantities))
+        self.names = [q for q in view.quantities if all(getattr(x, q) is not None for x in (*given, *true))]
+        off = [values_of(given, q) - values_of(true, q) for q in self.names]
+        weights = [tolerances([truth.bounds[i] for i in places], q, given) for q in self.names]
+        weights = [x[..., None] if wrong.ndim > x.ndim else x for x, wrong in zip(weights, off, strict=True)]
+        flat = [np.broadcast_to(x, wrong.shape).ravel() for x, wrong in zip(weights, off, strict=True)]
+        self.quantity = np.repeat(self.names, [x.size for x in flat])
+        self.state = np.concatenate([np.repeat(range(len(places)), x.size // len(places)) for x in flat])
+        bounds = np.concatenate(flat)
         self.weight = np.where(bounds > 0, bounds, np.inf)  # 0 explains nothing
-        self.values = np.concatenate(off) / self.weight
+        self.values = np.concatenate([x.ravel() for x in off]) / self.weight
         self.view, self.model = view, model
         self.predictor = Predictor(model, [truth.states[i] for i in places], view)
         self._right = self._flat(self.predictor.right)
@@ -128,10 +129,8 @@ class Difference:
         """Return the effects of combinations of candidates with their amounts, (lanes, m)."""
         cases, linear = list[Case](), np.zeros((len(lanes), len(self.values)))
         for i, (combination, x) in enumerate(lanes):
-            case, first = self.predictor.case, 0
-            for one in combination:
-                own = x[first : first + len(one.cause.nominal)]
-                first += len(one.cause.nominal)
+            case = self.predictor.case
+            for one, own in _split(combination, x):
                 if one.effect is not None:
                     linear[i] += one.effect * (own[0] - one.nominal[0] if len(own) else 1.0)
                 else:
@@ -156,29 +155,27 @@ class Explanation:
 
     def causes(self, states: int) -> tuple[Cause, ...]:
         """State the causes with their amounts and evidence."""
-        found, first = list[Cause](), 0
-        for one in self.combination:
-            count = len(one.cause.nominal)
-            cause = one.cause
-            if count:
-                own = slice(first, first + count)
-                cause = cause.with_amount(self.amounts[own], float(np.max(self.uncertainty[own])))
-            first += count
+        found = list[Cause]()
+        for one, x, uncertainty in _split(self.combination, self.amounts, self.uncertainty):
+            cause = one.cause.with_amount(x, float(np.max(uncertainty))) if len(x) else one.cause
             found.append(replace(cause, left=self.left, states=states))
         return tuple(found)
 
+    def mechanism(self, right: Case) -> object:
+        """What tells the mechanism with these edits from others; of linear terms the explanation itself."""
+        case = right
+        for one, x in _split(self.combination, self.amounts):
+            if one.change is None:
+                return id(self)
+            case = one.change(case, x)
+        return change_key(case, right)
 
-def _simplest(found: list[Explanation]) -> list[Explanation]:
-    """Leave out factors where one number of the same field explains it, and readings where one is missing."""
-    causes = [one.combination[0] for one in found]
-    entries = {one.fields for one in causes if one.cause.unit != "×" and one.fields}
-    are_numbers = any(one.amounts.size and not np.any(one.uncertainty) for one in found)
-    return [
-        one
-        for one, candidate in zip(found, causes, strict=True)
-        if not (candidate.cause.unit == "×" and candidate.fields in entries)
-        and not (are_numbers and candidate.cause.kind == "frame")
-    ]
+
+def _split(combination: Combination, *arrays: Array) -> Iterator[tuple[Any, ...]]:
+    """Edits with their own numbers of each array."""
+    ends = np.cumsum([len(one.cause.nominal) for one in combination])
+    for one, end in zip(combination, ends, strict=True):
+        yield one, *(x[end - len(one.cause.nominal) : end] for x in arrays)
 
 
 class Search:
@@ -240,10 +237,6 @@ class Search:
             Explanation(*self.whole[i], np.zeros(len(self.whole[i][1])), float(left[i]))
             for i in np.flatnonzero(left <= accepted)
         ]
-        if any(
-            one.amounts.size for one in found
-        ):  # the same mechanism by a number that is missing or reversed
-            found = [one for one in found if one.combination[0].cause.kind != "frame"]
         known = {id(one.combination[0]) for one in found}
         slopes = self.slopes[:, mask]
         cosine = np.abs(slopes @ wanted) / np.maximum(
@@ -257,7 +250,10 @@ class Search:
         order_of = {id(one): i for i, one in enumerate((*self.numbers, *self.fixed))}
         # what has words, as missing, before fitted amounts
         key = lambda one: (bool(np.any(one.uncertainty)), order_of[id(one.combination[0])])  # noqa: E731
-        return sorted(_simplest(found + fits), key=key)
+        right, every = self.difference.predictor.case, sorted(found + fits, key=key)
+        by_numbers = {one.mechanism(right) for one in every if one.amounts.size}
+        # a reading that makes the same mechanism as a number is no other cause
+        return [one for one in every if one.amounts.size or one.mechanism(right) not in by_numbers]
 
     def fit(self, starts: Sequence[tuple[Combination, Array]], mask: Mask) -> list[Explanation]:
         """Fit amounts by Newton's method in one batch; keep combinations that explain the difference."""
@@ -298,47 +294,24 @@ class Search:
         return list({id(one.combination[0]): one for one in found}.values())
 
     def explain_by_pairs(self, mask: Mask) -> list[Explanation]:
-        """Return pairs of causes that explain the difference together."""
+        """Return pairs that explain the difference together, of those whose effects span most of it."""
         wanted = self.difference.values[mask]
-        scale = float(np.linalg.norm(wanted))
-        slopes = self.slopes[:, mask]
-        size = np.linalg.norm(slopes, axis=1)
-        seen = np.flatnonzero(size * [one.scale for one in self.numbers] > 1.0)
-        units = slopes[seen] / size[seen, None]
-        effects = self.effects[:, mask]
-        effects = effects[np.all(np.isfinite(effects), axis=1)]
-        whole = [self.whole[i] for i in np.flatnonzero(np.all(np.isfinite(self.effects[:, mask]), axis=1))]
-        options = list[tuple[float, Combination, Array]]()
+        every = [*(((one,), one.nominal) for one in self.numbers), *self.whole]
+        columns = np.concatenate([self.slopes, self.effects])[:, mask]
+        size = np.linalg.norm(columns, axis=1)
+        scales = np.array([*(one.scale for one in self.numbers), *(1.0 for _ in self.whole)])
+        seen = np.flatnonzero(np.isfinite(size) & (size * scales > 1.0))
+        units = columns[seen] / size[seen, None]
         along, gram = units @ wanted, units @ units.T
-        with np.errstate(all="ignore"):  # of two amounts: what projection leaves
+        with np.errstate(all="ignore"):
             gain = (along[:, None] ** 2 + along**2 - 2 * gram * along[:, None] * along) / (1 - gram**2)
         gain = np.triu(np.where(np.abs(gram) < 1 - 1e-9, gain, 0.0), 1)
-        for flat in np.argsort(-gain, axis=None)[:MAX_PAIRS]:
-            i, j = np.unravel_index(flat, gain.shape)
-            pair = self.numbers[seen[i]], self.numbers[seen[j]]
-            options.append(
-                (scale**2 - float(gain[i, j]), pair, np.concatenate([one.nominal for one in pair]))
-            )
-        rest = wanted - effects  # of one whole effect and one amount
-        squares = np.sum(rest**2, axis=1)
-        left = squares[:, None] - (rest @ units.T) ** 2 if len(units) else squares[:, None]
-        for flat in np.argsort(left, axis=None)[: 2 * MAX_PAIRS] if len(units) and len(rest) else ():
-            i, j = np.unravel_index(flat, left.shape)
-            (one,), x = whole[i]
-            other = self.numbers[seen[j]]
-            if one is not other:
-                options.append((float(left[i, j]), (one, other), np.concatenate([x, other.nominal])))
-        both = (
-            squares[:, None] + squares - scale**2 + 2 * effects @ effects.T if len(rest) else np.zeros((0, 0))
-        )
-        both = np.where(np.triu(np.ones(both.shape, bool), 1), both, np.inf)
-        for flat in np.argsort(both, axis=None)[:MAX_PAIRS]:
-            i, j = np.unravel_index(flat, both.shape)
-            if whole[i][0][0] is not whole[j][0][0]:
-                x = np.concatenate([whole[i][1], whole[j][1]])
-                options.append((float(both[i, j]), (whole[i][0][0], whole[j][0][0]), x))
-        options.sort(key=lambda option: option[0])
-        return self.fit([(pair, x) for _, pair, x in options[: 3 * MAX_PAIRS]], mask)
+        starts = list[tuple[Combination, Array]]()
+        for i, j in zip(*np.unravel_index(np.argsort(-gain, axis=None)[:MAX_PAIRS], gain.shape), strict=True):
+            (one, x), (other, y) = every[seen[i]], every[seen[j]]
+            if one != other:
+                starts.append((one + other, np.concatenate([x, y])))
+        return self.fit(starts, mask)
 
 
 class _Fit:
@@ -397,26 +370,9 @@ class _Fit:
         if not self.left <= accepted:
             return None
         uncertainty = self.resolution * max(1.0, self.left)
-        if len(self.x) and np.any(self._significance(uncertainty) < MIN_SIGNIFICANT):
-            return None
-        if any(not one.can_vanish and x * nominal <= 0 for one, x, nominal in self._singles()):
-            return None  # no mass or length
+        for one, x, resolution in _split(self.combination, self.x, uncertainty):
+            if len(x) and np.max(np.abs(x - one.nominal) / resolution) < MIN_SIGNIFICANT:
+                return None
+            if not one.can_vanish and np.any(x * one.nominal <= 0):
+                return None  # no mass or length
         return Explanation(self.combination, self.x, uncertainty, self.left)
-
-    def _singles(self) -> Iterator[tuple[Edit, float, float]]:
-        """The candidates of one amount, with it and the nominal one."""
-        first = 0
-        for one in self.combination:
-            if len(one.cause.nominal) == 1:
-                yield one, float(self.x[first]), float(self.nominal[first])
-            first += len(one.cause.nominal)
-
-    def _significance(self, uncertainty: Array) -> Array:
-        """Of each candidate with amounts, how many times its uncertainty they differ from the right ones."""
-        ratios, first = list[float](), 0
-        for one in self.combination:
-            own = slice(first, first + len(one.cause.nominal))
-            first = own.stop
-            if len(one.cause.nominal):
-                ratios.append(float(np.max(np.abs(self.x - self.nominal)[own] / uncertainty[own])))
-        return np.array(ratios)

@@ -14,8 +14,7 @@ from itertools import combinations, islice
 import numpy as np
 
 from plumbline.diagnosis.digit_loss import REFUSALS, Evaluate, ask
-from plumbline.diagnosis.outputs import error_ratio
-from plumbline.diagnosis.prediction import Predictor, View
+from plumbline.diagnosis.prediction import Predictor, View, error_ratio, tolerances, values_of
 from plumbline.model.datatypes import BODY_FIELDS, JOINT_ELEMENTS, JOINT_FIELDS, KINDS, Flags, Model, State
 from plumbline.model.kinematics import complete_state
 from plumbline.model.loops import cut_open
@@ -233,7 +232,6 @@ def _wrong(model: Model, states: list[State], quantities: Collection[str], evalu
     bounds = rounding_bounds(model, states)
     wrong = set()
     for q in quantities:
-        off = np.array([np.asarray(getattr(answer, q), float) for answer in answers]) - right[q]
-        if not error_ratio(off, np.array([np.asarray(b.tolerance(q)) for b in bounds])) <= VANISHED:
+        if not error_ratio(values_of(answers, q) - right[q], tolerances(bounds, q)) <= VANISHED:
             wrong.add(q)
     return wrong

@@ -6,15 +6,24 @@ reverses the part that a load, an element, a closing joint or a body has in it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from plumbline.diagnosis.cause import Cause, quantity_words, significant
-from plumbline.diagnosis.edits import gyroscopic_moment
-from plumbline.diagnosis.prediction import WRENCHES, Answers, Case, determinate, projectors_at, single_states
+from plumbline.diagnosis.edits import WORDS, gyroscopic_moment
+from plumbline.diagnosis.prediction import (
+    TINY,
+    WRENCHES,
+    Answers,
+    Case,
+    determinate,
+    error_ratio,
+    projectors_at,
+    single_states,
+)
 from plumbline.equations.arithmetic import floats
 from plumbline.equations.tree import Tree
 from plumbline.model.datatypes import Array
@@ -23,19 +32,12 @@ from plumbline.model.loops import cut_open
 
 Choose = Callable[[Array], Array]  # of the rows of some bodies or joints
 MakeCause = Callable[..., Cause]  # of words and amounts
-TINY = float(np.finfo(float).tiny)
 SINGLE_ROUNDING = 1e-5  # of the largest value: what computing in single precision may cost
 MAX_RATIO = 2.0  # in bounds: of what is returned and of the right quantity
 FACTOR_ROUNDING = 1e-6  # of a fitted share of a part: a word for 0, 1, 2 or −1 times
+LOADING = ("force", "moment", "drag_force", "drag_moment", "spring_damping", "spring_stiffness")
 SPRINGS, CLOSING_JOINTS = "the springs between points", "those of the closing joints"
 SHARES = {-1.0: "without {}", 1.0: "with twice {}", -2.0: "with {} of the opposite sign"}
-
-
-def error_ratio(difference: Array, bound: Array) -> float:
-    """Return the largest ‖difference‖/bound, of (S,) scalars or (S, ..., 3) vectors; NaN where any is."""
-    size = np.abs(difference) if difference.ndim == 1 else np.linalg.norm(difference, axis=-1)
-    with np.errstate(over="ignore", invalid="ignore"):
-        return float(np.max(size / np.maximum(bound, TINY), initial=0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,8 +185,6 @@ class Outputs:
             yield f"of another {thing}, the previous one", np.roll(right, 1, 1)
             yield f"of another {thing}, the one counted from the other end", right[:, ::-1]
             yield f"of another {thing}, the one on which it hangs", right[:, hangs]
-        if quantity == "kinetic_energy":
-            yield "of rotation alone", right - 0.5 * np.sum(model.mass[..., None] * state.v**2, axis=(1, 2))
         if quantity == "angular_momentum":
             momentum = np.sum(model.mass[..., None] * state.v, axis=1)
             centre = np.sum(model.mass[..., None] * state.r, axis=1) / np.sum(model.mass, axis=-1)[..., None]
@@ -264,50 +264,20 @@ class Outputs:
         model, state = self.case
         moving = 0.5 * model.mass * np.sum(state.v**2, -1)
         turning = 0.5 * np.sum(state.omega * rotate_vectors(model.inertia, state.omega), -1)
-        parts = _of_bodies(
-            {"{}": moving + turning, "the rotation of {}": turning, "the translation of {}": moving}
-        )
-        return parts + self._element_energies("armature", "rotor", 0)
+        parts = {"{}": moving + turning, "the rotation of {}": turning, "the translation of {}": moving}
+        return _of_bodies(parts) + self._energies(0, "rotor", "armature")
 
     @cached_property
     def _potential(self) -> list[Part]:
         model, state = self.case
         weight = -model.mass * np.sum(state.r * model.gravity[..., None, :], -1)
-        springs = [
-            Part(f"spring {i + 1}", self._energy_without("spring_stiffness", (i,))[1], every=SPRINGS)
-            for i in range(len(model.spring_body))
-        ]
-        parts = _of_bodies({"the weight of {}": weight}) + self._element_energies("stiffness", "spring", 1)
-        if springs:
-            parts += [*springs, Part(SPRINGS, np.sum([s.value for s in springs], axis=0))]
-            of_joints = self._energy_without("stiffness", ())[1]
-            parts.append(Part("all springs", parts[-1].value + of_joints))
-        return parts
-
-    def _energy_without(self, name: str, at: tuple[int, ...]) -> tuple[Array, Array]:
-        """How much kinetic and potential energy a number, or a whole field, adds."""
-        model, state = self.case.model.tree, self.case.state
-        values = getattr(model, name).copy()
-        values[(..., *at)] = 0.0
-        count = len(state.p)
-        full, less = (
-            Tree(floats(), one, state).totals()[:2] for one in (model, replace(model, **{name: values}))
+        between = self._energies(1, "", "spring_stiffness")
+        parts = _of_bodies({"the weight of {}": weight}) + self._energies(1, "spring", "stiffness") + between
+        return (
+            [*parts, Part("all springs", self._energy(1, "stiffness", "spring_stiffness"))]
+            if between
+            else parts
         )
-        kinetic, potential = (
-            np.broadcast_to(x - y, (count, 1, 1))[:, 0, 0] for x, y in zip(full, less, strict=True)
-        )
-        return kinetic, potential
-
-    def _element_energies(self, name: str, word: str, which: int) -> list[Part]:
-        values = getattr(self.case.model, name)[: self.case.model.n]
-        places = [tuple(map(int, at)) for at in np.argwhere(values)] if values.ndim == 2 else []
-        every = f"that of the {word}s"
-        parts = [
-            Part(f"the {word} of joint {k + 1}" + (f" {i + 1}" if np.count_nonzero(values[k]) > 1 else ""),
-                 self._energy_without(name, (k, i))[which], every=every)
-            for k, i in places
-        ]  # fmt: skip
-        return [*parts, Part(every, self._energy_without(name, ())[which])] if places else []
 
     @cached_property
     def _momentum(self) -> list[Part]:
@@ -315,6 +285,26 @@ class Outputs:
         orbital = cross(state.r, model.mass[..., None] * state.v)
         spin = np.matvec(self._turns, rotate_vectors(model.inertia, state.omega))
         return _of_bodies({"{}": orbital + spin, "the spin of {}": spin, "the translation of {}": orbital})
+
+    def _energies(self, which: int, word: str, name: str) -> list[Part]:
+        """The parts of elements in kinetic (0) or potential energy (1): of the numbers of a field."""
+        values, each = getattr(self.case.model, name), list[tuple[str, Array]]()
+        for at in map(tuple, np.argwhere(values).tolist()):
+            several = f" {at[1] + 1}" if len(at) > 1 and np.count_nonzero(values[at[0]]) > 1 else ""
+            what = f"the {word} of joint {at[0] + 1}{several}" if word else f"spring {at[0] + 1}"
+            each.append((what, self._energy(which, name, at=at)))
+        return _each_and_all(f"that of the {word}s" if word else SPRINGS, each)
+
+    def _energy(self, which: int, *names: str, at: tuple[int, ...] = ()) -> Array:
+        """How much kinetic (0) or potential energy (1) a number, or whole fields, add."""
+        model, state = self.case.model.tree, self.case.state
+        changes = {name: getattr(model, name).copy() for name in names}
+        for values in changes.values():
+            values[(..., *at)] = 0.0
+        full, less = (
+            Tree(floats(), one, state).totals()[which] for one in (model, replace(model, **changes))
+        )
+        return np.asarray(np.broadcast_to(full - less, (len(state.p), 1, 1))[:, 0, 0])
 
     # -- wrenches of joints ------------------------------------------------------------------------
 
@@ -329,74 +319,59 @@ class Outputs:
     def _projectors(self) -> list[Array | None]:
         return projectors_at(self.case.model, single_states(self.case.state))
 
-    def _wrench(self, what: str, force: Array, moment: Array, every: str = "") -> Part:
-        """A part in the wrenches of joints; in loops what is determinate of it."""
-        both = determinate(
-            self.case.model, dict(zip(WRENCHES, (force, moment), strict=True)), self._projectors
-        )
-        return Part(what, np.array([both[name] for name in WRENCHES]), every=every)
+    def _determinate(self, wrenches: Array) -> Array:
+        """What is determinate in loops of wrenches (2, S, J, 3)."""
+        both = determinate(self.case.model, dict(zip(WRENCHES, wrenches, strict=True)), self._projectors)
+        return np.array([both[name] for name in WRENCHES])
 
-    def _carried(self, what: str, force: Array, moment: Array, every: str = "") -> Part:
-        """What joints carry of forces and moments (S, N, 3) at the centres of mass."""
+    def _carried(self, loads: Array) -> Array:
+        """What joints carry (2, S, J, 3) of forces and moments (2, S, N, 3) at the centres of mass."""
         model, state = self.case
-        f, m = (np.zeros(self._near.shape) for _ in range(2))
+        carried = np.zeros((2, *self._near.shape))
         for body in range(model.n):
+            force, moment = loads[:, :, body]
             k = body
             while k >= 0:
-                f[:, k] -= force[:, body]
-                m[:, k] -= moment[:, body] + cross(state.r[:, body] - self._near[:, k], force[:, body])
+                carried[0, :, k] -= force
+                carried[1, :, k] -= moment + cross(state.r[:, body] - self._near[:, k], force)
                 k = int(model.body[k, 0])
-        return self._wrench(what, f, m, every)
+        return self._determinate(carried)
 
     @cached_property
     def _wrench_parts(self) -> list[Part]:
         model, state = self.case
-        shape, none = state.v.shape, np.zeros(state.v.shape)
-        loads = {
-            "weight": (np.broadcast_to(model.mass[..., None] * model.gravity[..., None, :], shape), none),
-            "applied force": (np.broadcast_to(model.force, shape), none),
-            "applied moment": (none, np.matvec(self._turns, np.broadcast_to(model.moment, shape))),
-            "drag force": (-model.drag_force[..., None] * state.v, none),
-            "drag moment": (none, -model.drag_moment[..., None] * np.matvec(self._turns, state.omega)),
-        }
-        parts = list[Part]()
-        for what, (force, moment) in loads.items():
-            bodies = [k for k in range(model.n) if np.any(force[:, k]) or np.any(moment[:, k])]
-            if len(bodies) > 1:
-                parts.append(self._carried(f"the {what}s", force, moment))
-            for k in bodies:
-                only = (np.arange(model.n) == k)[:, None]
-                place = f"the {what} of body {k + 1}"
-                parts.append(self._carried(place, force * only, moment * only, f"the {what}s"))
-        parts += self._spring_parts() + self._element_parts() + self._joint_parts()
-        return parts
+        weight = np.zeros((2, *state.v.shape))
+        weight[0] = model.mass[..., None] * model.gravity[..., None, :]
+        parts = self._of_loads("weight", weight)
+        for name in ("force", "moment", "drag_force", "drag_moment"):
+            parts += self._of_loads(WORDS[name], self._loads(**{name: getattr(model, name)}))
+        return parts + self._spring_parts() + self._element_parts() + self._joint_parts()
+
+    def _loads(self, **fields: Array) -> Array:
+        """Forces and moments (2, S, N, 3) of bodies by some fields alone."""
+        model, state = self.case.model.tree, self.case.state
+        none = {name: 0 * getattr(model, name) for name in LOADING}
+        loads = Tree(floats(), replace(model, **none | fields), state).loads()
+        shape = len(state.p), 3, 1
+        return np.array([np.stack([np.broadcast_to(x, shape)[..., 0] for x in some], 1)
+                         for some in zip(*loads, strict=True)])  # fmt: skip
+
+    def _of_loads(self, what: str, loads: Array) -> list[Part]:
+        bodies, places = np.arange(self.case.model.n)[:, None], np.flatnonzero(np.any(loads, axis=(0, 1, 3)))
+        each = [(f"the {what} of body {k + 1}", self._carried(loads * (bodies == k))) for k in places]
+        return _each_and_all(f"the {what}s", each)
 
     def _spring_parts(self) -> list[Part]:
-        model, state = self.case.model.tree, self.case.state
-        parts = list[Part]()
-        count = len(model.spring_body)
-
-        def loads(damping: Array, stiffness: Array) -> tuple[Array, Array]:
-            tree = Tree(floats(), replace(model, spring_damping=damping, spring_stiffness=stiffness), state)
-            return tuple(  # type: ignore[return-value]
-                np.stack([np.broadcast_to(v, (len(state.p), 3, 1))[..., 0] for v in some], 1)
-                for some in zip(*tree.loads(), strict=True)
-            )
-
-        if not count:
-            return parts
-        c, k = model.spring_damping, model.spring_stiffness
-        none = loads(0 * c, 0 * k)
-        chosen = {f"spring {i + 1}": np.arange(count) == i for i in range(count)}
-        if count > 1:
-            chosen[SPRINGS] = np.ones(count, bool)
-        for what, where in chosen.items():
-            force, moment = (x - y for x, y in zip(loads(c * where, k * where), none, strict=True))
-            parts.append(self._carried(what, force, moment, SPRINGS))
-            if np.any(c * where) and np.any(k * where):
-                force, moment = (x - y for x, y in zip(loads(c * where, 0 * k), none, strict=True))
-                part = self._carried(f"the damping of {what}", force, moment, f"the damping of {SPRINGS}")
-                parts.append(part)
+        model, parts = self.case.model, list[Part]()
+        fields = {name: getattr(model, name) for name in ("spring_damping", "spring_stiffness")}
+        both = np.all([np.any(x) for x in fields.values()])
+        for words, names in (("{}", fields), ("the damping of {}", ["spring_damping"] if both else [])):
+            each = list[tuple[str, Array]]()
+            for i in range(len(model.spring_body) if names else 0):
+                only = np.arange(len(model.spring_body)) == i
+                alone = self._carried(self._loads(**{name: fields[name] * only for name in names}))
+                each.append((words.format(f"spring {i + 1}"), alone))
+            parts += _each_and_all(words.format(SPRINGS), each)
         return parts
 
     def _element_parts(self) -> list[Part]:
@@ -418,61 +393,48 @@ class Outputs:
                     pairs = zip(WRENCHES, pair, strict=True)
                     held = sum(e @ self.right[name][s, k] for name, e in pairs if e is not None)
                     values["rotors"][row, s, k] += (held - total) * axis
-        parts = list[Part]()
-        everything = np.zeros((2, *self._near.shape))
+        parts, joints = list[Part](), np.arange(self._near.shape[1])[:, None]
         for name, value in values.items():
-            if np.any(value):
-                every = f"those of the {name} of joints"
-                parts.append(self._wrench(every, *value))
-                joints = np.flatnonzero(np.any(value, axis=(0, 1, 3)))
-                for k in joints if len(joints) > 1 else []:
-                    only = np.zeros_like(value)
-                    only[:, :, k] = value[:, :, k]
-                    part = self._wrench(f"that of the {name} of joint {k + 1}", *only)
-                    parts.append(replace(part, every=every))
-                if name != "rotors":
-                    everything += value
+            places = np.flatnonzero(np.any(value, axis=(0, 1, 3)))
+            each = [
+                (f"that of the {name} of joint {k + 1}", self._determinate(value * (joints == k)))
+                for k in places
+            ]
+            parts += _each_and_all(f"those of the {name} of joints", each)
+        everything = np.sum([values[name] for name in efforts], axis=0)
         if np.any(everything):
-            parts.append(self._wrench("those of their springs, dampers and efforts", *everything))
+            parts.append(Part("those of their springs, dampers and efforts", self._determinate(everything)))
         return parts
 
     def _joint_parts(self) -> list[Part]:
         """What closing joints and children have in the wrenches of the joints before."""
         model, state = self.case
-        right = [self.right.get(name, np.zeros(self._near.shape)) for name in WRENCHES]
+        right = np.array([self.right.get(name, np.zeros(self._near.shape)) for name in WRENCHES])
         parts = list[Part]()
-        closing = range(model.n, len(model.kind))
-        for what, every, share in (
-            ("that of", CLOSING_JOINTS, (1.0, 1.0)),
-            ("the moment of", "the moments of the closing joints", (0.0, 1.0)),
+        for what, every, is_whole in (
+            ("that of", CLOSING_JOINTS, True),
+            ("the moment of", "the moments of the closing joints", False),
         ):
-            total = np.zeros((2, *state.v.shape))
-            for k in closing:
-                applied, force, moment = (
-                    np.zeros_like(total),
-                    share[0] * right[0][:, k],
-                    share[1] * right[1][:, k],
-                )
+            each = list[tuple[str, Array]]()
+            for k in range(model.n, len(model.kind)):
+                applied = np.zeros((2, *state.v.shape))
+                force, moment = is_whole * right[0, :, k], right[1, :, k]
                 for body, sign in zip(model.body[k], (-1.0, 1.0), strict=True):
                     if body >= 0:
                         applied[0, :, body] += sign * force
                         lever = self._near[:, k] - state.r[:, body]
                         applied[1, :, body] += sign * (moment + cross(lever, force))
-                total += applied
-                part = self._carried(f"{what} the closing joint {k + 1}", *applied)
-                parts.append(replace(part, every=every))
-            if len(closing) > 1:
-                parts.append(self._carried(every, *total))
+                each.append((f"{what} the closing joint {k + 1}", self._carried(applied)))
+            parts += _each_and_all(every, each)
         parts += self._welds_of_cuts()
         carried = np.zeros((2, *self._near.shape))
-        for k in range(model.n):
+        for k in np.flatnonzero(model.body[: model.n, 0] >= 0).tolist():
             far = int(model.body[k, 0])
-            if far >= 0:
-                lever = self._near[:, k] - self._near[:, far]
-                carried[0, :, far] += right[0][:, k]
-                carried[1, :, far] += right[1][:, k] + cross(lever, right[0][:, k])
+            lever = self._near[:, k] - self._near[:, far]
+            carried[0, :, far] += right[0][:, k]
+            carried[1, :, far] += right[1][:, k] + cross(lever, right[0][:, k])
         if np.any(carried):
-            parts.append(self._wrench("what the bodies beyond apply", *carried))
+            parts.append(Part("what the bodies beyond apply", self._determinate(carried)))
         return parts
 
     def _welds_of_cuts(self) -> list[Part]:
@@ -484,8 +446,7 @@ class Outputs:
         model, state = self.case
         if not model.has_loops or not self.right.keys() >= {"acceleration", *WRENCHES}:
             return []
-        cut, parts = cut_open(model), list[Part]()
-        every, total = "the moments of the welds in cut bodies", np.zeros(self._near.shape)
+        cut, each = cut_open(model), list[tuple[str, Array]]()
         inertial = np.matvec(model.inertia, self.right["angular_acceleration"]) + gyroscopic_moment(self.case)
         inertial = np.matvec(self._turns, inertial)
         for k in range(model.n, len(model.kind)):
@@ -494,16 +455,14 @@ class Outputs:
             lever = self._near[:, k] - state.r[:, body]
             force, moment = (self.right[name][:, k] for name in WRENCHES)
             weld = share * inertial[:, body] - moment - cross(lever, force)
-            value = np.zeros(self._near.shape)
-            value[:, k] += weld
-            for first, sign in ((int(model.body[k, 0]), 1.0), (body, -1.0)):
-                at = first
+            value = np.zeros((2, *self._near.shape))
+            value[1, :, k] += weld
+            for at, sign in ((int(model.body[k, 0]), 1.0), (body, -1.0)):
                 while at >= 0:
-                    value[:, at] += sign * weld
+                    value[1, :, at] += sign * weld
                     at = int(model.body[at, 0])
-            total += value
-            parts.append(self._wrench(f"the moment of the weld in body {body + 1}", 0 * value, value, every))
-        return [*parts, self._wrench(every, 0 * total, total)] if len(parts) > 1 else parts
+            each.append((f"the moment of the weld in body {body + 1}", self._determinate(value)))
+        return _each_and_all("the moments of the welds in cut bodies", each)
 
     @cached_property
     def _levers(self) -> list[Part]:
@@ -525,7 +484,7 @@ class Outputs:
             lever = cross(self._near - point, self.right["joint_reaction"])
             for kind in ("joint", *dict.fromkeys(model.kind)):
                 where = np.array([kind in ("joint", own) for own in model.kind])[:, None]
-                moment = self._wrench("", 0 * lever, lever * where).value[1]
+                moment = self._determinate(np.array([0 * lever, lever * where]))[1]
                 parts.append(Part(f"the arm of {kind}s to {what}", moment, f"of {kind}s about {what}"))
         return parts
 
@@ -543,15 +502,19 @@ def _share_words(share: float, part: Part) -> tuple[str, tuple[float, ...]]:
 
 
 def _of_bodies(values: dict[str, Array]) -> list[Part]:
-    """Parts (S, N[, 3]) of each body, and of all."""
+    """Parts (S, N[, 3]) of each body, and of all but where that is the whole."""
     parts = list[Part]()
     for words, x in values.items():
-        if words != "{}":
-            parts.append(Part(words.format("all bodies"), np.sum(x, axis=1)))
-        if x.shape[1] > 1:
-            every = words.format("all bodies")
-            parts += [Part(words.format(f"body {k + 1}"), x[:, k], every=every) for k in range(x.shape[1])]
+        each = [(words.format(f"body {k + 1}"), x[:, k]) for k in range(x.shape[1])]
+        found = _each_and_all(words.format("all bodies"), each)
+        parts += found if words != "{}" else found[1:]
     return parts
+
+
+def _each_and_all(every: str, each: Sequence[tuple[str, Array]]) -> list[Part]:
+    """A part of all places, where there are several, and one of each."""
+    total = [Part(every, np.sum([value for _, value in each], axis=0))] if len(each) > 1 else []
+    return total + [Part(what, value, every=every) for what, value in each]
 
 
 def _thing(quantity: str) -> str:

@@ -25,6 +25,7 @@ from plumbline.model.datatypes import (
     Array,
     Model,
     State,
+    StateQuantities,
 )
 from plumbline.model.invariants import kinetic_energy, potential_energy
 from plumbline.model.kinematics import (
@@ -40,6 +41,8 @@ from plumbline.model.kinematics import (
     stack_states,
 )
 from plumbline.model.loops import cut_open, determinate_projectors, wrench_length
+from plumbline.truth.ground_truth import StateTruth
+from plumbline.truth.rounding_bound import RoundingBound
 from reference_impl.direct import DirectSystem
 from reference_impl.joints import constraint_rows
 from reference_impl.singular_system import SingularSystem
@@ -55,8 +58,40 @@ TRAILING = (
     | dict.fromkeys(("inertia", "point", "turn", "spring_point"), 2)
 )
 CONSTANT_FIELDS = ("kind", "body", "spring_body")
+TINY = float(np.finfo(float).tiny)
 MAX_BATCH_BODIES = 12_000  # of one batch
 Answers = dict[str, Array]  # by quantity (S, N, 3), (S, 3) or (S,), or with an axis of lanes before
+
+
+def values_of(answers: Sequence[StateQuantities], quantity: str) -> Array:
+    """Return a quantity (S, ...) of S answers."""
+    return np.asarray([getattr(answer, quantity) for answer in answers], float)
+
+
+def tolerances(
+    bounds: Sequence[RoundingBound], quantity: str, answers: Sequence[StateQuantities] = ()
+) -> Array:
+    """Return what rounding explains at S states, (S,) or (S, N), with the uncertainty of engines' limits."""
+    found = np.array([np.asarray(bound.tolerance(quantity)) for bound in bounds])
+    limits = np.array([(answer.limit_error or {}).get(quantity, 0.0) for answer in answers] or 0.0)
+    return np.asarray((found.T + limits).T)
+
+
+def error_ratio(difference: Array, bound: Array) -> float:
+    """Return the largest ‖difference‖/bound, of (S,) scalars or (S, ..., 3) vectors; NaN where any is."""
+    size = np.abs(difference) if difference.ndim == 1 else np.linalg.norm(difference, axis=-1)
+    with np.errstate(over="ignore", invalid="ignore"):
+        return float(np.max(size / np.maximum(bound, TINY), initial=0.0))
+
+
+def error_ratios(reported: Sequence[StateQuantities], truth: StateTruth, quantity: str) -> Array:
+    """Return the errors (S,) of a quantity in bounds, of the worst body; 0 where there is none."""
+    if any(getattr(answer, quantity) is None for answer in (*reported, *truth.quantities)):
+        return np.zeros(len(reported))
+    off = values_of(reported, quantity) - values_of(truth.quantities, quantity)
+    bound = tolerances(truth.bounds, quantity, reported)
+    found = [error_ratio(off[i : i + 1], bound[i : i + 1]) for i in range(len(off))]
+    return np.where(np.isnan(found), np.inf, found)
 
 
 class Case(NamedTuple):
@@ -167,12 +202,10 @@ class Predictor:
         share = cut.model.mass / self.case.model.mass[near[order]]
         fields = dict[str, Any]()
         for name, value in vars(model).items():
-            if name in ("mass", "inertia"):
+            if name in ("mass", "inertia", *BODY_FIELDS):
                 x = np.take(value, near[order], value.ndim - 1 - TRAILING[name])
-                fields[name] = x * share.reshape(-1, *(1,) * TRAILING[name])
-            elif name in BODY_FIELDS:
-                x = np.take(value, near[order], value.ndim - 1 - TRAILING[name])
-                fields[name] = x * is_body.reshape(-1, *(1,) * TRAILING[name])
+                own = is_body if name in BODY_FIELDS else share
+                fields[name] = x * own.reshape(-1, *(1,) * TRAILING[name])
             elif name in JOINT_FIELDS[2:]:
                 fields[name] = np.take(value, order, value.ndim - 1 - TRAILING[name])
             elif name not in CONSTANT_FIELDS:

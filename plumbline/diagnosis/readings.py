@@ -68,7 +68,7 @@ def reading_edits(case: Case) -> Iterator[Edit]:
     """List the readings of a mechanism that change it, each once."""
     known: set[object] = {()}
     for term, place, words, change in _every_reading(case):
-        key = _key(change(case), case)
+        key = change_key(change(case), case)
         if key in known:
             continue
         known.add(key)
@@ -79,8 +79,11 @@ def _always(change: Change) -> Callable[[Case, Array], Case]:
     return lambda case, _: change(case)
 
 
-def _key(seen: Case, right: Case) -> tuple[tuple[str, bytes], ...]:
-    """What a case changes; quaternions ±q are the same, and of rigid joints only the relative turn counts."""
+def change_key(seen: Case, right: Case) -> tuple[tuple[str, bytes], ...]:
+    """Return what a case changes, to be compared.
+
+    Quaternions ±q are the same, and of rigid joints only the relative turn counts.
+    """
     found = list[tuple[str, bytes]]()
     for changed, base in zip(seen, right, strict=True):
         for name, value in vars(base).items():

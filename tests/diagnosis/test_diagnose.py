@@ -10,8 +10,7 @@ import pytest
 from plumbline.diagnosis.cause import Cause, describe, significant
 from plumbline.diagnosis.diagnose import diagnose
 from plumbline.diagnosis.edits import number_edits
-from plumbline.diagnosis.outputs import error_ratio
-from plumbline.diagnosis.prediction import QUANTITIES, Predictor, View
+from plumbline.diagnosis.prediction import QUANTITIES, Predictor, View, error_ratio
 from plumbline.model.kinematics import (
     complete_state,
     rotation_matrix,
