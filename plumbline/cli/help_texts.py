@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import textwrap
+
 from plumbline.execution.exit_codes import EXIT_CODE_MEANINGS
 
-_EXIT_CODE_LINES = "\n".join(f"{code:5}  {meaning}" for code, meaning in EXIT_CODE_MEANINGS.items())
+WIDTH = 78  # of the help, less its indent
+_EXIT_CODE_LINES = "\n".join(
+    textwrap.fill(meaning, WIDTH, initial_indent=f"{code:5}  ", subsequent_indent=" " * 7)
+    for code, meaning in EXIT_CODE_MEANINGS.items()
+)
 EXIT_CODES = f"""
 \b
 Exit codes:

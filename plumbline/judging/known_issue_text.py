@@ -14,9 +14,10 @@ from plumbline.judging.rows import Row, Verdict
 MATCHED_BY_CAUSE = (*DIAGNOSED_LEVELS, *FOLLOWING_LEVELS)
 MARGIN = 3.0  # of the largest error seen: what a new entry covers
 LINE = 118  # characters
+LARGE = 1e5  # a number that is easier to read with an exponent
 SELECTING = (
     "scenario", "engine", "level", "integrator", "quantity", "verdict", "max_ratio", "max_ratio_by_inertia",
-    "min_bodies", "joints", "shown_by", "intermittent", "extra_refinements_only",
+    "min_bodies", "min_loops", "joints", "shown_by", "intermittent", "extra_refinements_only",
 )  # fmt: skip
 Entry = dict[str, Any]
 
@@ -91,24 +92,38 @@ def _merged(entries: Sequence[Entry]) -> Entry:
     return first | {"evidence": evidence, "rows": rows}
 
 
-def entry_lines(entry: Mapping[str, Any]) -> Iterator[str]:
-    """Write an entry as YAML."""
+def entry_lines(entry: Mapping[str, Any], width: int = LINE) -> Iterator[str]:
+    """Write an entry as YAML, in lines of a width where words are not longer."""
     for place, (name, value) in enumerate(entry.items()):
         lead = "- " if place == 0 else "  "
         if name == "rows":
             yield f"{lead}rows:"
-            yield from (f"    - {_flow(one)}" for one in value)
-        elif isinstance(value, str) and len(value) > LINE - 20:
+            for one in value:
+                yield from _wrapped(_flow(one), "    - ", 8, width)
+        elif isinstance(value, str) and len(value) > width - 20:
             yield f"{lead}{name}: >-"
-            yield from textwrap.wrap(value, LINE, initial_indent="    ", subsequent_indent="    ")
+            yield from _wrapped(value, "    ", 4, width)
         else:
-            yield f"{lead}{name}: {_flow(value)}"
+            yield from _wrapped(f"{name}: {_flow(value)}", lead, 4, width)
+
+
+def _wrapped(text: str, lead: str, indent: int, width: int) -> list[str]:
+    return textwrap.wrap(
+        text,
+        width,
+        initial_indent=lead,
+        subsequent_indent=" " * indent,
+        break_on_hyphens=False,
+        break_long_words=False,
+    )
 
 
 def _flow(value: Any) -> str:
     """Write a value in one line; JSON is YAML, but keys need no quotes."""
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{name}: {_flow(one)}" for name, one in value.items()) + "}"
+    if isinstance(value, float) and value >= LARGE:
+        return f"{value:.2g}" if "." in f"{value:.2g}" else f"{value:.1e}"
     if isinstance(value, list):
         return "[" + ", ".join(map(_flow, value)) + "]"
     return json.dumps(value, ensure_ascii=False)

@@ -101,6 +101,7 @@ class KnownIssue:
     )  # by the number of bodies up to which it holds
     max_ratio_by_inertia: float | None = None  # the same, over `plumbline.model.invariants.inertia_ratio`
     min_bodies: int = 0  # with fewer it does not occur
+    min_loops: int = 0  # the same of loops
     joints: tuple[str, ...] = ()  # kinds, of which the mechanism has one; empty: any
     mechanism: Mechanism | None = None
     shown_by: str = ""  # the engine whose rows show the mechanism; empty: the row's own
@@ -161,8 +162,9 @@ class KnownIssue:
             return False
 
     def needs_of_mechanism_are_met(self, bodies: int, joints: Collection[str]) -> bool:
-        """Return whether a mechanism has what the entry needs."""
-        return bodies >= self.min_bodies and (not self.joints or not set(self.joints).isdisjoint(joints))
+        """Return whether a mechanism has what the entry needs; each joint beyond its bodies closes a loop."""
+        has_enough = bodies >= self.min_bodies and max(len(joints) - bodies, 0) >= self.min_loops
+        return has_enough and (not self.joints or not set(self.joints).isdisjoint(joints))
 
     def covered_ratio(self, bodies: int, inertia_ratio: float) -> float:
         """Return the largest ratio of error and tolerance that the entry covers.
@@ -282,6 +284,7 @@ class _Selector(BaseModel):
         "The largest ratio of error and tolerance, over the chain's largest ratio of inertias.", None
     )
     min_bodies: PositiveInt | None = _field("The smallest number of bodies with which it occurs.", None)
+    min_loops: PositiveInt | None = _field("The smallest number of loops with which it occurs.", None)
     joints: _Texts | None = _field("A kind of joint, or a list: the mechanism has one of them.", None)
     shown_by: str = _field("The engine whose rows show the mechanism.", "")
     intermittent: str = _field("Why the verdict may or may not occur.", "")
@@ -318,7 +321,8 @@ class _Selector(BaseModel):
         """
         own = {one: getattr(self, one) for one in _Selector.model_fields}
         own["engine"] = self.engine or common["engine"]
-        own |= {"min_bodies": self.min_bodies or 0, "joints": tuple(self.joints or ())}
+        own |= {"min_bodies": self.min_bodies or 0, "min_loops": self.min_loops or 0}
+        own |= {"joints": tuple(self.joints or ())}
         lists = {one: own[one] for one in ("scenario", "integrator", "quantity")}
         for names in product(*lists.values()):
             varied = [one for one, given in zip(names, lists.values(), strict=True) if len(given) > 1]

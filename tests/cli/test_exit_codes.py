@@ -52,6 +52,9 @@ def with_module(folder, name, text):
 def test_every_code_has_a_meaning_and_the_help_has_the_table():
     assert set(EXIT_CODE_MEANINGS) == set(ExitCode)
     shown = CliRunner().invoke(main, ["--help"]).stdout
+    table = shown[shown.index("Exit codes:") :]
+    assert all(len(line) <= 80 for line in table.splitlines())
+    shown = re.sub(r"\n {8,}", " ", shown)
     for code, meaning in EXIT_CODE_MEANINGS.items():
         assert re.search(rf"^ +{code:d}  {re.escape(meaning)}$", shown, re.M), code
 
@@ -308,8 +311,8 @@ MINE = "- {id: mine, scenario: rest, engine: mujoco, verdict: unresolved, eviden
         (MINE.replace("mujoco", "mujocoo"), ":1:38: [0].engine: no engine matches 'mujocoo'; did you mean"),
         (None, "cannot be read: No such file"),
         (
-            MINE.replace("mine", "conical-is-unstable"),
-            "[0].id: the id 'conical-is-unstable' is used twice, first at ",
+            MINE.replace("mine", "unstable-steady-motion"),
+            "[0].id: the id 'unstable-steady-motion' is used twice, first at ",
         ),
     ],
 )

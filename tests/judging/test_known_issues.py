@@ -550,12 +550,13 @@ def test_a_row_of_a_motion_follows_from_the_states_that_show_the_finding(tmp_pat
 @pytest.mark.parametrize(
     ("needs", "is_known"),
     [({"min_bodies": 3}, True), ({"min_bodies": 4}, False), ({"joints": "ball"}, True),
-     ({"joints": ["slide", "rod"]}, True), ({"joints": ["slide"]}, False)],
+     ({"joints": ["slide", "rod"]}, True), ({"joints": ["slide"]}, False),
+     ({"min_loops": 1}, True), ({"min_loops": 2}, False)],
 )  # fmt: skip
 def test_an_entry_is_about_mechanisms_that_have_what_it_needs(tmp_path, needs, is_known):
     entries = loaded(tmp_path, {"scenario": "*", **OFF, "max_ratio": 30, **needs})
     excuses = known_issues.KnownIssues(entries, has_extra_refinements=False)
-    (found,) = excuses.mark_known([ratio_row(10.0)], 3, joints=("ball", "rod", "rod"))
+    (found,) = excuses.mark_known([ratio_row(10.0)], 3, joints=("ball", "rod", "rod", "rod"))
     assert (found.known_issue == "a") is is_known
 
 
