@@ -37,15 +37,16 @@ def issue_text(results: Results, finding: Record) -> str:
         f"The error is {value} {first['unit']}, {ratio} times what rounding explains ({tolerance} "
         f"{first['unit']}). Tolerance: {first['derivation']}."
     )
+    count = len(finding["scenarios"])
+    on = f"on {count} mechanisms, of which {first['scenario']} is the smallest" if count > 1 else ""
     parts = [
         f"# {finding['engine']}: {finding['title']}",
         f"## {happens}",
-        f"{first['reason']}.",
+        f"{first['reason'][:1].upper()}{first['reason'][1:]}.",
         f"Diagnosis: {finding['sentence']}." if finding["sentence"] != first["reason"] else "",
         f"## {expects}" if expects else "",
         expected,
-        f"It shows in {len(rows)} comparisons; the smallest mechanism with it is {first['scenario']} of "
-        f"{len(finding['scenarios'])}.",
+        f"It shows in {len(rows)} comparison{'s' * (len(rows) > 1)} {on or 'on ' + first['scenario']}.",
         f"## {how}",
     ]
     if scripted is not None:

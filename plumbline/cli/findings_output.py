@@ -41,7 +41,7 @@ def describe_run(
         yield "[dim]plumbline explain NAME prints everything that is known about one[/]"
     for finding in findings:
         if not finding.needs_attention:
-            yield from recorded_lines(finding, width)
+            yield recorded_line(finding, width)
     yield from family_lines(rows, width, verdict_count)
 
 
@@ -60,20 +60,26 @@ def finding_lines(finding: Finding, width: int) -> list[str]:
     ]
 
 
-def recorded_lines(finding: Finding, width: int) -> list[str]:
-    """Describe a recorded finding in one line, or two where the size would be cut."""
-    shown = shown_verdict(finding.verdict, finding.known_issue)
-    size = "" if finding.largest_ratio is None else f", up to {finding.largest_ratio:.2g} tolerances"
-    text = f"{finding.name}: {coverage(finding)}{size}"
-    head, *more = wrap(text, width - 2, "")
-    return [f"[dim]{SHOWN_STYLES[shown].glyph} {escape(head)}[/]", *(f"[dim]  {escape(x)}[/]" for x in more)]
+def recorded_line(finding: Finding, width: int) -> str:
+    """Describe a recorded finding in one line: in fewer words where the whole is too long."""
+    shown, ratio = shown_verdict(finding.verdict, finding.known_issue), finding.largest_ratio
+    size, short = ("", "") if ratio is None else (f", up to {ratio:.2g} tolerances", f", × {ratio:.2g}")
+    rows = _count_rows(finding)
+    texts = [f"{finding.name}: {x}" for x in (coverage(finding) + size, rows + size, rows + short)]
+    text = next((text for text in texts if len(text) <= width - 2), texts[-1])
+    return f"[dim]{SHOWN_STYLES[shown].glyph} {escape(shorten(text, width - 2))}[/]"
 
 
 def coverage(finding: Finding) -> str:
     """Say which rows a finding has: "4 rows, four-bar and 2 more"."""
-    scenarios, count = finding.scenarios, len(finding.rows)
+    scenarios = finding.scenarios
     more = f" and {len(scenarios) - 1} more" if len(scenarios) > 1 else ""
-    return f"{count} {'row' if count == 1 else 'rows'}, {scenarios[0]}{more}"
+    return f"{_count_rows(finding)}, {scenarios[0]}{more}"
+
+
+def _count_rows(finding: Finding) -> str:
+    count = len(finding.rows)
+    return f"{count} {'row' if count == 1 else 'rows'}"
 
 
 def family_lines(rows: Iterable[Row], width: int, verdict_count: Mapping[Verdict, int]) -> Iterator[str]:
@@ -112,6 +118,8 @@ def explain(
     yield finding.name
     yield from wrap(f"{finding.engine} {finding.version_range}: {finding.title}", width, "  ")
     yield from wrap(finding.sentence, width, "  ")
+    if finding.known_issue and issue is None:
+        yield "  recorded in a file of known issues: --known FILE prints the entry"
     if issue is not None:
         yield ""
         yield f"recorded as {finding.known_issue}:"
@@ -145,7 +153,7 @@ def explain(
     if finding.needs_attention and finding.verdict != Verdict.HARNESS_FAILED:
         yield ""
         yield "To record it, write evidence and reason into this entry of a file for --known:"
-        yield from entry_lines(entry_of(finding))
+        yield from entry_lines(entry_of(finding), width)
 
 
 def wrap(text: str, width: int, indent: str) -> list[str]:

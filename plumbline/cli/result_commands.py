@@ -14,6 +14,7 @@ from plumbline import layout
 from plumbline.cli import options
 from plumbline.cli.help_texts import examples
 from plumbline.cli.terminal_output import count_noun, line_width, make_console, print_table
+from plumbline.judging.rows import Verdict
 from plumbline.scenario.line_and_column_errors import did_you_mean
 from plumbline.storage.results_store import read_results
 
@@ -43,17 +44,32 @@ def history(folder: Path, pattern: str | None, as_json: bool) -> None:
 
 
 def _print_issue(folder: Path, name: str) -> None:
+    """Print the text for the tracker, with a script that is written where the run wrote none."""
+    from plumbline.reproduce.write import write_scripts
     from reports.issue_text import issue_text
     from reports.stored_results import Results
 
     with options.exit_on_damaged_results():
         results = Results.load(folder)
-        finding = next((f for f in results.findings if f["name"] == name), None)
-        if finding is None:
-            names = [f["name"] for f in results.findings]
-            hint = did_you_mean(name, names) or "`plumbline explain` lists them"
-            raise click.UsageError(f"no finding {name!r}; {hint}")
+        finding = results.findings[_place_of(name, [f["name"] for f in results.findings])]
+        verdicts = {row["key"]: row["verdict"] for row in results.rows}
+        wrong = [key for key in finding["rows"] if verdicts[key] == Verdict.DISAGREES]
+        if wrong and results.scripts.keys().isdisjoint(finding["rows"]):
+            written = write_scripts(options.claim_folder(folder), wrong[:1])
+            for reason in written.reasons.values():
+                click.echo(f"no script: {reason}", err=True)
+            results = Results.load(folder)
         click.echo(issue_text(results, finding))
+
+
+def _place_of(name: str, names: list[str]) -> int:
+    """Return which finding has a name, or alone begins with it."""
+    places = [names.index(name)] if name in names else [i for i, x in enumerate(names) if x.startswith(name)]
+    if len(places) != 1:
+        hint = did_you_mean(name, [names[i] for i in places] or names) or "`plumbline explain` lists them"
+        several = f"{len(places)} findings begin so" if places else "no finding has this name"
+        raise click.UsageError(f"{name!r}: {several}; {hint}")
+    return places[0]
 
 
 def _print_history(folder: Path, document: dict[str, Any], pattern: str | None) -> None:
@@ -135,7 +151,10 @@ def _reproduce_model(folder: Path, keys: tuple[str, ...], form: str | None) -> N
     help="Folder of earlier nights: adds trends and the comparison with the last green one.",
 )
 @click.option(
-    "--issue", metavar="FINDING", help="Print the text of an issue for the engine's tracker instead."
+    "--issue",
+    metavar="FINDING",
+    help="Print the text of an issue for the engine's tracker instead, of a finding or of the one whose name "
+    "begins so.",
 )
 def report(folder: Path, history_folder: Path | None, issue: str | None) -> None:
     """Write report.html, junit.xml, summary.md and findings.sarif again, from the results in FOLDER.
@@ -203,7 +222,8 @@ def reproduce(folder: Path, keys: tuple[str, ...], form: str | None) -> None:
     type=options.ResultsPath(),
     help="Folder of results. Default: that of `run`.",
 )
-def explain(name: str | None, folder: Path) -> None:
+@options.known_option
+def explain(name: str | None, folder: Path, known_files: tuple[Path, ...]) -> None:
     """Print everything that is known about a finding of a run, or list its findings.
 
     FINDING is a name that `run` prints, or its beginning.
@@ -222,16 +242,13 @@ def explain(name: str | None, folder: Path) -> None:
             click.echo(f"{finding.name}: {output.coverage(finding)}")
         click.echo(count_noun(len(found), "finding") if found else "no finding", err=True)
         return
-    chosen = [f for f in found if f.name == name] or [f for f in found if f.name.startswith(name)]
-    if len(chosen) != 1:
-        hint = did_you_mean(name, [f.name for f in chosen or found])
-        several = f"{len(chosen)} findings begin so" if chosen else "no finding has this name"
-        raise click.UsageError(f"{name!r}: {several}" + (f"; {hint}" if hint else ""))
-    issues = {issue.name: issue for issue in project_known_issues()}
-    issue, width = issues.get(chosen[0].known_issue or ""), line_width(make_console(sys.stdout))
-    is_own = document["scenarios"].get(chosen[0].rows[0].scenario, {}).get("own", False)
+    chosen = found[_place_of(name, [f.name for f in found])]
+    own = options.read_user_known_issues(known_files, list(document["scenarios"]))
+    issues = {issue.name: issue for issue in (*project_known_issues(), *own)}
+    issue, width = issues.get(chosen.known_issue or ""), line_width(make_console(sys.stdout))
+    is_own = document["scenarios"].get(chosen.rows[0].scenario, {}).get("own", False)
     command = str(document["run"]["command"]) if is_own else ""
-    for line in output.explain(chosen[0], issue, scripts, width, command):
+    for line in output.explain(chosen, issue, scripts, width, command):
         click.echo(line)
 
 

@@ -12,15 +12,23 @@ import click
 import reports
 from plumbline import layout
 from plumbline.cli import options
+from plumbline.cli.findings_output import wrap
 from plumbline.cli.help_texts import EXIT_CODES, examples
 from plumbline.cli.run_display import RunDisplay
-from plumbline.cli.terminal_output import command_line, print_matrix, print_result
+from plumbline.cli.terminal_output import (
+    command_line,
+    line_width,
+    make_console,
+    print_findings,
+    print_result,
+)
 from plumbline.engines.registry import ENGINES
 from plumbline.execution import scenario_verdicts
 from plumbline.execution.exit_codes import ExitCode
 from plumbline.execution.plan import Plan
 from plumbline.execution.result_cache import DiskResultCache, user_cells_folder
 from plumbline.execution.runner import RunResult, exit_code, run_plan, save
+from plumbline.judging.findings import find_findings
 from plumbline.processes.worker_pool import Limits, start_warm_process
 from plumbline.storage.results_store import read_results, row_record, to_json_value
 
@@ -238,15 +246,16 @@ def _leave_out_seen(result: RunResult, seen: frozenset[str]) -> None:
 
 
 def _run_visibly(plan: Plan, as_json: bool, is_fresh: bool) -> RunResult:
-    """Run a plan and show verdicts as they come; an interruption leaves the table of what has finished."""
+    """Run a plan and show verdicts as they come; an interruption leaves the findings of what has finished."""
     display = RunDisplay(sys.stderr)
     try:
         with display as progress:
             return run_plan(plan, progress, display)
     except KeyboardInterrupt:
-        if not as_json and display.finished.scenario_count:
-            print_matrix(display.finished)
-            click.echo(f"{display.finished.scenario_count} of {len(plan.scenarios)} scenarios finished")
+        if not as_json and display.rows:
+            rows = [row for some in display.rows.values() for row in some]
+            print_findings(rows, find_findings(rows, {s.name: s.model.n for s in plan.scenarios}))
+            click.echo(f"{len(display.rows)} of {len(plan.scenarios)} scenarios finished")
         if is_fresh:  # with it the finished cells would be computed again
             raise KeyboardInterrupt("without --fresh") from None
         raise
@@ -263,5 +272,5 @@ def _finish(result: RunResult, report: Path, as_json: bool, has_matrix: bool = F
     click.echo(f"report: {report}", err=as_json)
     if cached := result.cpu_times.cached_count:
         _log(f"{cached} answers of earlier runs were used; --fresh computes them again")
-    _log(result.cpu_times.summary())
+    _log("\n".join(wrap(result.cpu_times.summary(), line_width(make_console(sys.stderr)), "")))
     sys.exit(result.metadata["exit_code"])

@@ -22,13 +22,14 @@ class RunDisplay(ProgressDisplay, RunObserver):
     """The matrix that fills in, above the progress bar; elsewhere than on a terminal a line per scenario.
 
     Attributes:
-        finished: the rows of the scenarios whose tasks have all finished.
+        finished: the cells of the scenarios whose tasks have all finished.
+        rows: theirs, by scenario.
 
     """
 
     def __init__(self, file: Any) -> None:
         super().__init__(file)
-        self.finished = VerdictMatrix({})
+        self.finished, self.rows = VerdictMatrix({}), dict[str, Sequence[Row]]()
         self._matrix = VerdictMatrix({})  # with the rows of unfinished scenarios
         self._refreshed = 0.0  # monotonic time of the last picture
         self._live = Live(
@@ -65,6 +66,7 @@ class RunDisplay(ProgressDisplay, RunObserver):
         if not is_complete:
             self._matrix.add_rows(scenario, rows)
             return
+        self.rows[scenario] = rows
         self.finished.replace_rows(scenario, rows)
         self._matrix.replace_rows(scenario, rows)
         if not self.file.isatty():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from rich.cells import cell_len
@@ -17,7 +17,8 @@ from rich.table import Table
 from plumbline.cli.findings_output import WIDTH, describe_run, legend, wrap
 from plumbline.cli.verdict_matrix import VerdictMatrix, matrix_of_rows
 from plumbline.execution.runner import RunResult
-from plumbline.judging.rows import SHOWN_STYLES, Verdict
+from plumbline.judging.findings import Finding
+from plumbline.judging.rows import SHOWN_STYLES, Row, Verdict
 
 MAX_WIDTH = 160  # columns of a wide terminal that sentences use
 PIPED_WIDTH = 10_000  # columns: in a pipe or a log nothing is cut or wrapped, unless COLUMNS is set
@@ -145,6 +146,21 @@ def print_matrix(matrix: VerdictMatrix) -> None:
     out.print(f"[dim]each cell: worst verdict, its error over tolerance\n{legend}[/]")
 
 
+def print_findings(
+    rows: Sequence[Row], findings: Sequence[Finding], verdict_count: Mapping[Verdict, int] | None = None
+) -> None:
+    """Print findings and families.
+
+    Args:
+        verdict_count: rows of random scenarios that are only counted.
+
+    """
+    out = make_console(sys.stdout)
+    for line in describe_run(rows, findings, line_width(out), verdict_count or {}):
+        out.print(line)
+    out.print(f"[dim]{escape(wrap_items(legend(rows), line_width(out)))}[/]")
+
+
 def print_result(result: RunResult, *, has_matrix: bool = False) -> None:
     """Print what a run found.
 
@@ -161,9 +177,7 @@ def print_result(result: RunResult, *, has_matrix: bool = False) -> None:
             out.print(f"[magenta bold]{escape(line)}[/]")
     if has_matrix:
         print_matrix(matrix_of_rows(result.rows, result.engines))
-    for line in describe_run(result.rows, result.findings, width, result.random_batch.counts_by_verdict):
-        out.print(line)
-    out.print(f"[dim]{escape(wrap_items(legend(result.rows), width))}[/]")
+    print_findings(result.rows, result.findings, result.random_batch.counts_by_verdict)
     for sentence in result.wide_issues:
         for line in wrap(f"i {sentence}", width, ""):
             out.print(f"[yellow]{escape(line)}[/]")

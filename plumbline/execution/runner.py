@@ -352,7 +352,7 @@ def save(result: RunResult, folder: Path, command: str) -> None:
 
 
 def summarize_verdicts(result: RunResult) -> str:
-    """Return the verdicts of a run in one sentence: independent checks, verdicts, disagreements by name."""
+    """Return the verdicts of a run in one sentence: independent checks, verdicts, findings by name."""
     parts, checks = [], 0
     for verdict in sorted(Verdict, key=lambda verdict: verdict != Verdict.HARNESS_FAILED):  # it comes first
         rows = [row for row in result.rows if row.verdict == verdict]
@@ -363,9 +363,9 @@ def summarize_verdicts(result: RunResult) -> str:
         checks += count if verdict.is_comparison else 0
         new = [row for row in rows if row.known_issue is None]
         if verdict in (Verdict.DISAGREES, Verdict.FAILED, Verdict.HARNESS_FAILED) and new:
-            named = list(dict.fromkeys(f"{row.engine}, {row.scenario}: {row.quantity}" for row in new))
+            named = [f.name for f in result.findings if f.needs_attention and f.verdict == verdict]
             more = f" and {len(named) - 3} more" if len(named) > 3 else ""
-            part += f" ({'; '.join(named[:3])}{more})"
+            part += f" ({', '.join(named[:3])}{more})"
         # rows of random scenarios that are only counted are expected, except where there is nothing to expect
         if verdict.needs_attention and count > len(new):
             declared = sum(row.is_declared for row in rows)

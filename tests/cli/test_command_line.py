@@ -168,6 +168,7 @@ def result_of(rows, stale=0, own=frozenset()):
     """What a run found, as far as its summary and its exit code depend on it."""
     return SimpleNamespace(
         rows=rows,
+        findings=find_findings(rows, {}),
         stale_issues=stale * [SimpleNamespace(id="k")],
         random_batch=SimpleNamespace(counts_by_verdict=Counter()),
         own_scenarios=own,
@@ -177,21 +178,19 @@ def result_of(rows, stale=0, own=frozenset()):
 def test_the_summary_counts_one_and_several():
     one, several = (result_of(count * [row("agrees"), row("disagrees")], count) for count in (1, 2))
     assert summarize_verdicts(one).startswith("2 independent checks: 1 agrees, ")
-    words = "1 disagrees (engine, scenario: q)", "1 known entry no longer occurs (k)"
+    words = "1 disagrees (engine-q-at-level-state)", "1 known entry no longer occurs (k)"
     assert all(part in summarize_verdicts(one) for part in words)
-    words = "2 agree", "2 disagree (engine, scenario: q)", "2 known entries no longer occur (k, k)"
+    words = "2 agree", "2 disagree (engine-q-at-level-state)", "2 known entries no longer occur (k, k)"
     assert all(part in summarize_verdicts(several) for part in words)
 
 
 def test_findings_of_the_last_night_do_not_count_but_new_ones_and_failures_do():
     old, new = row("disagrees"), row("disagrees", quantity="new")
     found = result_of([row("agrees"), old])
-    found.findings = find_findings(found.rows, {})
     (name,) = (finding.name for finding in found.findings)
     assert (exit_code(found), exit_code(found, {name}), exit_code(found, {"other"})) == (1, 0, 1)
     for rows, code in (([old, new], 1), ([old, row("failed")], 3), ([old, row("harness failed")], 5)):
         found = result_of([row("agrees"), *rows])
-        found.findings = find_findings(found.rows, {})
         seen = {one.name for one in found.findings if one.quantities != ["new"]}
         assert exit_code(found, seen) == code
 

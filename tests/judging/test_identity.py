@@ -163,7 +163,7 @@ def test_a_run_reports_an_alias_that_is_not_declared(monkeypatch, tmp_path):
     )  # fmt: skip
     assert (
         result.metadata["exit_code"] == 1
-        and "1 disagrees (mujoco, all scenarios" in result.metadata["sentence"]
+        and "1 disagrees (mujoco-identity-with-mujoco-euler-of-implicitfast" in result.metadata["sentence"]
     )
     runner.save(result, tmp_path / "out", "test")
     page = reports.write(tmp_path / "out").read_text()

@@ -22,9 +22,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from rich.markup import render
 
 from plumbline.cli import verdict_matrix
+from plumbline.cli.main import main
 from plumbline.judging.rows import VERDICT_STYLES, Row, Verdict
 from plumbline.model.kinematics import quaternion_product
 from reports import chunks, html_report, junit, report_data, sarif, step_summary
@@ -572,10 +574,29 @@ def test_the_text_of_an_issue_has_script_versions_and_the_expected_number(out):
     results = Results.load(out)
     finding = next(f for f in results.findings if f["verdict"] == "disagrees")
     text = issue_text(results, finding)
-    assert "## Reproduction steps" in text and finding["sentence"] in text
+    assert "## Reproduction steps" in text and finding["sentence"][1:] in text
     assert "times what rounding explains" in text and f"Wrong in {finding['versions'][0]}" in text
     scripts = [results.scripts[key] for key in finding["rows"] if key in results.scripts]
     assert not scripts or scripts[0].rstrip() in text
+
+
+def test_a_finding_is_explained_and_reported_by_the_beginning_of_its_name(out, tmp_path):
+    def typed(*words):
+        return CliRunner().invoke(main, list(map(str, words)))
+
+    results = Results.load(out)
+    scripted = next(f for f in results.findings if not results.scripts.keys().isdisjoint(f["rows"]))
+    printed = typed("report", out, "--issue", scripted["name"][:-1])
+    assert (printed.exit_code, printed.stdout) == (0, issue_text(results, scripted) + "\n")
+    assert "no finding has this name" in typed("report", out, "--issue", "nothing").stderr
+    assert "findings begin so" in typed("explain", "pinocchio", "--results", out).stderr
+    entry = {"id": "coarse-steps", "engine": "mujoco", "verdict": "unresolved"}
+    entry |= {"evidence": "measured", "reason": "short"}
+    own = tmp_path / "own.yaml"
+    own.write_text(json.dumps([entry]))
+    assert "--known FILE prints the entry" in typed("explain", "coarse-steps", "--results", out).stdout
+    explained = typed("explain", "coarse-steps", "--results", out, "--known", own).stdout
+    assert "Evidence: measured" in explained and "short" in explained
 
 
 def test_the_step_summary_shows_text_as_text_and_keeps_its_limit(out):
