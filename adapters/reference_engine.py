@@ -28,7 +28,7 @@ from plumbline.model.datatypes import (
 from plumbline.model.kinematics import joint_coordinates
 from reference_impl.direct import DirectSystem, Solution
 from reference_impl.fast.collocation import integrate_collocation
-from reference_impl.fast.tree_elimination import eliminated_acceleration, eliminated_system
+from reference_impl.fast.tree_elimination import eliminated_system, fastest_acceleration
 from reference_impl.integrate import integrate_dop853
 from reference_impl.singular_system import SingularSystem
 
@@ -97,9 +97,9 @@ class Reference(MetamorphicHooks):
             if integrator.name == "collocation":
                 system = eliminated_system([model], x)
                 return trajectory(integrate_collocation(system, *start, times, resolution))
-            # Where the matrix may be singular the direct form, which says why, and keeps its rows in a run.
-            form = None if model.has_loops or model.lacks_inertia else eliminated_acceleration(model)
-            return trajectory(integrate_dop853(model, *start, times, resolution, form, x))
+            return trajectory(
+                integrate_dop853(model, *start, times, resolution, fastest_acceleration(model), x)
+            )
         except ArithmeticError as error:
             raise EngineFailure(f"{self.title}: {error}") from error
 

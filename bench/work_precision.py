@@ -13,7 +13,7 @@ from plumbline.engines.adapter import Adapter
 from plumbline.model.datatypes import Array, Model, State
 from plumbline.model.kinematics import quaternion_rate
 from reference_impl.fast.collocation import integrate_collocation
-from reference_impl.fast.tree_elimination import eliminated_acceleration
+from reference_impl.fast.tree_elimination import fastest_acceleration
 from reference_impl.integrate import integrate_dop853
 
 SAMPLE_TIMES = np.array([0.0, 2.0])
@@ -121,7 +121,7 @@ def dop853_curve(
                 *stack_states([state]),
                 SAMPLE_TIMES,
                 rtol,
-                acceleration=eliminated_acceleration(model) if structured else None,
+                acceleration=fastest_acceleration(model) if structured else None,
             ).r[-1]
             for state in states
         ]

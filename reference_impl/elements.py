@@ -22,6 +22,7 @@ the far to the near body, along whose axis the torque −k θ u acts: V = ½ k �
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -45,6 +46,21 @@ class ElementForces:
     p_force: Float[Array, "bodies 4"]  # N m, the generalised force on p of the same
     potential: float  # J, of the springs
     dissipation: float  # W, of the dampers
+
+
+class _Motion(NamedTuple):
+    """The coordinates that have elements, and their rates; pairs are of the near and the far body."""
+
+    axes: tuple[Array, Array]  # rows: of the far and the near body
+    spin: Array  # (2, e, 3) rad/s
+    arm: Array  # (2, e, 3) m, to the points
+    turning: Array  # (2, e, 3, 4) from ṗ to ω
+    axis: Array  # (e, 3) w
+    d: Array  # (e, 3) m
+    push: Array  # (e, 3) f
+    n_near: Array
+    n_far: Array
+    rate: Array  # (e,) φ̇
 
 
 class Elements:
@@ -76,6 +92,7 @@ class Elements:
         self.bodies = m.body[self.joint, ::-1].T  # (2, e) near, far
         self.points = np.moveaxis(m.point[self.joint, ::-1], 1, 0)
         self.turns = np.moveaxis(m.turn[self.joint, ::-1], 1, 0)
+        self._axes, self._numbers = A(self.turns), np.arange(len(self.joint))
         self.has_winding_angles = bool(np.any((self.stiffness != 0) & ~self.is_slide & ~self.is_ball))
 
     def coordinates(
@@ -120,27 +137,25 @@ class Elements:
 
         """
         state = _with_world(r, p, v, pdot)
-        re, pe, ve, pdot_e = (y[self.bodies] for y in state)  # (2, e, ·) near, far
-        turn, rates = A(pe), 2 * G(pe)
-        (wb, wa), (b, a) = np.matvec(rates, pdot_e), np.matvec(turn, self.points)
-        h, f = (turn @ A(self.turns)).swapaxes(-1, -2)  # rows: the axes
-        e, is_far, is_slide = np.arange(len(self.joint)), self.is_far[:, None], self.is_slide[:, None]
-        w, carrier = np.where(is_far, f[e, self.axis], h[e, self.axis]), np.where(is_far, wa, wb)
-        d = re[0] + b - re[1] - a
+        at = self._motion(state)
+        (wb, wa), (b, a), w, d = at.spin, at.arm, at.axis, at.d
+        push, n_near, n_far, rate, rates = at.push, at.n_near, at.n_far, at.rate, at.turning
+        ve, carrier = state[2][self.bodies], np.where(self.is_far[:, None], wa, wb)
         d_rate = ve[0] + cross(wb, b) - ve[1] - cross(wa, a)
-        push = w * is_slide
-        n_near, n_far = (np.where(is_slide, cross(arm, w), w) for arm in (b, a + d))
-        rate = dot(push, ve[0] - ve[1]) + dot(n_near, wb) - dot(n_far, wa)
         w_rate = cross(carrier, w)
         bend = cross(wb, cross(wb, b)) - cross(wa, cross(wa, a))
         slide_bias = dot(w, bend) + 2 * dot(w_rate, d_rate) + dot(cross(wa, w_rate), d)
-        stretch = np.where(self.is_slide, dot(w, d), self._angles(f, h, pe, x)) - self.rest
+        stretch = (
+            np.where(self.is_slide, dot(w, d), self._angles(*at.axes, state[1][self.bodies], x)) - self.rest
+        )
         torque = self.effort - self.stiffness * stretch - self.damping * rate
         wrench = torque[:, None] * np.stack([np.hstack([push, n_near]), -np.hstack([push, n_far])])
-        spring_wrench, potential, lost = self._point_springs(state)
+        potential = lost = 0.0
         total = np.zeros((len(r) + 1, 6))  # force, and moment about the centre of mass; the world last
         np.add.at(total, self.bodies, wrench)
-        np.add.at(total, self.mechanism.spring_body.T, spring_wrench)
+        if len(self.mechanism.spring_body):
+            spring_wrench, potential, lost = self._point_springs(state)
+            np.add.at(total, self.mechanism.spring_body.T, spring_wrench)
         return ElementForces(
             r_near=push,
             p_near=np.vecmat(n_near, rates[0]),
@@ -155,6 +170,32 @@ class Elements:
             dissipation=lost + float(self.damping @ rate**2),
         )
 
+    def rates(
+        self,
+        r: Float[Array, "bodies 3"],
+        p: Float[Array, "bodies 4"],
+        v: Float[Array, "bodies 3"],
+        pdot: Float[Array, "bodies 4"],
+    ) -> Float[Array, "joints coordinates"]:
+        """Return the rates of `coordinates` alone."""
+        found = np.zeros(self.mechanism.armature.shape)
+        found[self.joint, self.column] = self._motion(_with_world(r, p, v, pdot)).rate
+        return found
+
+    def _motion(self, state: tuple[Array, ...]) -> _Motion:
+        """What the state says of the coordinates that have elements."""
+        re, pe, ve, pdot_e = (y[self.bodies] for y in state)  # (2, e, ·) near, far
+        turn, turning = A(pe), 2 * G(pe)
+        spin, arm = np.matvec(turning, pdot_e), np.matvec(turn, self.points)
+        (wb, wa), (b, a) = spin, arm
+        h, f = (turn @ self._axes).swapaxes(-1, -2)  # rows: the axes
+        at, is_slide = (self._numbers, self.axis), self.is_slide[:, None]
+        w = np.where(self.is_far[:, None], f[at], h[at])
+        d, push = re[0] + b - re[1] - a, w * is_slide
+        n_near, n_far = (np.where(is_slide, cross(lever, w), w) for lever in (b, a + d))
+        rate = dot(push, ve[0] - ve[1]) + dot(n_near, wb) - dot(n_far, wa)
+        return _Motion((f, h), spin, arm, turning, w, d, push, n_near, n_far, rate)
+
     def with_rotors(self, rows: ConstraintRows, found: ElementForces) -> ConstraintRows:
         """Append the rows of the rotors to those of the joints: they hold nothing, C counts as 0."""
         own = self.rotors
@@ -166,11 +207,13 @@ class Elements:
 
     def _angles(self, f: Array, h: Array, p: Array, x: Array | None) -> Array:
         """Angles (e,) of turns, and of balls the components of the rotation vector."""
-        e, (i, j, k) = np.arange(len(self.axis)), (self.axis + np.arange(3)[:, None]) % 3
+        e, (i, j, k) = self._numbers, (self.axis + np.arange(3)[:, None]) % 3
         cosine = np.where(self.is_far, dot(f[e, j], h[e, j]), dot(f[e, k], h[e, k]))
         angle = np.arctan2(dot(f[e, k], h[e, j]), cosine)
         if x is not None:
             angle += 2 * np.pi * np.round((x[self.joint, self.column] - angle) / (2 * np.pi))
+        if not self.is_ball.any():
+            return angle
         near, far = self.turns[..., :1] * p + np.vecmat(self.turns[..., 1:], L(p))  # p ∘ turn
         scalar, vector = dot(far, near), np.matvec(L(far), near)
         size = np.sqrt(dot(vector, vector))
@@ -181,8 +224,6 @@ class Elements:
     def _point_springs(self, state: tuple[Array, ...]) -> tuple[Array, float, float]:
         """Wrenches (2, K, 6) on both bodies of each spring, its potential energy and dissipated power."""
         m = self.mechanism
-        if not len(m.spring_body):
-            return np.zeros((2, 0, 6)), 0.0, 0.0
         r, p, v, pdot = (y[m.spring_body.T] for y in state)
         arm = np.matvec(A(p), np.moveaxis(m.spring_point, 1, 0))
         d, d_rate = (
@@ -199,5 +240,12 @@ class Elements:
 
 def _with_world(r: Array, p: Array, v: Array, pdot: Array) -> tuple[Array, ...]:
     """The state with the world as the last body, where index −1 finds it."""
-    rest = (np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3), np.zeros(4))
-    return tuple(np.vstack([y, world]) for y, world in zip((r, p, v, pdot), rest, strict=True))
+    found = list[Array]()
+    for y, world in zip((r, p, v, pdot), _WORLD, strict=True):
+        padded = np.empty((len(y) + 1, y.shape[1]), y.dtype)
+        padded[:-1], padded[-1] = y, world
+        found.append(padded)
+    return tuple(found)
+
+
+_WORLD = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3), np.zeros(4)  # r, p, ṙ and ṗ

@@ -48,7 +48,7 @@ from plumbline.truth.parameters import Parameter, perturb
 from plumbline.truth.step_formulas import fastest_rates
 from reference_impl.fast.chain_elimination import component_first
 from reference_impl.fast.collocation import integrate_collocation
-from reference_impl.fast.tree_elimination import TreeSystem, eliminated_acceleration, eliminated_system
+from reference_impl.fast.tree_elimination import TreeSystem, eliminated_system, fastest_acceleration
 from reference_impl.integrate import IntegrationResult, integrate_dop853
 
 NOTES_RTOL = 1e-13  # of the notes' form: at 1e-14 it is no closer to extended precision, the rest is rounding
@@ -221,7 +221,7 @@ def simulate_notes_form(
         if (
             method == "dop853"
         ):  # absolute tolerances of 1 m, 1, 1 m/s and 1 1/s: those by default are too coarse
-            form = eliminated_acceleration(model)
+            form = fastest_acceleration(model)
             run = integrate_dop853(model, *start, times, rtol, form, x=x, atol=rtol)
         else:
             system = eliminated_system([model], x)

@@ -193,7 +193,7 @@ def integrate_collocation(
         if reached > done:
             within, coordinates[done:reached] = stepper.dense_output((times[done:reached] - t) / h)
             if project:
-                within = np.stack([forest.project(q, v) for q, v in within.swapaxes(0, 1)], axis=1)
+                within = stepper.projected(within)
             samples[:, done:reached] = within
         if project:
             stepper.project()
@@ -250,6 +250,7 @@ class _Stepper:
             np.zeros_like(q),
             np.zeros_like(v),
         )  # what rounding took from the sums
+        self.copies: dict[int, EliminatedSystem] = {}  # by number
         self.modes: Array = np.empty(0)  # (7, S, M) Legendre modes of the last step's accelerations
         self.sweeps = 0
 
@@ -332,7 +333,7 @@ class _Stepper:
                 (y[:3].reshape(3, -1).T, y[3:].reshape(4, -1).T) for y in (Q[:, nodes], V[:, nodes])
             )
             if tile.winding:
-                rate = tile.winding.coordinates(r, p, v, pdot)[1]
+                rate = tile.winding.rates(r, p, v, pdot)
                 self.x_rate[nodes] = rate.reshape(-1, *self.x.shape)
         for nodes, tile in systems:
             tile.x = (self.x + np.tensordot(hA[nodes], self.x_rate, 1)).reshape(-1, self.x.shape[1])
@@ -378,6 +379,15 @@ class _Stepper:
         q = self.q0 + h * (tau[:, None, None] * self.v0 + h * np.einsum("tk,ikm->tim", twice, modes))
         x = self.x0 + h * np.tensordot(once @ self.table.node_to_mode, self.x_rate, 1)
         return np.stack([q, v]), x
+
+    def projected(self, samples: Array) -> Array:
+        """Samples (2, T, 7, M) of q and v, on the manifold: all together."""
+        count = samples.shape[1]
+        if count not in self.copies:
+            self.copies[count] = self.forest.repeated(count)
+        side_by_side = samples.swapaxes(1, 2).reshape(2, 7, -1)
+        found = np.stack(self.copies[count].project(*side_by_side))
+        return found.reshape(2, 7, count, -1).swapaxes(1, 2)
 
     def project(self) -> None:
         """Onto the manifold."""

@@ -39,7 +39,7 @@ from reference_impl.direct import (
 from reference_impl.elements import ElementForces, Elements
 from reference_impl.euler_parameters import L, angular_velocity, cross, dot
 from reference_impl.fast.chain_elimination import StructuredSystem, component_first
-from reference_impl.integrate import Acceleration
+from reference_impl.integrate import Acceleration, direct_acceleration
 from reference_impl.joints import ConstraintRows, constraint_rows, joint_of_rows
 from reference_impl.mechanism import Array, Float, Indices, Int, Mechanism, side_by_side
 from reference_impl.singular_system import SingularSystem
@@ -220,11 +220,11 @@ class TreeSystem:
         rest = np.zeros((self.body_count, 6))
         for _ in range(2):  # the second step takes the square of the gap away
             q[3:] /= np.sqrt(dot(q[3:].T, q[3:].T))
-            rows = self._rows(q, v)[0]
+            rows = self._held_rows(q, v)[0]
             q += component_first(*self._eliminate(rows, q[3:].T, rest, -rows.C)[:2])
         q[3:] /= np.sqrt(dot(q[3:].T, q[3:].T))
         v[3:] -= q[3:] * dot(q[3:].T, v[3:].T)
-        rows, rate, _ = self._rows(q, v)
+        rows, rate = self._held_rows(q, v)
         v += component_first(*self._eliminate(rows, q[3:].T, rest, -rate)[:2])
         return q, v
 
@@ -232,14 +232,21 @@ class TreeSystem:
         self, q: Array, v: Array, x: Float[Array, "joints coordinates"] | None = None
     ) -> tuple[ConstraintRows, Array, ElementForces | None]:
         """The rows of all joints and then of all rotors, Ċ, and the elements."""
+        if self.elements is None:
+            return *self._held_rows(q, v), None
         state = q[:3].T, q[3:].T, v[:3].T, v[3:].T
         rows = constraint_rows(self.forest, *state)
         rate = rows.constraint_rate(*state[2:])
-        if self.elements is None:
-            return rows, rate, None
         found = self.elements.evaluate(*state, self.x if x is None else x)
         rotors = np.zeros(len(self.elements.rotors))
         return self.elements.with_rotors(rows, found), np.concatenate([rate, rotors]), found
+
+    def _held_rows(self, q: Array, v: Array) -> tuple[ConstraintRows, Array]:
+        """The rows of all joints, with those of rotors if there are any, and Ċ."""
+        if self.elements and len(self.elements.rotors):
+            return self._rows(q, v)[:2]
+        rows = constraint_rows(self.forest, q[:3].T, q[3:].T, v[:3].T, v[3:].T)
+        return rows, rows.constraint_rate(v[:3].T, v[3:].T)
 
     def _eliminate(
         self, rows: ConstraintRows, p: Array, wrench: Array, gamma: Array, refine: bool = False
@@ -302,26 +309,29 @@ class DenseSystem(TreeSystem):
         """Solve for a (M, 6) and the multipliers, 0 of rows that depend on others."""
         batch, n = len(self.chains), self.chains[0].n
         c, each = len(gamma) // batch, np.arange(len(gamma) // batch)
-        by_body = np.zeros((batch, c, n, 6))
         order, gamma = self.by_mechanism, gamma[self.by_mechanism]
         first, compliance = order[:c], self.compliance[order].reshape(batch, c)
-        by_body[:, each, self.near[first]] = near[order].reshape(batch, c, 6)
-        held = np.flatnonzero(self.far[first] >= 0)
-        by_body[:, held, self.far[first[held]]] += far[order].reshape(batch, c, 6)[:, held]
-        C = by_body.reshape(batch, c, 6 * n)
+        near, far = near[order].reshape(batch, c, 6), far[order].reshape(batch, c, 6)
+        places = [6 * body[first, None] + np.arange(6) for body in (self.near, self.far)]  # columns of C
+        C, held = np.zeros((c, 6 * n)), np.flatnonzero(self.far[first] >= 0)
+        C[each[:, None], places[0]] = near[0]
+        C[held[:, None], places[1][held]] = far[0, held]
         is_soft = compliance[0] > 0
         of_joints = np.flatnonzero(~is_soft)
-        kept = of_joints[independent_rows(C[0][of_joints], RUN_RANK_TOLERANCE)]
+        kept = of_joints[independent_rows(C[of_joints], RUN_RANK_TOLERANCE)]
         kept = np.sort(np.concatenate([kept, np.flatnonzero(is_soft)]))
         size = 6 * n + len(kept)
         S = np.zeros((batch, size, size))
         for k in range(n):
             own = slice(6 * k, 6 * k + 6)
             S[:, own, own] = self.inertia.reshape(batch, n, 6, 6)[:, k]
-        S[:, 6 * n :, : 6 * n] = C[:, kept]
-        S[:, : 6 * n, 6 * n :] = C[:, kept].mT
         each = 6 * n + np.arange(len(kept))
         S[:, each, each] = -compliance[:, kept]
+        for part, columns, some in zip(
+            (near, far), places, (kept >= 0, self.far[first[kept]] >= 0), strict=True
+        ):
+            row, column, values = each[some, None], columns[kept[some]], part[:, kept[some]]
+            S[:, row, column], S[:, column, row] = values, values
         right = np.concatenate([wrench.reshape(batch, -1), gamma.reshape(batch, -1)[:, kept]], axis=1)
         scale = power_of_two_scale(np.max(np.abs(S), axis=-1))
         S *= scale[:, :, None] * scale[:, None]
@@ -359,20 +369,18 @@ def eliminated_system(
     return TreeSystem(mechanisms, x)
 
 
-def eliminated_acceleration(chain: Mechanism) -> Acceleration:
-    """Return the right-hand side of the eliminated form, which takes less time on long chains.
+def fastest_acceleration(chain: Mechanism) -> Acceleration:
+    """Return the right-hand side in the form that takes least time at one state.
 
     Returns:
-        r̈ and p̈ (7 N,) as a function of r, p, ṙ, ṗ.
+        r̈ and p̈ (7 N,) as a function of r, p, ṙ, ṗ: by the structured form of chains, else the direct one.
 
     """
     system = eliminated_system([chain])
+    if not isinstance(system, StructuredSystem):
+        return direct_acceleration(chain)
 
-    def acceleration(
-        r: Array, p: Array, v: Array, pdot: Array, x: Float[Array, "joints coordinates"] | None = None
-    ) -> Array:
-        if isinstance(system, TreeSystem):
-            system.x = x
+    def acceleration(r: Array, p: Array, v: Array, pdot: Array, _: Array | None = None) -> Array:
         a = system.acceleration(component_first(r, p), component_first(v, pdot))
         return np.concatenate([a[:3].T.ravel(), a[3:].T.ravel()])
 
