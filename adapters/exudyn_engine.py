@@ -46,9 +46,11 @@ from adapters.exudyn_common import (
     silence_engine,
     written_items,
 )
-from adapters.exudyn_surface import Probes
+from adapters.exudyn_surface import POSE_FUNCTIONS, Probes, pose_function
+from adapters.pose_functions import add_pose_answers
 from plumbline.model.datatypes import (
     Array,
+    Call,
     Float,
     Integrator,
     JointKind,
@@ -345,14 +347,15 @@ class Exudyn(ExudynAdapter):
         bodies = {"nodes": [*map(int, chain.nodes)], "bodies": [*map(int, chain.piece_bodies)], "held": held}
         return parts | bodies | {"fields": fields}
 
-    def _surface(self, model: Model, states: Sequence[State]) -> list[SurfaceAnswer]:
-        found = list[SurfaceAnswer]()
+    def _surface(self, model: Model, states: Sequence[State]) -> Sequence[SurfaceAnswer]:
+        found = list[dict[str, dict[Call, Array]]]()
         with silence_engine():
             for state in states:
                 chain = ExudynChain(model, state, has_probes=True)
                 _evaluate_state(chain)
                 assert chain.probes is not None
                 found.append(chain.probes.answer())
+            add_pose_answers(found, states, POSE_FUNCTIONS, pose_function)
         return found
 
     def _simulate(

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
+from importlib import import_module
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from adapters.exudyn_common import Output, items
-from plumbline.model.datatypes import Array, Call, Model, SurfaceAnswer
+from plumbline.model.datatypes import Array, Call, Model
 from plumbline.model.kinematics import rotation_matrix
 from plumbline.model.probe_frames import PROBE_ATTITUDE, probe_points
 
@@ -30,6 +31,109 @@ def _in_probe_axes(values: Array) -> Array:
 
 def _axes(values: Array) -> Array:
     return (values.reshape(-1, 3, 3) @ TURN).mT.reshape(-1, 3)
+
+
+def _table(module: str, text: str) -> dict[str, str]:
+    lines = (line.partition(": ") for line in text.strip().splitlines())
+    return {f"{module}.{name}": functions for name, _, functions in lines}
+
+
+# By module the functions of attitudes and poses; adapters/pose_functions.py describes the forms.  Plücker
+# matrices of shifts alone are inverse to those of shifts with turns.
+_OF_BOTH = """
+EulerParameters2RotationMatrix: p -> R
+RotationMatrix2EulerParameters: Q.R -> Q.p
+RotXYZ2RotationMatrix: xyz -> R
+HomogeneousTransformation: R r -> H
+HT2translation: H -> r
+HT2rotationMatrix: H -> R
+Skew: r -> S
+Skew2Vec: S -> r
+"""
+POSE_FUNCTIONS = {
+    **_table("rigidBodyUtilities", _OF_BOTH), **_table("lieGroupBasics", _OF_BOTH),
+    **_table("rigidBodyUtilities", """
+RotationVector2RotationMatrix: phi -> R
+RotationMatrix2RotationVector: Q.R -> Q.phi
+RotationMatrix2RotXYZ: Q.R -> Q.xyz
+RotationMatrix2RotZYZ: Q.R 0 -> Q.zyz
+RotXYZ2EulerParameters: xyz -> p
+EulerParameters2G: Q.p -> @pdot w
+EulerParameters2GLocal: Q.p -> @pdot wl
+RotXYZ2G: Q.xyz -> @xyzdot w
+RotXYZ2GLocal: Q.xyz -> @xyzdot wl
+RotationVector2G: Q.phi -> @wl w
+RotationVector2GLocal: Q.phi -> @wl wl
+AngularVelocity2EulerParameters_t: w Q.p -> pdot
+AngularVelocity2RotXYZ_t: w Q.xyz -> xyzdot
+ComputeSkewMatrix: r -> S
+RotationMatrixX: x -> Rx
+RotationMatrixY: y -> Ry
+RotationMatrixZ: z -> Rz
+HTrotateX: x -> Rx
+HTrotateY: y -> Ry
+HTrotateZ: z -> Rz
+HTtranslate: r -> T
+HTtranslateX: rx -> Tx
+HTtranslateY: ry -> Ty
+HTtranslateZ: rz -> Tz
+InverseHT: I.H -> H
+RotationTranslation2T66: R r -> X
+RotationTranslation2T66Inverse: R r -> XI
+T66toRotationTranslation: X -> R r
+InverseT66toRotationTranslation: XI -> R r
+T66toHT: X -> H
+T66Inverse: XI -> X
+HT2T66Inverse: H -> XI
+RotationX2T66: x -> Rx
+RotationY2T66: y -> Ry
+RotationZ2T66: z -> Rz
+Translation2T66: r -> -T
+TranslationX2T66: rx -> -Tx
+TranslationY2T66: ry -> -Ty
+TranslationZ2T66: rz -> -Tz
+"""),
+    **_table("kinematicTree", """
+RotationX2T66Inverse: x -> -Rx
+RotationY2T66Inverse: y -> -Ry
+RotationZ2T66Inverse: z -> -Rz
+TranslationX2T66Inverse: rx -> Tx
+TranslationY2T66Inverse: ry -> Ty
+TranslationZ2T66Inverse: rz -> Tz
+"""),
+    **_table("robotics.utilities", "HT2translation: H -> r\nHT2rotationMatrix: H -> R"),
+    **_table("lieGroupBasics", """
+ExpSO3: phi -> R
+ExpS3: phi -> p
+ExpSE3: xi -> H
+ExpR3xSO3: rphi -> G
+LogSO3: Q.R -> Q.skew
+LogSE3: Q.H -> Q.log
+TExpSO3: Q.phi -> @phidot wl
+TExpSO3Inv: Q.phi -> @wl phidot
+TExpSE3: Q.xi -> @xidot t
+TExpSE3Inv: Q.xi -> @t xidot
+CompositionRuleForEulerParameters: M.p K.p -> Q.p
+CompositionRuleForRotationVectors: M.phi K.phi -> Q.phi
+CompositionRuleRotXYZAnglesRotationVector: M.xyz K.phi -> Q.xyz
+CompositionRuleDirectProductR3AndR3RotVec: M.rphi shift -> Q.rphi
+CompositionRuleDirectProductR3AndR3RotXYZAngles: M.rxyz shift -> Q.rxyz
+CompositionRuleDirectProductR3AndS3: M.rp shift -> Q.rp
+CompositionRuleSemiDirectProductR3AndR3RotVec: M.rphi K.xi -> Q.rphi
+CompositionRuleSemiDirectProductR3AndR3RotXYZAngles: M.rxyz K.xi -> Q.rxyz
+CompositionRuleSemiDirectProductR3AndS3: M.rp K.xi -> Q.rp
+R3xSO3Matrix: r R -> G
+R3xSO3Matrix2RotationMatrix: G -> R
+R3xSO3Matrix2Translation: G -> r
+"""),
+}  # fmt: skip
+
+
+def pose_function(name: str, given: Sequence[Any], forms: Sequence[str]) -> Sequence[Any]:
+    """Call a function of attitudes or poses."""
+    module, _, function = name.rpartition(".")
+    result = getattr(import_module(f"exudyn.{module}"), function)(*given)
+    return result if len(forms) > 1 and not forms[0].startswith("@") else [result]
 
 
 class _Output(NamedTuple):
@@ -84,7 +188,7 @@ class Probes:
                     item = getattr(items, kind)(**place, outputVariableType=getattr(Output, name), **silent)
                     self.sensors[kind, name, quantity].append(mbs.AddSensor(item))
 
-    def answer(self) -> SurfaceAnswer:
+    def answer(self) -> dict[str, dict[Call, Array]]:
         """Read all at the current state."""
         mbs, found = self.mbs, defaultdict[str, dict[Call, Array]](dict)
         places = (

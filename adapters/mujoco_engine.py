@@ -58,7 +58,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from adapters.mujoco_surface import add_probes, surface_answer
+from adapters.mujoco_surface import POSE_FUNCTIONS, add_probes, pose_function, surface_answer
 from adapters.mujoco_variants import (
     HINGE_ANGLES,
     HINGE_RATES,
@@ -68,6 +68,7 @@ from adapters.mujoco_variants import (
     Change,
     is_constrained,
 )
+from adapters.pose_functions import add_pose_answers
 from plumbline.engines.metamorphic_hooks import MetamorphicHooks
 from plumbline.model import kinematics
 from plumbline.model.datatypes import (
@@ -226,14 +227,23 @@ class Mujoco(MetamorphicHooks):
     def _change(self) -> Change:
         return self.variant.change if self.variant else Change()
 
-    def _surface(self, model: Model, states: Sequence[State]) -> list[SurfaceAnswer]:
+    def _surface(self, model: Model, states: Sequence[State]) -> Sequence[SurfaceAnswer]:
         if self.is_soft(model):
             return []
         chain = _MujocoChain(model, has_probes=True)
         with _raise_on_warnings(chain.d):
-            return [
-                surface_answer(chain.m, chain.d, chain.link_ids, chain.evaluate_forward(s)) for s in states
+            found = [
+                surface_answer(
+                    chain.m,
+                    chain.d,
+                    chain.link_ids,
+                    chain.evaluate_forward(s),
+                    kinematics.elastic_energy(model, s),
+                )
+                for s in states
             ]
+        add_pose_answers(found, states, POSE_FUNCTIONS, pose_function)
+        return found
 
     def _simulate(
         self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float

@@ -14,7 +14,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from plumbline.model.datatypes import Array, Call, Float, Model, SurfaceAnswer
+from plumbline.model.datatypes import Array, Call, Float, Model
 from plumbline.model.kinematics import rotation_matrix
 from plumbline.model.probe_frames import PROBE_ATTITUDE, probe_points
 
@@ -39,6 +39,7 @@ SENSORS = {
     "SUBTREELINVEL": (BODY, "subtree_velocity"),
     "SUBTREEANGMOM": (BODY, "subtree_angular_momentum"),
 }
+ENERGIES = ("E_KINETIC", "E_POTENTIAL")
 AXES = ("FRAMEXAXIS", "FRAMEYAXIS", "FRAMEZAXIS")
 # By function of an object's motion the quantities of its two halves, rotation and point.
 OBJECT_MOTIONS = {
@@ -51,11 +52,36 @@ JACOBIANS = {
     "mj_jacSite": ("frame_velocity", "frame_angular_velocity"),
     "mj_jacBody": ("body_velocity", "frame_angular_velocity"),
     "mj_jacBodyCom": ("body_velocity", "frame_angular_velocity"),
+    "mj_jacPointAxis": ("frame_velocity",),
     "mj_jacDot": ("frame_acceleration", "frame_angular_acceleration"),
     "mj_jacSubtreeCom": ("subtree_velocity",),
     "mj_angmomMat": ("subtree_angular_momentum",),
 }
+# Calls that leave the forces of inverse dynamics.
+INVERSES = (("mj_inverse",), ("mj_inverseSkip",))
 Found = dict[str, dict[Call, Array]]
+SENSOR_STAGES = ("mj_sensorPos", "mj_sensorVel", "mj_sensorAcc")
+# adapters/pose_functions.py describes the forms
+POSE_FUNCTIONS = {
+    "mju_axisAngle2Quat": "axis angle -> p", "mju_euler2Quat": "xyz 'xyz' -> p", "mju_mat2Quat": "R -> p",
+    "mju_mulPose": "L.r L.p Q.r Q.p -> r p", "mju_mulQuat": "L.p Q.p -> p",
+    "mju_mulQuatAxis": "Q.p wl -> 2pdot",
+    "mju_negPose": "I.r I.p -> r p", "mju_negQuat": "I.p -> p", "mju_quat2Mat": "p -> R",
+    "mju_quat2Vel": "Q.p 1 -> Q.phi", "mju_rotVecQuat": "wl Q.p -> w", "mju_trnVecPose": "L.r L.p Q.r -> r",
+    "mju_derivQuat": "Q.p w -> pdot", "mju_subQuat": "Q.p M.p -> K.phi",
+    "mju_quatIntegrate": "M.p K.phi 1 -> Q.p",
+}  # fmt: skip
+SIZES = {"p": 4, "R": 9, "r": 3, "phi": 3, "w": 3, "pdot": 4, "2pdot": 4}
+
+
+def pose_function(name: str, given: Sequence[Any], forms: Sequence[str]) -> list[Array]:
+    """Call a function of attitudes or poses; its results come first."""
+    arguments = [np.ravel(x) if isinstance(x, np.ndarray) else x for x in given]
+    results = [np.empty(SIZES[form.rpartition(".")[2]]) for form in forms]
+    if name == "mju_quatIntegrate":  # in place
+        results = [arguments.pop(0).copy()]
+    getattr(mujoco, name)(*results, *arguments)
+    return results
 
 
 def add_probes(spec: Any, links: Sequence[Any], model: Model) -> None:
@@ -70,29 +96,37 @@ def add_probes(spec: Any, links: Sequence[Any], model: Model) -> None:
             sensor.name, sensor.type = f"{name} {k}", getattr(mujoco.mjtSensor, f"mjSENS_{name}")
             sensor.objtype = objects[kind]
             sensor.objname = site.name if kind == SITE else link.name
+    for name in ENERGIES:
+        sensor = spec.add_sensor()
+        sensor.name, sensor.type = name, getattr(mujoco.mjtSensor, f"mjSENS_{name}")
 
 
-def surface_answer(m: Any, d: Any, links: Sequence[int], rates: Float[Array, "nv nu"]) -> SurfaceAnswer:
+def surface_answer(
+    m: Any, d: Any, links: Sequence[int], rates: Float[Array, "nv nu"], elastic: float
+) -> Found:
     """Read all after the forward dynamics at one state.
 
     Args:
         links: the engine's bodies.
         rates: takes ν to qvel.
+        elastic: energy of the springs [J].
 
     """
     found: Found = defaultdict(dict)
     sites = [m.site(f"probe {k}").id for k in range(len(links))]
-    _add_sensors(found, m, d, len(links))
+    _add_sensors(found, m, d, len(links), elastic)
     _add_frames(found, m, d, links, sites)
     _add_momenta(found, m, d, links)
     _add_torques(found, m, d, rates)
     return found
 
 
-def _add_sensors(found: Found, m: Any, d: Any, count: int) -> None:
-    mujoco.mj_sensorPos(m, d)
-    mujoco.mj_sensorVel(m, d)
-    mujoco.mj_sensorAcc(m, d)
+def _add_sensors(found: Found, m: Any, d: Any, count: int, elastic: float) -> None:
+    for stage in SENSOR_STAGES:
+        getattr(mujoco, stage)(m, d)
+    kinetic, potential = (d.sensor(name).data.copy()[None] for name in ENERGIES)
+    found["kinetic_energy"]["mjtSensor.mjSENS_E_KINETIC",] = kinetic
+    found["gravity_energy"]["mjtSensor.mjSENS_E_POTENTIAL",] = potential - elastic
     read = {name: np.array([d.sensor(f"{name} {k}").data.copy() for k in range(count)]) for name in SENSORS}
     turn = rotation_matrix(read.pop("FRAMEQUAT"))
     axes = [read.pop(name) for name in AXES]
@@ -101,7 +135,8 @@ def _add_sensors(found: Found, m: Any, d: Any, count: int) -> None:
         tuple(f"mjtSensor.mjSENS_{name}" for name in AXES): np.stack(axes, 1).reshape(-1, 3),
     }
     for name, value in read.items():
-        found[SENSORS[name][1]][f"mjtSensor.mjSENS_{name}",] = value
+        stage = SENSOR_STAGES[m.sensor_needstage[m.sensor(f"{name} 0").id] - 1]
+        found[SENSORS[name][1]][f"mjtSensor.mjSENS_{name}", stage] = value
 
 
 def _add_frames(found: Found, m: Any, d: Any, links: Sequence[int], sites: Sequence[int]) -> None:
@@ -132,6 +167,9 @@ def _add_jacobians(found: Found, m: Any, d: Any, links: Sequence[int], sites: Se
         (p, r), (dp, dr) = np.zeros((2, 2, 3, m.nv))
         mujoco.mj_jac(m, d, p, r, d.site_xpos[site], b)
         add("mj_jac", p @ d.qvel, r @ d.qvel)
+        axis = d.site_xmat[site].reshape(3, 3)[:, 0].copy()
+        mujoco.mj_jacPointAxis(m, d, p, r, d.site_xpos[site], axis, b)
+        add("mj_jacPointAxis", p @ d.qvel)
         for call, number in (("mj_jacBody", b), ("mj_jacBodyCom", b), ("mj_jacSite", site)):
             getattr(mujoco, call)(m, d, p, r, number)
             add(call, p @ d.qvel, r @ d.qvel)
@@ -156,9 +194,23 @@ def _add_momenta(found: Found, m: Any, d: Any, links: Sequence[int]) -> None:
     found["centroidal_angular_momentum"]["MjData.subtree_angmom",] = d.subtree_angmom[:1].copy()
 
 
+def _add_factors(found: Found, m: Any, d: Any) -> None:
+    """Add ½ |x|² of what roots of the mass matrix and of its inverse give: kinetic energies."""
+    root, momentum, back = np.zeros((3, m.nv))
+    mujoco.mj_mulM2(m, d, root, d.qvel)
+    mujoco.mj_mulM(m, d, momentum, d.qvel)
+    mujoco.mj_solveM2(m, d, back[None], momentum[None], np.sqrt(d.qLDiagInv))
+    found["kinetic_energy"] |= {
+        ("mj_mulM2",): np.array([[root @ root / 2]]),
+        ("mj_solveM2",): np.array([[back @ back / 2]]),
+        ("MjData.energy",): d.energy[1:, None].copy(),
+    }
+
+
 def _add_torques(found: Found, m: Any, d: Any, rates: Array) -> None:
     v, a = d.qvel.copy(), d.qacc.copy()
     rotors = m.dof_armature * a
+    _add_factors(found, m, d)
     momentum, through, force, tau, gravity = np.zeros((5, m.nv))
     mujoco.mj_mulM(m, d, momentum, v)
     mujoco.mj_solveM(m, d, through[None], momentum[None])
@@ -169,12 +221,27 @@ def _add_torques(found: Found, m: Any, d: Any, rates: Array) -> None:
         ("mj_rne",): tau.copy(),
         ("MjData.qfrc_bias",): d.qfrc_bias + force - rotors,
     }
-    mujoco.mj_inverse(m, d)
-    dynamics["mj_inverse", "MjData.qfrc_inverse"] = d.qfrc_inverse + d.qfrc_passive - rotors
+    for call in INVERSES:
+        d.qfrc_inverse[:] = 0.0
+        for function in call:
+            stage = (mujoco.mjtStage.mjSTAGE_NONE, 1) if function == "mj_inverseSkip" else ()
+            getattr(mujoco, function)(m, d, *stage)
+        dynamics[*call, "MjData.qfrc_inverse"] = d.qfrc_inverse + d.qfrc_passive - rotors
+    if not np.any(m.dof_damping):
+        flags = m.opt.enableflags
+        m.opt.enableflags = flags | int(mujoco.mjtEnableBit.mjENBL_INVDISCRETE)
+        mujoco.mj_inverse(m, d)
+        dynamics["mjtEnableBit.mjENBL_INVDISCRETE",] = d.qfrc_inverse + d.qfrc_passive - rotors
+        m.opt.enableflags = flags
     d.qvel[:] = 0.0
     mujoco.mj_fwdVelocity(m, d)
     mujoco.mj_rne(m, d, 0, gravity)
     of_gravity = {("mj_rne",): gravity, ("MjData.qfrc_bias", "mj_fwdVelocity"): d.qfrc_bias}
+    pulls = np.zeros(m.nv)
+    for b in range(1, m.nbody):
+        weight = -m.body_mass[b] * m.opt.gravity
+        mujoco.mj_applyFT(m, d, weight, np.zeros(3), d.xipos[b], b, pulls)
+    of_gravity["mj_applyFT",] = pulls
     for quantity, values in (
         ("generalized_momentum", {("mj_mulM",): momentum}),
         ("momentum_through_inverse", {("mj_solveM",): through}),

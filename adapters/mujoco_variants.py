@@ -55,6 +55,12 @@ def _no_change(*given: Any) -> Any:
     return given if len(given) > 1 else given[0]
 
 
+NEEDLESS = tuple(  # flags of what no free mechanism without elements has
+    f"mjtDisableBit.mjDSBL_{name}"
+    for name in (
+        "LIMIT", "CONSTRAINT", "EQUALITY", "CLAMPCTRL", "REFSAFE", "SENSOR", "EULERDAMP", "SPRING", "DAMPER",
+    )
+)  # fmt: skip
 BIAS = "mj_rne"
 LAST_STAGES = ("mj_fwdActuation", "mj_fwdAcceleration", "mj_fwdConstraint")
 STAGES = ("mj_fwdPosition", "mj_energyPos", "mj_fwdVelocity", "mj_energyVel", *LAST_STAGES)
@@ -63,6 +69,10 @@ PARTS = (  # the functions that the stages of positions and velocities call
     "mj_projectConstraint", "mj_transmission", "mj_energyPos", "mj_fwdVelocity", "mj_comVel", "mj_passive",
     "mj_referenceConstraint", BIAS, "mj_energyVel", *LAST_STAGES,
 )  # fmt: skip
+OTHER_PARTS = (
+    "mj_fwdKinematics",
+    *(x for x in PARTS if x not in ("mj_kinematics", "mj_comPos", "mj_tendon")),
+)
 
 
 @dataclass(frozen=True)
@@ -150,6 +160,90 @@ def _forward_after_set_state(m: Any, d: Any) -> None:
     mujoco.mj_forward(m, d)
 
 
+def _forward_after_copied_state(m: Any, d: Any) -> None:
+    """Carry the state and the loads over to other data and back, positions and velocities once more alone."""
+    kind, part = mujoco.mjtState.mjSTATE_INTEGRATION, mujoco.mjtState.mjSTATE_PHYSICS
+    other, state = mujoco.MjData(m), np.empty(mujoco.mj_stateSize(m, kind))
+    mujoco.mj_copyState(m, d, other, kind)
+    mujoco.mj_resetData(m, d)
+    mujoco.mj_getState(m, other, state, kind)
+    own = np.empty(mujoco.mj_stateSize(m, part))
+    mujoco.mj_extractState(m, state, kind, own, part)
+    mujoco.mj_copyState(m, other, d, kind)
+    d.qpos[:], d.qvel[:] = m.qpos0, 0.0
+    mujoco.mj_setState(m, d, own, part)
+    mujoco.mj_forward(m, d)
+
+
+def _with_key(spec: Any) -> Any:
+    """Give the model a keyframe."""
+    spec.add_key()
+    return spec
+
+
+def _forward_after_keyframe(m: Any, d: Any) -> None:
+    """Keep the state in a keyframe and reset the data to it; it has no loads."""
+    loads = d.qfrc_applied.copy(), d.xfrc_applied.copy()
+    mujoco.mj_setKeyframe(m, d, 0)
+    mujoco.mj_resetDataKeyframe(m, d, 0)
+    d.qfrc_applied[:], d.xfrc_applied[:] = loads
+    mujoco.mj_forward(m, d)
+
+
+def _forward_from_reference(m: Any, d: Any) -> None:
+    """Reach the positions from those of the model by the motion that leads there in one second."""
+    motion = np.zeros(m.nv)
+    mujoco.mj_differentiatePos(m, motion, 1.0, m.qpos0, d.qpos)
+    d.qpos[:] = m.qpos0
+    mujoco.mj_integratePos(m, d.qpos, motion, 1.0)
+    mujoco.mj_forward(m, d)
+
+
+def _forward_by_step(*functions: str) -> Callable[[Any, Any], None]:
+    """Take the acceleration from the velocity after a step of 1 s, semi-implicit with explicit dampers."""
+
+    def forward(m: Any, d: Any) -> None:
+        flags, (q, v, t) = m.opt.disableflags, (d.qpos.copy(), d.qvel.copy(), d.time)
+        m.opt.integrator, m.opt.timestep = mujoco.mjtIntegrator.mjINT_EULER, 1.0
+        m.opt.disableflags = flags | int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
+        for function in functions:
+            getattr(mujoco, function)(m, d)
+        a = d.qvel - v
+        d.qpos[:], d.qvel[:], d.time, m.opt.disableflags = q, v, t, flags
+        mujoco.mj_forward(m, d)
+        d.qacc[:] = a
+
+    return forward
+
+
+def _forward_by_callback(name: str) -> Callable[[Any, Any], None]:
+    """Apply the forces of the joints in a callback of the engine."""
+
+    def forward(m: Any, d: Any) -> None:
+        force = d.qfrc_applied.copy()
+        place = d.qfrc_passive if name == "passive" else d.qfrc_applied
+
+        def apply(*_: Any) -> None:
+            place[:] = place + force if name == "passive" else force
+
+        d.qfrc_applied[:] = 0.0
+        getattr(mujoco, f"set_mjcb_{name}")(apply)
+        try:
+            mujoco.mj_forward(m, d)
+        finally:
+            getattr(mujoco, f"set_mjcb_{name}")(None)
+        d.qfrc_applied[:] = force
+
+    return forward
+
+
+def _flags(m: Any, d: Any) -> tuple[Any, Any]:
+    """Disable what the mechanism has none of."""
+    for flag in NEEDLESS:
+        m.opt.disableflags |= int(getattr(mujoco.mjtDisableBit, flag.partition(".")[2]))
+    return m, d
+
+
 def _keep(m: Any, d: Any) -> None:
     """Leave what the last state left in the data."""
 
@@ -234,6 +328,22 @@ VARIANTS = (
         "option",
         ("mj_getState", "mj_setState", "mj_stateSize", "mj_resetData"),
         forward=_forward_after_set_state,
+    ),
+    Variant("option", OTHER_PARTS, Change(forward=_forward_by(*OTHER_PARTS)), lambda _: True),
+    _free("option", ("mj_copyState", "mj_extractState"), forward=_forward_after_copied_state),
+    _free(
+        "option",
+        ("mj_setKeyframe", "mj_resetDataKeyframe", "MjsKey"),
+        describe=_with_key,
+        forward=_forward_after_keyframe,
+    ),
+    _free("option", ("mj_differentiatePos", "mj_integratePos"), forward=_forward_from_reference),
+    _free("option", ("mj_Euler",), forward=_forward_by_step("mj_forward", "mj_Euler")),
+    _free("option", ("mj_step2",), forward=_forward_by_step("mj_step1", "mj_step2")),
+    _free("option", ("set_mjcb_passive",), forward=_forward_by_callback("passive")),
+    _free("option", ("set_mjcb_control",), forward=_forward_by_callback("control")),
+    Variant(
+        "option", NEEDLESS, Change(remake=_flags), lambda model: _is_free(model) and not model.has_elements
     ),
     _free("option", ("MjData",), reset=_keep),
     _free("option", ("mj_copyData",), remake=_copied_data),

@@ -43,7 +43,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pinocchio as pin
-from scipy.linalg import lapack
+from scipy.linalg import block_diag, lapack
 
 from adapters.pinocchio_common import (
     PinocchioAdapter,
@@ -57,10 +57,13 @@ from adapters.pinocchio_common import (
     set_corrector,
     translation,
 )
-from adapters.pinocchio_surface import add_probe_frames, surface_answer
+from adapters.pinocchio_surface import POSE_FUNCTIONS, add_probe_frames, pose_function, surface_answer
+from adapters.pinocchio_variants import VARIANTS, Change, Spelling
+from adapters.pose_functions import add_pose_answers
 from plumbline.engines.integrators import dop853, rkmk4, sample_steps, semi_implicit_euler
 from plumbline.model.datatypes import (
     Array,
+    Call,
     Float,
     Integrator,
     Model,
@@ -112,13 +115,13 @@ class PinocchioChain:
         algorithm: str,
         parts: BodyParts | None = None,
         ends: Sequence[tuple[int, int]] = (),
+        change: Change = Change(),  # noqa: B008
     ):
-        self.source_model, self.algorithm = model, algorithm
+        self.source_model, self.algorithm = model, change.algorithm or algorithm
         parts = parts or undivided_bodies(model)
         self.pin_model = pin.Model()
         self.pin_model.gravity = pin.Motion(model.gravity, np.zeros(3))
         self.body_joints: list[int] = []  # joint of body k
-        self.com_frames: list[int] = []  # frame at body k's centre of mass
         self.placements: list[pin.SE3] = []  # of body k's frame in its joint's frame
         for k, (kind, far) in enumerate(zip(model.kinds, model.body[:, 0], strict=True)):
             joint = self.body_joints[far] if far >= 0 else 0
@@ -135,8 +138,10 @@ class PinocchioChain:
             joint = self._add_body(k, joint, hang)
             append_parts(self.pin_model, joint, parts[k], self.placements[k])
             centre = self.placements[k].translation
-            self.com_frames.append(add_frame(self.pin_model, f"com {k}", joint, centre))
+            add_frame(self.pin_model, f"com {k}", joint, centre)
             self.body_joints.append(joint)
+        self.pin_model = change.remake(self.pin_model)
+        self.com_frames = [self.pin_model.getFrameId(f"com {k}") for k in range(model.n)]
         self.data = self.pin_model.createData()
         self.joint_count = self.pin_model.njoints - 1
         self.body_rows = [joint - 1 for joint in self.body_joints]  # of the bodies among the joints
@@ -149,13 +154,15 @@ class PinocchioChain:
         ]  # joints that can have elements
         self._init_elements()
         self.ends = ends
+        # without ends a solver without constraints
+        self.has_constraints = bool(ends) or self.algorithm == "constraintDynamics"
         self.welds, self.weld_data = pin.StdVec_RigidConstraintModel(), pin.StdVec_RigidConstraintData()
         for ends_of_loop in ends:
             places = [(self.body_joints[k], self.placements[k]) for k in ends_of_loop]
             kind, frame = pin.ContactType.CONTACT_6D, pin.ReferenceFrame.LOCAL
             self.welds.append(pin.RigidConstraintModel(kind, self.pin_model, *places[0], *places[1], frame))
             self.weld_data.append(self.welds[-1].createData())
-        if ends:
+        if self.has_constraints:
             init_constraint_dynamics(self.pin_model, self.data, self.welds, self.weld_data)
         self._init_loads()
 
@@ -370,7 +377,7 @@ class PinocchioChain:
             self._add_up_loads()
         self.update_loads(q, v)
         torque = self.joint_torque(q, v)
-        if self.ends:
+        if self.has_constraints:
             return self._closed_acceleration(q, v, torque)
         if self.algorithm in ("crba", "cholesky", "forwardDynamics"):
             engine, data = self.pin_model, self.data
@@ -628,6 +635,53 @@ class PinocchioChain:
         return found
 
 
+class _SpelledTree(PinocchioChain):
+    """A tree whose joints are other models than usual, at one state."""
+
+    def __init__(
+        self, model: Model, algorithm: str, parts: BodyParts | None, change: Change, state: State
+    ) -> None:
+        """Build it beside the usual one, which has the coordinates and what takes ν to velocities."""
+        self.usual, self.spellings = PinocchioChain(model, algorithm, parts), change.joints
+        self.usual_q, self.usual_v = self.usual.coordinates(state)
+        self.q, self.blocks = list[Array](), list[Array]()  # by joint
+        super().__init__(model, algorithm, parts)
+
+    def _add_joint(self, parent: int, joint: Any, placement: pin.SE3, name: str) -> int:
+        own, spelling = self.usual.joints[len(self.q)], self.spellings.get(joint.shortname(), Spelling())
+        usual_q = self.usual_q[own.idx_q : own.idx_q + own.nq]
+        made, q = spelling.make(joint), spelling.coordinates(usual_q)
+        (turn, S), (turn_now, S_now) = _joint_motion(joint, usual_q), _joint_motion(made, q)
+        if spelling.at_angles:
+            placement = placement * pin.SE3(turn @ turn_now.T, np.zeros(3))
+        self.q.append(q)
+        self.blocks.append(np.linalg.pinv(S_now) @ S)
+        return super()._add_joint(parent, made, placement, name)
+
+    def coordinates(self, state: State) -> tuple[Array, Array]:
+        """Return those of its state."""
+        return np.concatenate(self.q), block_diag(*self.blocks) @ self.usual_v
+
+    def joint_torque(self, q: Array, v: Array) -> Array:
+        """Evaluate springs, dampers and efforts: both velocities have the same power."""
+        torque = self.usual.joint_torque(self.usual_q, self.usual_v)
+        return np.linalg.solve(block_diag(*self.blocks).T, torque)
+
+    def rate_map(self, state: State, q: Array) -> Array:
+        """Map ν to the velocity at its state."""
+        return np.asarray(block_diag(*self.blocks) @ self.usual.rate_map(state, self.usual_q))
+
+
+def _joint_motion(joint: Any, q: Array) -> tuple[Array, Array]:
+    """Return the turn and the motion subspace (6, nv) of a joint alone."""
+    alone = pin.Model()
+    number = alone.addJoint(0, joint, pin.SE3.Identity(), "joint")
+    data = alone.createData()
+    pin.forwardKinematics(alone, data, q)
+    turn = data.oMi[number].rotation.copy()
+    return turn, np.reshape(pin.computeJointJacobian(alone, data, q, number), (6, -1)).copy()
+
+
 def _placed(placement: pin.SE3) -> tuple[Array, Array]:
     """Return rotation and translation of a placement."""
     return placement.rotation.copy(), placement.translation.copy()
@@ -706,6 +760,7 @@ class Pinocchio(PinocchioAdapter):
     )
     builds_trees = builds_elements = moves_loops = True
     options: ClassVar[tuple[str, ...]] = ("cholesky", "forwardDynamics")
+    variants = VARIANTS
     usual_algorithm: ClassVar[str] = "crba"  # for the accelerations of state evaluation
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
@@ -713,7 +768,11 @@ class Pinocchio(PinocchioAdapter):
             cut = cut_open(model)
             tree = PinocchioChain(cut.model, self.usual_algorithm, ends=cut.ends)
             return [cut.source_quantities(tree.quantities(cut.state(state))) for state in states]
-        chain = PinocchioChain(model, self.option or self.usual_algorithm, self.body_pieces(model))
+        change = self.variant.change if self.variant else Change()
+        given = model, self.option or self.usual_algorithm, self.body_pieces(model)
+        if change.joints:
+            return [_SpelledTree(*given, change, state).quantities(state) for state in states]
+        chain = PinocchioChain(*given, change=change)
         return [chain.quantities(state) for state in states]
 
     def written(self, model: Model, state: State) -> dict[str, Any]:
@@ -725,15 +784,21 @@ class Pinocchio(PinocchioAdapter):
         found["fields"] |= {"bodies": cut.place[: model.n], "joints": cut.place}
         return found
 
-    def _surface(self, model: Model, states: Sequence[State]) -> list[SurfaceAnswer]:
+    def _surface(self, model: Model, states: Sequence[State]) -> Sequence[SurfaceAnswer]:
         chain = PinocchioChain(model, self.usual_algorithm)
         frames = add_probe_frames(chain.pin_model, chain.body_joints, chain.placements, model)
         chain.data = chain.pin_model.createData()
-        found = list[SurfaceAnswer]()
+        inertias = [
+            place.act(pin.Inertia(mass, np.zeros(3), inertia))
+            for place, mass, inertia in zip(chain.placements, model.mass, model.inertia, strict=True)
+        ]
+        found = list[dict[str, dict[Call, Array]]]()
         for state in states:
             q, v = chain.coordinates(state)
             motion = q, v, chain.acceleration(q, v)
-            found.append(surface_answer(chain.pin_model, frames, motion, chain.rate_map(state, q)))
+            answer = surface_answer(chain.pin_model, frames, inertias, motion, chain.rate_map(state, q))
+            found.append(answer)
+        add_pose_answers(found, states, POSE_FUNCTIONS, pose_function)
         return found
 
     def _simulate(
@@ -773,8 +838,9 @@ class PinocchioAba(Pinocchio):
         "integrators": "another algorithm of Pinocchio is compared at state level only"
     }
     options = ("crba",)
+    variants = ()
     usual_algorithm = "aba"
     loops_unsupported_reason = "aba has no constraints; the column pinocchio closes loops"
 
-    def _surface(self, model: Model, states: Sequence[State]) -> list[SurfaceAnswer]:
+    def _surface(self, model: Model, states: Sequence[State]) -> Sequence[SurfaceAnswer]:
         return []  # the column pinocchio has it

@@ -4,6 +4,10 @@ Reference frames: LOCAL has the origin and the axes of the frame, LOCAL_WORLD_AL
 world's axes, WORLD gives the spatial vector at the world's origin.  A frame's acceleration is the spatial one
 but for `getFrameClassicalAcceleration` and for the rate of the Jacobian in LOCAL_WORLD_ALIGNED.  `rnea` and
 `crba` count the rotors, which are taken out of torques here.
+
+What a joint has is taken to the probe frame on it.  Derivatives are compared along v, by what holds for every
+mechanism: terms of velocities are of second degree, so that ∂τ/∂v v is twice them; a velocity's derivatives
+by q and v, times v and v̇, are its rate; and v · ∂g/∂q v + g · v̇ is the second rate of the energy of gravity.
 """
 
 from __future__ import annotations
@@ -15,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from plumbline.model.datatypes import Array, Call, Float, Model, SurfaceAnswer
+from plumbline.model.datatypes import Array, Call, Float, Model
 from plumbline.model.kinematics import rotation_matrix
 from plumbline.model.probe_frames import PROBE_ATTITUDE, probe_points
 
@@ -33,6 +37,19 @@ FRAMES = {
     "LOCAL": _Frame("_local", "_local"),
     "WORLD": _Frame("_at_origin"),
 }
+POSE_FUNCTIONS = {  # adapters/pose_functions.py describes the forms
+    "exp3": "phi -> R", "log3": "Q.R -> Q.phi", "exp3_quat": "phi -> xyzw", "exp": "phi -> R",
+    "log": "Q.R -> Q.phi",
+    "Jexp3": "Q.phi -> @phidot wl", "Jlog3": "Q.R -> @wl phidot", "skew": "r -> S", "unSkew": "S -> r",
+    "exp6": "xi -> H", "log6": "Q.H -> Q.xi", "exp6_quat": "xi -> rxyzw", "log6_quat": "Q.rxyzw -> Q.xi",
+    "Jexp6": "Q.xi -> @xidot t", "Jlog6": "Q.H -> @t xidot",
+    "XYZQUATToSE3": "rxyzw -> H", "SE3ToXYZQUAT": "H -> rxyzw", "SE3ToXYZQUATtuple": "H -> rxyzw",
+    "rpy.rpyToMatrix": "rpy -> R", "rpy.matrixToRpy": "Q.R -> Q.rpy", "rpy.rotate": "'x' x -> Rx",
+    "rpy.computeRpyJacobian": "Q.rpy -> @rpydot wl", "rpy.computeRpyJacobianInverse": "Q.rpy -> @wl rpydot",
+    "liegroups.SO3": "L.xyzw Q.phi -> xyzw", "liegroups.SE3": "L.rxyzw Q.xi -> rxyzw",
+    "liegroups.R3": "L.r dr -> r",
+}  # fmt: skip
+OF_MOTIONS = ("exp6", "Jexp6")  # take a pin.Motion
 ANGULAR = {"velocity": "velocity", "acceleration": "acceleration", "spatial_acceleration": "acceleration"}
 Found = dict[str, dict[Call, Array]]
 
@@ -57,22 +74,38 @@ def add_probe_frames(
 def surface_answer(
     pin_model: pin.Model,
     frames: Sequence[int],
+    bodies: Sequence[pin.Inertia],
     motion: tuple[Float[Array, "nq"], Float[Array, "nv"], Float[Array, "nv"]],
     rates: Float[Array, "nv nu"],
-) -> SurfaceAnswer:
+) -> Found:
     """Evaluate all at one state.
 
     Args:
         frames: the probe frames by body.
+        bodies: inertias of the bodies, in their joints' frames.
         motion: q, v and v̇.
         rates: takes ν to v.
 
     """
     found: Found = defaultdict(dict)
     _add_frames(found, pin_model, frames, motion)
-    _add_centres(found, pin_model, motion)
-    _add_torques(found, pin_model, motion, rates)
+    _add_data(found, pin_model, frames, motion)
+    _add_centres(found, pin_model, frames, motion)
+    _add_regressors(found, pin_model, frames, bodies, motion)
+    _add_torques(found, pin_model, bodies, motion, rates)
     return found
+
+
+def pose_function(name: str, given: Sequence[Any], _: Sequence[str]) -> list[Any]:
+    """Call a function of attitudes or poses."""
+    function = pin
+    for part in name.split("."):
+        function = getattr(function, part)
+    if name.startswith("liegroups"):
+        return [function().integrate(*given)]
+    arguments = [pin.SE3(x) if np.shape(x) == (4, 4) else x for x in given]
+    result = function(*(map(pin.Motion, given) if name in OF_MOTIONS else arguments))
+    return [result.homogeneous if isinstance(result, pin.SE3) else getattr(result, "vector", result)]
 
 
 def _product(matrix: Any, x: Array) -> Array:
@@ -80,19 +113,19 @@ def _product(matrix: Any, x: Array) -> Array:
     return np.reshape(matrix, (-1, len(x))) @ x
 
 
+def _rate(by_q: Any, by_v: Any, v: Array, a: Array) -> Array:
+    """The rate of something whose derivatives by q and v these are."""
+    return _product(by_q, v) + _product(by_v, a)
+
+
 def _add_frames(
     found: Found, m: pin.Model, frames: Sequence[int], motion: tuple[Array, Array, Array]
 ) -> None:
-    (q, v, a), data = motion, m.createData()
+    (q, v, a), data, derived = motion, m.createData(), m.createData()
     pin.forwardKinematics(m, data, q, v, a)
     pin.updateFramePlacements(m, data)
-    places = {
-        "updateFramePlacements": [data.oMf[f].copy() for f in frames],
-        "updateFramePlacement": [pin.updateFramePlacement(m, data, f).copy() for f in frames],
-    }
-    for function, poses in places.items():
-        found["frame_position"][function,] = np.array([pose.translation for pose in poses])
-        found["frame_axes"][function,] = np.concatenate([pose.rotation.T for pose in poses])
+    pin.computeForwardKinematicsDerivatives(m, derived, q, v, a)
+    pin.updateFramePlacements(m, derived)
     pin.computeJointJacobiansTimeVariation(m, data, q, v)
     other = m.createData()
     for name, frame in FRAMES.items():
@@ -100,100 +133,367 @@ def _add_frames(
         # by function, what its vectors are, by which algorithm
         twists: dict[tuple[str, str, str], list[Array]] = defaultdict(list)
         for f in frames:
+            joint, place = m.frames[f].parentJoint, m.frames[f].placement
+            here = {"LOCAL": place, "WORLD": pin.SE3.Identity()}.get(
+                name, pin.SE3(np.eye(3), data.oMi[joint].rotation @ place.translation)
+            )
+            joint_velocity = pin.getVelocity(m, data, joint, reference)
 
-            def read(function: str, f: int = f, reference: Any = reference) -> Any:
-                return getattr(pin, function)(m, data, f, reference)
+            def add(
+                function: str,
+                what: str,
+                twist: Any,
+                by: str = "",
+                is_of_joint: bool = False,
+                here: pin.SE3 = here,
+                at_joint: Any = joint_velocity,
+                twists: Any = twists,
+            ) -> None:
+                vector = np.array(getattr(twist, "vector", twist))
+                if is_of_joint:  # a classical acceleration is moved as the spatial one
+                    if what == "acceleration":
+                        what, vector[:3] = (
+                            "spatial_acceleration",
+                            vector[:3] - np.cross(at_joint.angular, at_joint.linear),
+                        )
+                    vector = here.actInv(pin.Motion(vector)).vector
+                twists[function, what, by].append(vector)
 
-            J, dJ = read("getFrameJacobian"), read("getFrameJacobianTimeVariation")
-            rates = {"getFrameJacobianTimeVariation": _product(dJ, v) + _product(J, a)}
-            velocities = {
-                "getFrameVelocity": read("getFrameVelocity").vector,
-                "getFrameJacobian": _product(J, v),
-            }
+            for of, number in (("Frame", f), ("Joint", joint)):
+
+                def read(function: str, d: Any = data, number: int = number, r: Any = reference) -> Any:
+                    return getattr(pin, function)(m, d, number, r)
+
+                is_of_joint = of == "Joint"
+                plain = "" if is_of_joint else of
+                J, dJ = read(f"get{of}Jacobian"), read(f"get{of}JacobianTimeVariation")
+                by_q, by_v = read(f"get{of}VelocityDerivatives", derived)[:2]
+                add(f"get{plain}Velocity", "velocity", read(f"get{plain}Velocity"), "", is_of_joint)
+                add(f"get{of}Jacobian", "velocity", _product(J, v), "", is_of_joint)
+                rate = _rate(dJ, J, v, a)
+                by = "_by_jacobian_rate"
+                add(f"get{of}JacobianTimeVariation", frame.of_rate, rate, by, is_of_joint)
+                by, function = "_by_derivative", f"get{of}VelocityDerivatives"
+                add(function, "velocity", _product(by_v, v), by, is_of_joint)
+                # its rate in the world's axes is that of spatial vectors, too
+                add(function, "spatial_acceleration", _rate(by_q, by_v, v, a), by, is_of_joint)
+                function = f"get{of}AccelerationDerivatives"
+                *_, of_v, of_a = read(function, derived)
+                add(function, "spatial_acceleration", _rate(of_v, of_a, v / 2, a), by, is_of_joint)
+                function = f"get{plain}Acceleration"
+                add(function, "spatial_acceleration", read(function), "", is_of_joint)
+                if reference != pin.ReferenceFrame.WORLD:
+                    function = f"get{plain}ClassicalAcceleration"
+                    add(function, "acceleration", read(function), "", is_of_joint)
             J = np.array(pin.computeFrameJacobian(m, other, q, f, reference))
             dJ = pin.frameJacobianTimeVariation(m, other, q, v, f, reference)
-            velocities["computeFrameJacobian"] = _product(J, v)
-            rates["frameJacobianTimeVariation"] = _product(dJ, v) + _product(J, a)
-            for function, twist in velocities.items():
-                twists[function, "velocity", ""].append(twist)
-            for function, twist in rates.items():
-                twists[function, frame.of_rate, "_by_jacobian_rate"].append(twist)
-            function = "getFrameAcceleration"
-            twists[function, "spatial_acceleration", ""].append(read(function).vector)
-            if reference != pin.ReferenceFrame.WORLD:
-                function = "getFrameClassicalAcceleration"
-                twists[function, "acceleration", ""].append(read(function).vector)
+            add("computeFrameJacobian", "velocity", _product(J, v))
+            add("frameJacobianTimeVariation", frame.of_rate, _rate(dJ, J, v, a), "_by_jacobian_rate")
+            if name == "LOCAL":
+                J = pin.computeJointJacobian(m, other, q, joint)
+                add("computeJointJacobian", "velocity", _product(J, v), "", True)
         for (function, what, by), values in twists.items():
             call, (linear, angular) = (function, f"ReferenceFrame.{name}"), np.split(np.array(values), 2, 1)
             found[f"frame_{what}{frame.of_point}{by}"][call] = linear
             found[f"frame_angular_{ANGULAR[what]}{frame.of_rotation}{by}"][call] = angular
+        if name != "WORLD":
+            _add_points(found, m, derived, frames, name, v, a)
 
 
-def _add_centres(found: Found, m: pin.Model, motion: tuple[Array, Array, Array]) -> None:
-    (q, v, a), data = motion, m.createData()
+def _add_points(
+    found: Found, m: pin.Model, derived: pin.Data, frames: Sequence[int], name: str, v: Array, a: Array
+) -> None:
+    """Add what derivatives of points' velocities and accelerations say; points have no angular part."""
+    frame, reference = FRAMES[name], getattr(pin.ReferenceFrame, name)
+    rows = defaultdict[tuple[str, str], list[Array]](list)
+    for f in frames:
+        place = m.frames[f].parentJoint, m.frames[f].placement, reference
+        by_q, by_v = pin.getPointVelocityDerivatives(m, derived, *place)
+        *_, of_v, of_a = pin.getPointClassicAccelerationDerivatives(m, derived, *place)
+        function = "getPointVelocityDerivatives"
+        rows["velocity", function].append(_product(by_v, v))
+        what = "spatial_acceleration" if name == "LOCAL" else "acceleration"
+        rows[what, function].append(_rate(by_q, by_v, v, a))
+        acceleration = _rate(of_v, of_a, v / 2, a)
+        rows["acceleration", "getPointClassicAccelerationDerivatives"].append(acceleration)
+    for (what, function), values in rows.items():
+        found[f"frame_{what}{frame.of_point}_by_derivative"][function,] = np.array(values)
+
+
+def _add_data(found: Found, m: pin.Model, frames: Sequence[int], motion: tuple[Array, Array, Array]) -> None:
+    """Add what algorithms leave in their data, joint by joint."""
+    (q, v, a), data, derived = motion, m.createData(), m.createData()
+    pin.rnea(m, data, q, v, a)
+    pin.computeRNEADerivatives(m, derived, q, v, a)
+    pin.forwardKinematics(m, data, q, v, a)
+    pin.updateFramePlacements(m, data)
+    pin.computeJointJacobiansTimeVariation(m, data, q, v)
+    pin.updateGlobalPlacements(m, data)
+    chained = [pin.SE3.Identity()]
+    for joint in range(1, m.njoints):
+        chained.append(chained[m.parents[joint]] * data.liMi[joint])
+    spatial, places = (
+        "spatial_acceleration",
+        [(m.frames[f].parentJoint, m.frames[f].placement) for f in frames],
+    )
+    poses = {
+        ("forwardKinematics", "Data.oMi"): [data.oMi[j] * place for j, place in places],
+        ("Data.liMi",): [chained[j] * place for j, place in places],
+        ("updateFramePlacements", "Data.oMf"): [data.oMf[f].copy() for f in frames],
+        ("updateFramePlacement",): [pin.updateFramePlacement(m, data, f).copy() for f in frames],
+        ("updateGlobalPlacements",): [data.oMi[j] * place for j, place in places],
+    }
+    for call, found_poses in poses.items():
+        found["frame_position"][call] = np.array([pose.translation for pose in found_poses])
+        found["frame_axes"][call] = np.concatenate([pose.rotation.T for pose in found_poses])
+    weight = pin.Motion(m.gravity.linear, np.zeros(3))
+    for what, at, by, values in (
+        ("velocity", "_local", ("forwardKinematics", "Data.v"), data.v),
+        (spatial, "_local", ("forwardKinematics", "Data.a"), data.a),
+        (spatial, "_local", ("rnea", "Data.a_gf"),
+         [x + pose.actInv(weight) for x, pose in zip(data.a_gf, data.oMi, strict=True)]),
+        ("velocity", "_at_origin", ("computeRNEADerivatives", "Data.ov"), derived.ov),
+        (spatial, "_at_origin", ("computeRNEADerivatives", "Data.oa"), derived.oa),
+        (spatial, "_at_origin", ("computeRNEADerivatives", "Data.oa_gf"),
+         [x + weight for x in derived.oa_gf]),
+    ):  # fmt: skip
+        twists = [place.actInv(values[j]) if at == "_local" else values[j] for j, place in places]
+        found[f"frame_{what}{at}"][by] = np.array([twist.linear for twist in twists])
+        turn = "_local" if at == "_local" else ""
+        found[f"frame_angular_{ANGULAR[what]}{turn}"][by] = np.array([twist.angular for twist in twists])
+    J, dJ = (np.reshape(x, (6, m.nv)) for x in (data.J, data.dJ))
+    columns = [
+        np.concatenate([np.arange(m.idx_vs[i], m.idx_vs[i] + m.nvs[i]) for i in m.supports[j]]).astype(int)
+        for j, _ in places
+    ]
+    velocity = np.array([J[:, own] @ v[own] for own in columns])
+    rate = np.array([dJ[:, own] @ v[own] + J[:, own] @ a[own] for own in columns])
+    found["frame_velocity_at_origin"]["computeJointJacobians", "Data.J"] = velocity[:, :3]
+    by = "computeJointJacobiansTimeVariation", "Data.dJ"
+    found["frame_spatial_acceleration_at_origin_by_jacobian_rate"][by] = rate[:, :3]
+
+
+def _add_centres(
+    found: Found, m: pin.Model, frames: Sequence[int], motion: tuple[Array, Array, Array]
+) -> None:
+    (q, v, a), data, derived = motion, m.createData(), m.createData()
     found["total_mass"]["computeTotalMass",] = np.array([[pin.computeTotalMass(m)]])
     pin.centerOfMass(m, data, q, v, a)
-    for quantity, values in (("", data.com), ("_velocity", data.vcom), ("_acceleration", data.acom)):
-        found[f"centre_of_mass{quantity}"]["centerOfMass",] = values[0][None].copy()
-    jacobian = pin.jacobianCenterOfMass(m, data, q)
-    found["centre_of_mass_velocity"]["jacobianCenterOfMass",] = _product(jacobian, v)[None]
+    for quantity, name in (("", "com"), ("_velocity", "vcom"), ("_acceleration", "acom")):
+        values = getattr(data, name)
+        found[f"centre_of_mass{quantity}"]["centerOfMass", f"Data.{name}"] = values[0][None].copy()
+    jacobian = np.reshape(pin.jacobianCenterOfMass(m, data, q), (3, -1)).copy()
+    found["centre_of_mass_velocity"]["jacobianCenterOfMass", "Data.Jcom"] = _product(data.Jcom, v)[None]
+    pin.computeForwardKinematicsDerivatives(m, derived, q, v, a)
+    pin.centerOfMass(m, derived, q, v)
+    rate = _rate(pin.getCenterOfMassVelocityDerivatives(m, derived), jacobian, v, a)
+    found["centre_of_mass_acceleration_by_derivative"]["getCenterOfMassVelocityDerivatives",] = rate[None]
+    joints = [m.frames[f].parentJoint for f in frames]
+    if len(set(joints)) == len(joints):  # no joint carries two bodies
+        _add_subtrees(found, m, joints, motion)
     momenta = {
-        "computeCentroidalMomentum": pin.computeCentroidalMomentum(m, data, q, v).vector.copy(),
-        "computeCentroidalMap": _product(pin.computeCentroidalMap(m, data, q), v),
-        "ccrba": _product(pin.ccrba(m, data, q, v), v),
+        ("computeCentroidalMomentum", "Data.hg"): pin.computeCentroidalMomentum(m, data, q, v).vector.copy(),
+        ("computeCentroidalMap", "Data.Ag"): _product(pin.computeCentroidalMap(m, data, q), v),
+        ("ccrba",): _product(pin.ccrba(m, data, q, v), v),
     }
-    rates = {
-        "computeCentroidalMomentumTimeVariation": pin.computeCentroidalMomentumTimeVariation(
-            m, data, q, v, a
-        ).vector.copy(),
-    }
+    variation = pin.computeCentroidalMomentumTimeVariation(m, data, q, v, a).vector.copy()
+    rates = {("computeCentroidalMomentumTimeVariation", "Data.dhg"): variation}
+    dAg = np.array(pin.computeCentroidalMapTimeVariation(m, data, q, v))
     by_map = {
-        "computeCentroidalMapTimeVariation": _product(pin.computeCentroidalMapTimeVariation(m, data, q, v), v)
-        + _product(data.Ag, a),
-        "dccrba": _product(pin.dccrba(m, data, q, v), v) + _product(data.Ag, a),
+        ("computeCentroidalMapTimeVariation", "Data.dAg"): _rate(dAg, data.Ag, v, a),
+        ("dccrba",): _rate(pin.dccrba(m, data, q, v), data.Ag, v, a),
     }
-    for suffix, twists in (("", momenta), ("_rate", rates), ("_rate_by_map_rate", by_map)):
-        for function, twist in twists.items():
-            found[f"momentum{suffix}"][function,] = twist[None, :3].copy()
-            found[f"centroidal_angular_momentum{suffix}"][function,] = twist[None, 3:].copy()
+    pin.computeCentroidalDynamicsDerivatives(m, derived, q, v, a)
+    by_derivative = dict[Call, Array]()
+    again = m.createData()
+    pin.computeRNEADerivatives(m, again, q, v, a)
+    for name, (h_q, _, of_v, of_a) in (
+        ("compute", pin.computeCentroidalDynamicsDerivatives(m, derived, q, v, a)),
+        ("get", pin.getCentroidalDynamicsDerivatives(m, again)),
+    ):
+        by_derivative[f"{name}CentroidalDynamicsDerivatives",] = (
+            _rate(h_q, of_a, v, a) + _rate(of_v, of_a, v / 2, a)
+        ) / 2
+    for suffix, twists in (
+        ("", momenta), ("_rate", rates), ("_rate_by_map_rate", by_map),
+        ("_rate_by_derivative", by_derivative),
+    ):  # fmt: skip
+        for call, twist in twists.items():
+            found[f"momentum{suffix}"][call] = twist[None, :3].copy()
+            found[f"centroidal_angular_momentum{suffix}"][call] = twist[None, 3:].copy()
 
 
-def _add_torques(found: Found, m: pin.Model, motion: tuple[Array, Array, Array], rates: Array) -> None:
-    (q, v, a), data, zero = motion, m.createData(), np.zeros(m.nv)
+def _add_subtrees(
+    found: Found, m: pin.Model, joints: Sequence[int], motion: tuple[Array, Array, Array]
+) -> None:
+    (q, v, a), data, other = motion, m.createData(), m.createData()
+    pin.centerOfMass(m, data, q, v, a, True)
+    poses = [data.oMi[j] for j in joints]
+    centres = [pose.act(data.com[j]) for j, pose in zip(joints, poses, strict=True)]
+    found["subtree_centre"]["centerOfMass",] = np.array(centres)
+    for quantity, values in (("velocity", data.vcom), ("acceleration", data.acom)):
+        turned = [pose.rotation @ values[j] for j, pose in zip(joints, poses, strict=True)]
+        found[f"subtree_{quantity}"]["centerOfMass",] = np.array(turned)
+    pin.computeSubtreeMasses(m, data)
+    found["subtree_mass"]["computeSubtreeMasses", "Data.mass"] = np.array([[data.mass[j]] for j in joints])
+    velocities = [_product(pin.jacobianSubtreeCenterOfMass(m, other, q, j), v) for j in joints]
+    found["subtree_velocity"]["jacobianSubtreeCenterOfMass",] = np.array(velocities)
+    pin.jacobianCenterOfMass(m, other, q)
+    velocities = [_product(pin.getJacobianSubtreeCenterOfMass(m, other, j), v) for j in joints]
+    found["subtree_velocity"]["getJacobianSubtreeCenterOfMass",] = np.array(velocities)
+    pin.crba(m, other, q, pin.Convention.LOCAL)
+    centres = [pose.act(other.Ycrb[j].lever) for j, pose in zip(joints, poses, strict=True)]
+    found["subtree_centre"]["Data.Ycrb",] = np.array(centres)
+    pin.ccrba(m, other, q, v)
+    found["subtree_centre"]["Data.oYcrb",] = np.array([other.oYcrb[j].lever for j in joints])
+
+
+def _add_regressors(
+    found: Found, m: pin.Model, frames: Sequence[int], bodies: Sequence[pin.Inertia],
+    motion: tuple[Array, Array, Array],
+) -> None:  # fmt: skip
+    (q, v, a), data = motion, m.createData()
+    pin.rnea(m, data, q, v, a)
+    forces = defaultdict[str, list[pin.Force]](list)
+    pin.updateFramePlacements(m, data)
+    for f, inertia in zip(frames, bodies, strict=True):
+        j, place = m.frames[f].parentJoint, m.frames[f].placement
+        own, here = inertia.toDynamicParameters(), place.actInv(inertia).toDynamicParameters()
+        forces["bodyRegressor"].append(
+            place.actInv(pin.Force(pin.bodyRegressor(data.v[j], data.a_gf[j]) @ own))
+        )
+        forces["jointBodyRegressor"].append(place.actInv(pin.Force(pin.jointBodyRegressor(m, data, j) @ own)))
+        forces["frameBodyRegressor"].append(pin.Force(pin.frameBodyRegressor(m, data, f) @ here))
+    for function, values in forces.items():
+        found["body_force_local"][function,] = np.array([force.linear for force in values])
+        found["body_moment_local"][function,] = np.array([force.angular for force in values])
+    pin.forwardKinematics(m, data, q, v)
+    own_twists = [
+        (m.jointPlacements[j].inverse() * data.liMi[j]).act(
+            data.v[j] - data.liMi[j].actInv(data.v[m.parents[j]])
+        )
+        for j in range(1, m.njoints)
+    ]
+    turns = np.concatenate([twist.vector for twist in own_twists])
+    velocities = {
+        "computeJointKinematicRegressor": [
+            pin.computeJointKinematicRegressor(
+                m, data, m.frames[f].parentJoint, pin.ReferenceFrame.LOCAL, m.frames[f].placement
+            ) @ turns
+            for f in frames
+        ],
+        "computeFrameKinematicRegressor": [
+            pin.computeFrameKinematicRegressor(m, data, f, pin.ReferenceFrame.LOCAL) @ turns for f in frames
+        ],
+    }  # fmt: skip
+    for function, twists in velocities.items():
+        found["frame_velocity_local"][function,] = np.array([twist[:3] for twist in twists])
+        found["frame_angular_velocity_local"][function,] = np.array([twist[3:] for twist in twists])
+
+
+def _add_torques(
+    found: Found,
+    m: pin.Model,
+    bodies: Sequence[pin.Inertia],
+    motion: tuple[Array, Array, Array],
+    rates: Array,
+) -> None:
+    (q, v, a), data, zero, terms = motion, m.createData(), np.zeros(m.nv), m.createData()
     none = pin.StdVec_Force()
     none.extend([pin.Force.Zero()] * m.njoints)
     M = np.reshape(pin.crba(m, data, q), (m.nv, m.nv)).copy()
     momentum = M @ v
     pin.cholesky.decompose(m, data)
+    U, D = np.reshape(data.U, M.shape), np.ravel(data.D)
     through = {
         ("cholesky.decompose", "cholesky.solve"): np.ravel(pin.cholesky.solve(m, data, momentum)),
         ("cholesky.computeMinv",): _product(pin.cholesky.computeMinv(m, data), momentum),
     }
-    by_aba = {("computeMinverse",): _product(pin.computeMinverse(m, data, q), momentum)}
+    by_aba = {("computeMinverse", "Data.Minv"): _product(pin.computeMinverse(m, data, q), momentum)}
+    pin.computeAllTerms(m, terms, q, v)
+    all_terms = np.reshape(terms.M, M.shape)
+    all_terms = np.triu(all_terms) + np.triu(all_terms, 1).T
+    world = np.reshape(pin.crba(m, m.createData(), q, pin.Convention.WORLD), M.shape)
+    momenta = {
+        ("crba", "Data.M"): momentum,
+        ("crba", "Convention.WORLD"): world @ v,
+        ("cholesky.decompose", "Data.U", "Data.D"): U @ (D * (U.T @ v)),
+        ("computeAllTerms", "Data.M"): all_terms @ v,
+    }
     gravity = {
-        ("computeGeneralizedGravity",): pin.computeGeneralizedGravity(m, data, q).copy(),
+        ("computeGeneralizedGravity", "Data.g"): pin.computeGeneralizedGravity(m, data, q).copy(),
         ("computeStaticTorque",): pin.computeStaticTorque(m, data, q, none).copy(),
     }
     tau = pin.rnea(m, data, q, v, a).copy()
     parameters = np.concatenate([inertia.toDynamicParameters() for inertia in m.inertias[1:]])
     rotors = m.armature * a
-    again = pin.rnea(m, data, q, v, pin.aba(m, data, q, v, tau)) - rotors
     rest = pin.rnea(m, data, q, zero, a) - rotors  # without the terms of velocities
     coriolis = _product(pin.computeCoriolisMatrix(m, data, q, v), v) + rest
+    derived, pool = m.createData(), pin.ModelPool(m, 1)
+    _, of_v, of_a = pin.computeRNEADerivatives(m, derived, q, v, a)
     dynamics = {
-        ("rnea",): tau - rotors,
+        ("rnea", "Data.tau"): tau - rotors,
         ("nonLinearEffects",): pin.nonLinearEffects(m, data, q, v) + M @ a - rotors,
-        ("computeJointTorqueRegressor",): _product(
+        ("nle", "Data.nle"): pin.nle(m, data, q, v) + M @ a - rotors,
+        ("computeAllTerms", "Data.nle"): terms.nle + M @ a - rotors,
+        ("rneaInParallel", "ModelPool"): np.ravel(
+            pin.rneaInParallel(1, pool, q[:, None], v[:, None], a[:, None])
+        )
+        - rotors,
+        ("computeJointTorqueRegressor", "Data.jointTorqueRegressor"): _product(
             pin.computeJointTorqueRegressor(m, data, q, v, a), parameters
         ),
     }
+    by_derivative = {
+        ("computeRNEADerivatives", "Data.dtau_dv"): _rate(of_v, of_a, v / 2, a)
+        + gravity["computeGeneralizedGravity", "Data.g"]
+        - rotors,
+    }
+    again = {("aba", "Data.ddq"): pin.aba(m, data, q, v, tau).copy()}
+    _add_energies(found, m, parameters, motion, none)
     for quantity, values in (
-        ("generalized_momentum", {("crba",): momentum}),
+        ("generalized_momentum", momenta),
         ("momentum_through_inverse", {call: M @ x for call, x in through.items()}),
         ("momentum_through_inverse_by_aba", {call: M @ x for call, x in by_aba.items()}),
         ("generalized_gravity", gravity),
         ("inverse_dynamics", dynamics),
-        ("inverse_dynamics_by_aba", {("aba",): again}),
-        ("inverse_dynamics_by_coriolis_matrix", {("computeCoriolisMatrix",): coriolis}),
+        ("inverse_dynamics_by_derivative", by_derivative),
+        ("inverse_dynamics_by_aba", {call: pin.rnea(m, data, q, v, x) - rotors for call, x in again.items()}),
+        ("inverse_dynamics_by_coriolis_matrix", {("computeCoriolisMatrix", "Data.C"): coriolis}),
     ):
         found[quantity] |= {call: (rates.T @ value)[:, None] for call, value in values.items()}
+
+
+def _add_energies(
+    found: Found, m: pin.Model, parameters: Array, motion: tuple[Array, Array, Array], none: pin.StdVec_Force
+) -> None:
+    (q, v, a), data, terms = motion, m.createData(), m.createData()
+    of_rotors = float(m.armature @ v**2) / 2
+    kinetic = {
+        ("computeKineticEnergy", "Data.kinetic_energy"): pin.computeKineticEnergy(m, data, q, v),
+        ("computeKineticEnergyRegressor", "Data.kineticEnergyRegressor"): of_rotors
+        + float(pin.computeKineticEnergyRegressor(m, data, q, v) @ parameters),
+    }
+    gravity = {
+        ("computePotentialEnergy", "Data.potential_energy"): pin.computePotentialEnergy(m, data, q),
+        ("computePotentialEnergyRegressor", "Data.potentialEnergyRegressor"): float(
+            pin.computePotentialEnergyRegressor(m, data, q) @ parameters
+        ),
+    }
+    both = {("computeMechanicalEnergy", "Data.mechanical_energy"): pin.computeMechanicalEnergy(m, data, q, v)}
+    g = pin.computeGeneralizedGravity(m, terms, q).copy()
+    second = {
+        ("computeGeneralizedGravityDerivatives",): pin.computeGeneralizedGravityDerivatives(
+            m, terms, q
+        ).copy(),
+        ("computeStaticTorqueDerivatives",): pin.computeStaticTorqueDerivatives(m, terms, q, none).copy(),
+        ("computeRNEADerivatives", "Data.dtau_dq"): pin.computeRNEADerivatives(m, terms, q, 0 * v, 0 * v)[
+            0
+        ].copy(),
+    }
+    rates = {call: float(v @ _product(matrix, v) + g @ a) for call, matrix in second.items()}
+    for quantity, values in (
+        ("kinetic_energy", kinetic), ("gravity_energy", gravity), ("mechanical_energy", both),
+        ("gravity_energy_second_rate", rates),
+    ):  # fmt: skip
+        found[quantity] |= {call: np.array([[value]]) for call, value in values.items()}

@@ -138,7 +138,7 @@ class Adapter(ABC):
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
         """Return the state quantities at each state; raise Unsupported with a sentence to refuse."""
 
-    def _surface(self, model: Model, states: Sequence[State]) -> list[SurfaceAnswer]:
+    def _surface(self, model: Model, states: Sequence[State]) -> Sequence[SurfaceAnswer]:
         """Return what the engine reports besides the state quantities, at each state; none where nothing."""
         return []
 
@@ -226,7 +226,7 @@ class Adapter(ABC):
         other.variant = variant
         return other
 
-    def surface(self, model: Model, states: Sequence[State]) -> list[SurfaceAnswer]:
+    def surface(self, model: Model, states: Sequence[State]) -> Sequence[SurfaceAnswer]:
         """Evaluate what the engine reports besides the state quantities; errors are those of `evaluate`.
 
         Args:

@@ -211,11 +211,14 @@ def stack_answers(answers: Sequence[SurfaceAnswer]) -> dict[str, dict[Call, Arra
     """Put the answers at all states into one array per call.
 
     Args:
-        answers: of the surface, one per state, of the same calls.
+        answers: of the surface, one per state; later states may lack calls of the first.
 
     """
     return {
-        quantity: {call: np.array([one[quantity][call] for one in answers]) for call in calls}
+        quantity: {
+            call: np.array([one[quantity][call] for one in answers if call in one.get(quantity, {})])
+            for call in calls
+        }
         for quantity, calls in (answers[0] if answers else {}).items()
     }
 

@@ -24,10 +24,18 @@ by rows of a run, outside for one of five reasons (contact, rendering, input and
 physics), or not compared yet, with the reason. `plumbline list surface` counts the names and lists those
 that the installed version has besides, as a night does.
 A name is exercised where a relative change of 1e-6 in what it returns turns a row red
-(`python -m plumbline.studies.exercised_names > adapters/surface/exercised.json` computes it). Wrong so far
-are Pinocchio's rates of Jacobians, Coriolis matrix and rate of the centroidal map where a composite joint is
-universal or planar ([script](surface/pinocchio_composite_rates.py)), and its `computeMinverse` on long
-chains.
+(`python -m plumbline.studies.exercised_names > adapters/surface/exercised.json` computes it).
+
+Wrong so far, each with a script or an entry of the known issues, are
+
+- Pinocchio's rates of Jacobians, Coriolis matrix, rate of the centroidal map and analytical derivatives where
+  a composite joint is universal or planar ([script](surface/pinocchio_composite_rates.py)), its
+  `computeMinverse` on long chains, its kinetic energy of rotors on revolute and helical joints about a given
+  axis ([script](surface/pinocchio_kinetic_energy_of_rotors.py)), the gravity of models that `appendModel`
+  makes ([script](surface/pinocchio_append_model.py)), and the order of the entries of kinematic Hessians in
+  Python ([script](surface/pinocchio_kinematic_hessians.py));
+- Exudyn's tangent operators of SE(3), `TExpSE3` and `TExpSE3Inv`
+  ([script](surface/exudyn_tangent_operators.py)).
 
 Written by `python -m plumbline.engines.surface_page > docs/surface.md`.
 """

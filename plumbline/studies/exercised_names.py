@@ -27,6 +27,7 @@ CHANGE = 1e-6  # relative
 MECHANISMS = (
     "rest", "double-rod-then-ball", "furuta", "sprung-slider-on-arm", "free-body-with-rotors",
     "tree-of-seven", "universal-pendulum", "planar-top", "slider-crank",
+    "cart-pole", "nesc-tumbling-brick", "helical-screw",
 )  # fmt: skip
 _CONTEXT = RowContext("", "", "", "the engine", "")
 

@@ -112,7 +112,7 @@ class Motion:
         self.axes = A @ rotation_matrix(PROBE_ATTITUDE)  # of the probe frames
         self.point = self.r.plus(self.arm)
         self.point_velocity = self.v.plus(self.w.cross(self.arm))
-        swing = self.alpha.cross(self.arm).plus(self.w.cross(self.w.cross(self.arm)))
+        self.swing = swing = self.alpha.cross(self.arm).plus(self.w.cross(self.w.cross(self.arm)))
         self.point_acceleration = self.a.plus(swing)
         far, n = model.tree.body[:, 0], model.n
         self.below = np.eye(n)  # [k, b]: body b is k or beyond it
@@ -171,6 +171,11 @@ def _subtree(motion: Motion, vectors: Rounded) -> Rounded:
     return vectors.summed(weights / np.sum(weights, axis=1, keepdims=True))
 
 
+def _subtree_mass(motion: Motion) -> Rounded:
+    mass = motion.below @ motion.mass
+    return Rounded(mass[:, None], np.zeros(len(mass)), mass)
+
+
 def _momenta(motion: Motion) -> Rounded:
     return motion.v.times(motion.mass)
 
@@ -200,7 +205,7 @@ def _total_mass(m: Motion) -> Rounded:
 
 
 def _inverse_dynamics(m: Motion) -> Rounded:
-    return m.generalized(m.a.minus(m.gravity).times(m.mass), m.spin_momentum_rate())
+    return m.generalized(_body_force(m), m.spin_momentum_rate())
 
 
 def _generalized_momentum(m: Motion) -> Rounded:
@@ -216,6 +221,40 @@ def _momentum_through_inverse(m: Motion) -> Rounded:
     once = _generalized_momentum(m)
     through = np.abs(m.mass_matrix) @ np.abs(np.linalg.pinv(m.mass_matrix, hermitian=True))
     return once._replace(error=once.error + 2 * through @ once.tolerance)
+
+
+def _total(m: Motion, vectors: Rounded, others: Rounded) -> Rounded:
+    """Σ a · b over all rows, (1, 1)."""
+    norms = [np.linalg.norm(x.value, axis=-1) for x in (vectors, others)]
+    error = np.sum(norms[0] * others.error + norms[1] * vectors.error)
+    size = np.sum(vectors.size * others.size)
+    return Rounded(np.full((1, 1), np.sum(vectors.value * others.value)), np.full(1, error), np.full(1, size))
+
+
+def _kinetic_energy(m: Motion) -> Rounded:
+    """½ ν · M ν, with the rotors."""
+    rates = minimal_rates(m.model, m.state)[:, None] / 2
+    exact = np.zeros(len(rates))
+    return _total(m, _generalized_momentum(m), Rounded(rates, exact, np.abs(rates[:, 0])))
+
+
+def _gravity_energy(m: Motion, rates: Rounded) -> Rounded:
+    """Of positions −Σ m g · r, of accelerations its second rate."""
+    return _total(m, m.gravity._replace(size=np.linalg.norm(m.gravity.value, axis=-1)).times(-m.mass), rates)
+
+
+def _body_force(m: Motion) -> Rounded:
+    return m.a.minus(m.gravity).times(m.mass)
+
+
+def _force_of_probe(m: Motion) -> Rounded:
+    """The same by the acceleration of the probe points, as engines take it where their frames are."""
+    return m.point_acceleration.minus(m.swing).minus(m.gravity).times(m.mass)
+
+
+def _body_moment(m: Motion) -> Rounded:
+    """Of forces on the bodies, about the probe points."""
+    return m.spin_momentum_rate().minus(m.arm.cross(_force_of_probe(m)))
 
 
 def _probe_moment(m: Motion) -> Rounded:
@@ -264,6 +303,13 @@ _FORMULAS: Mapping[str, tuple[str, Callable[[Motion], Rounded]]] = {
     "subtree_angular_momentum": (
         "kg m²/s", lambda m: _about_centre(m, m.below, _momenta(m), m.spin_momentum()),
     ),
+    "subtree_mass": ("kg", _subtree_mass),
+    "kinetic_energy": ("J", _kinetic_energy),
+    "gravity_energy": ("J", lambda m: _gravity_energy(m, m.r)),
+    "gravity_energy_second_rate": ("W/s", lambda m: _gravity_energy(m, m.a)),
+    "mechanical_energy": ("J", lambda m: _kinetic_energy(m).plus(_gravity_energy(m, m.r))),
+    "body_force_local": ("N", lambda m: m.local(_force_of_probe(m))),
+    "body_moment_local": ("N m", lambda m: m.local(_body_moment(m))),
     "joint_force_local": ("N", lambda m: m.local(m.force)),
     "joint_moment_local": ("N m", lambda m: m.local(_probe_moment(m))),
     "generalized_momentum": ("kg m²/s", _generalized_momentum),
@@ -274,9 +320,19 @@ _FORMULAS: Mapping[str, tuple[str, Callable[[Motion], Rounded]]] = {
 # The same by an algorithm that is compared by itself, because it can be wrong where others are right.
 _BY_ALGORITHM = {
     "by_jacobian_rate": (
-        "frame_acceleration", "frame_spatial_acceleration_local", "frame_spatial_acceleration_at_origin",
-        "frame_angular_acceleration", "frame_angular_acceleration_local",
+        "frame_acceleration", "frame_spatial_acceleration", "frame_spatial_acceleration_local",
+        "frame_spatial_acceleration_at_origin", "frame_angular_acceleration",
+        "frame_angular_acceleration_local",
     ),
+    "by_derivative": (
+        "frame_velocity", "frame_velocity_local", "frame_velocity_at_origin", "frame_angular_velocity",
+        "frame_angular_velocity_local", "frame_acceleration", "frame_acceleration_local",
+        "frame_spatial_acceleration", "frame_spatial_acceleration_local",
+        "frame_spatial_acceleration_at_origin", "frame_angular_acceleration",
+        "frame_angular_acceleration_local", "centre_of_mass_acceleration", "momentum_rate",
+        "centroidal_angular_momentum_rate", "inverse_dynamics",
+    ),
+    "by_tangent_operator": ("body_velocity", "frame_angular_velocity"),
     "by_map_rate": ("momentum_rate", "centroidal_angular_momentum_rate"),
     "by_coriolis_matrix": ("inverse_dynamics",),
     "by_aba": ("inverse_dynamics", "momentum_through_inverse"),

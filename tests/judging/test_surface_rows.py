@@ -21,8 +21,9 @@ from plumbline.truth.surface_truth import SURFACE_QUANTITIES
 
 WHO = RowContext("s", "f", "e", "The engine", "0")
 KINDS = ("rod", "ball", "hinge", "slide", "cylindrical", "free", "weld")
-RATES = ("_by_jacobian_rate", "_by_map_rate", "_by_coriolis_matrix")
+RATES = ("_by_jacobian_rate", "_by_map_rate", "_by_coriolis_matrix", "_by_derivative", "_second_rate")
 RECORDED = {name for name in SURFACE_QUANTITIES if name.endswith(RATES)}  # known_issues.yaml, pinocchio
+WRONG = {"exudyn": {"body_velocity_by_tangent_operator"}}  # the same, of every mechanism
 
 
 def mechanism(kinds, seed=5, bodies=4):
@@ -50,22 +51,23 @@ def test_every_call_agrees_and_a_relative_change_of_1e_6_is_seen(engine, tree):
     model, states, truth = tree
     answers = answers_of(engine, model, states)
     found = verdicts(truth, answers)
-    assert len(found) >= 10 and set(found.values()) == {Verdict.AGREES}, found
+    wrong = {name for name, verdict in found.items() if verdict != Verdict.AGREES}
+    assert len(found) >= 10 and wrong == WRONG.get(engine, set()), found
     calls = {name for by_call in answers.values() for call in by_call for name in call}
     evaluation = Evaluation([], None, None, 0.0, surface=answers)
     assert set(exercised_names(truth, evaluation)) == calls
 
 
-def test_every_variant_agrees_and_a_relative_change_of_1e_6_is_seen(tree):
+@pytest.mark.parametrize(("engine", "count"), [("mujoco", 30), ("pinocchio", 20)])
+def test_every_variant_agrees_and_a_relative_change_of_1e_6_is_seen(engine, count, tree):
     model, states, truth = tree
-    engine = "mujoco"
     evaluation = Evaluation(
         [], None, None, 0.0, variants=evaluate_variants(load_adapter(engine), model, states)
     )
     rows = judge_variants(WHO, truth, evaluation)
     assert {row.verdict for row in rows} == {Verdict.AGREES}, [row.reason for row in rows]
     names = {name for variants in evaluation.variants.values() for call in variants for name in call}
-    assert len(names) >= 5 and set(exercised_names(truth, evaluation)) == names
+    assert len(names) >= count and set(exercised_names(truth, evaluation)) == names
 
 
 def test_variants_of_flat_bodies_and_of_frames_turned_by_quarters_agree():
@@ -124,8 +126,8 @@ def test_a_loose_bound_is_no_agreement(tree):
 def test_a_wrong_call_is_named(tree):
     model, states, truth = tree
     answers = evaluate_states("mujoco", model, states).surface["frame_angular_velocity_local"]
-    wrong = {call: value * (call != ("mjtSensor.mjSENS_GYRO",)) for call, value in answers.items()}
+    wrong = {call: value * ("mjtSensor.mjSENS_GYRO" not in call) for call, value in answers.items()}
     evaluation = Evaluation([], None, None, 0.0, surface={"frame_angular_velocity_local": wrong})
     (row,) = judge_surface(WHO, truth, evaluation)
     assert row.verdict == Verdict.DISAGREES
-    assert "by mjtSensor.mjSENS_GYRO is off by" in row.reason and "too" not in row.reason
+    assert "by mjtSensor.mjSENS_GYRO, mj_sensorVel is off by" in row.reason and "too" not in row.reason

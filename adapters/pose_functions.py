@@ -1,0 +1,291 @@
+"""Functions of an engine's library of attitudes, poses and their rates, compared on a mechanism's bodies.
+
+A table says in words like "L.p Q.p -> p" what a function is given and what it returns.  What it is given
+comes from our own formulas, and what it returns is taken back by our own formulas to the positions, axes and
+velocities of the body, which have a truth.  Poses are that of the body, which has no letter, and
+
+    Q       one near a fixed one, where no form of an attitude is near a singular one; rates are given there
+    L, I    with body = L Q and I = body⁻¹
+    K, M    a fixed one, and M with Q = M K
+
+    R p xyzw phi xyz rpy zyz skew   attitude: matrix, quaternion with the scalar first and last, rotation
+                            vector, angles of Rx Ry Rz, Rz Ry Rx and Rz Ry Rz, matrix of the rotation vector;
+                            x y z are the three of xyz, axis and angle the parts of phi
+    r S                     position, and its matrix of a cross product
+    rp rxyzw rphi rxyz      position and attitude; shift: what takes rphi of M to that of Q, and
+                            dr what takes r of L to that of the body
+    H X XI G xi log         4 × 4 matrix; Plücker matrix, angular part first, and its inverse; 7 × 7 matrix of
+                            R³ × SO(3); logarithm on SE(3), linear part first, and its 4 × 4 matrix
+    w wl t                  angular velocity in the world and in Q's axes; twist in these, linear part first
+    pdot 2pdot phidot xyzdot rpydot xidot    rates of the forms
+
+A result "@pdot w" is a matrix that takes the first to the second.  "Rx" is the turn by x alone and "Tx" the
+shift by one coordinate, as a matrix of any kind; -Rx and -Tx are their inverses.  Numbers, and texts in
+quotes, are given as they stand.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from plumbline.model.datatypes import Array, Call, Float, State
+from plumbline.model.kinematics import (
+    angular_velocity,
+    cross_matrix,
+    quaternion_conjugate,
+    quaternion_exponential,
+    quaternion_product,
+    quaternion_rate,
+    rotation_matrix,
+    rotation_vector,
+)
+from plumbline.model.probe_frames import PROBE_ATTITUDE
+
+FIXED_PLACE = np.array([0.3, -0.2, 0.5])
+FIXED_TURN, OTHER_TURN = (
+    np.array(x) / np.sqrt(102.0) for x in ([8.0, 3.0, -2.0, 5.0], [9.0, -2.0, 4.0, 1.0])
+)
+POSE_STATES = 2  # at which they are called
+TERMS = 40  # of a series in rotation vectors up to π
+PROBE = rotation_matrix(PROBE_ATTITUDE)
+
+
+def xyz_angles(R: Float[Array, "3 3"]) -> Float[Array, "3"]:
+    """Return the angles about x, y, z in turn, intrinsic."""
+    first = np.arctan2(-R[1, 2], R[2, 2])
+    rest = _about(0, -first) @ R  # also where the first is arbitrary
+    return np.array([first, np.arctan2(rest[0, 2], rest[2, 2]), np.arctan2(rest[1, 0], rest[1, 1])])
+
+
+def _about(axis: int, angle: float) -> Array:
+    return rotation_matrix(np.append(np.cos(angle / 2), np.sin(angle / 2) * np.eye(3)[axis]))
+
+
+def _turned(angles: Array) -> Array:
+    return _about(0, angles[0]) @ _about(1, angles[1]) @ _about(2, angles[2])
+
+
+def _mean_of_exponential(generator: Array) -> Array:
+    """Σ Gᵏ / (k + 1)!: of [φ] the left Jacobian of the exponential, of −[φ] the right one."""
+    total: Array = np.eye(len(generator))
+    term = total
+    for k in range(1, TERMS):
+        term = term @ generator / (k + 1)
+        total = total + term
+    return total
+
+
+def _place_on_se3(xi: Array) -> Array:
+    return np.asarray(_mean_of_exponential(cross_matrix(xi[3:])) @ xi[:3])
+
+
+class Pose:
+    """A pose in all forms."""
+
+    def __init__(self, r: Array, p: Array) -> None:
+        self.r, self.p = r, p
+        self.R = rotation_matrix(p)
+
+    def __mul__(self, other: Pose) -> Pose:
+        return Pose(self.r + self.R @ other.r, quaternion_product(self.p, other.p))
+
+    def inverse(self) -> Pose:
+        """The pose of the world in this one."""
+        return Pose(-self.R.T @ self.r, quaternion_conjugate(self.p))
+
+    @cached_property
+    def forms(self) -> Mapping[str, Any]:
+        """By name; x, y and z are numbers."""
+        phi, xyz = rotation_vector(self.p), xyz_angles(self.R)
+        H, G = np.eye(4), np.eye(7)
+        H[:3, :3] = G[:3, :3] = self.R
+        H[:3, 3] = G[3:6, 6] = self.r
+        X = np.kron(np.eye(2), self.R)
+        X[3:, :3] = cross_matrix(self.r) @ self.R
+        XI = np.kron(np.eye(2), self.R.T)
+        XI[3:, :3] = -self.R.T @ cross_matrix(self.r)
+        xi = np.append(np.linalg.solve(_mean_of_exponential(cross_matrix(phi)), self.r), phi)
+        named: dict[str, Any] = {
+            "R": self.R,
+            "p": self.p,
+            "xyzw": np.roll(self.p, -1),
+            "phi": phi,
+            "xyz": xyz,
+        }
+        angle = float(np.linalg.norm(phi))
+        named |= {
+            "r": self.r,
+            "rpy": -xyz_angles(self.R.T),
+            "H": H,
+            "X": X,
+            "XI": XI,
+            "G": G,
+            "xi": xi,
+            "angle": angle,
+        }
+        named |= {"S": cross_matrix(self.r), "axis": phi / angle if angle else np.eye(3)[2]}
+        named |= {"r" + form: np.append(self.r, named[form]) for form in ("p", "xyzw", "phi", "xyz")}
+        return named | dict(zip(("x", "y", "z", "rx", "ry", "rz"), map(float, [*xyz, *self.r]), strict=True))
+
+
+def _rate_maps(Q: Pose) -> dict[str, Array]:
+    """Matrices at Q from the rates of forms to ω in Q's axes, or to the twist in them."""
+    phi, (a, *_), (u, v, _) = (Q.forms[name] for name in ("phi", "xyz", "rpy"))
+    of_xyz = [Q.R.T @ axis for axis in (np.eye(3)[0], _about(0, a)[:, 1], Q.R[:, 2])]
+    of_rpy = [np.eye(3)[0], _about(0, u).T[:, 1], (_about(1, v) @ _about(0, u)).T[:, 2]]
+    xi = Q.forms["xi"]
+    generator: Array = np.asarray(np.kron(np.eye(2), cross_matrix(xi[3:])), float)
+    generator[:3, 3:] = cross_matrix(xi[:3])
+    maps: dict[str, Array] = {
+        "xyzdot": np.stack(of_xyz, 1),
+        "rpydot": np.stack(of_rpy, 1),
+        "w": Q.R.T,
+        "wl": np.eye(3),
+    }
+    return maps | {
+        "phidot": _mean_of_exponential(-cross_matrix(phi)), "xidot": _mean_of_exponential(-generator),
+        "pdot": np.stack([angular_velocity(Q.p, axis) for axis in np.eye(4)], 1), "t": np.eye(6),
+        "2pdot": np.stack([angular_velocity(Q.p, axis) for axis in np.eye(4)], 1) / 2,
+    }  # fmt: skip
+
+
+class _Body:
+    """A body at a state: what functions are given, and what their results are."""
+
+    def __init__(self, state: State, k: int, omega: Array) -> None:
+        self.pose, length = Pose(state.r[k], state.p[k]), np.linalg.norm(state.r[k])
+        near = quaternion_product(FIXED_TURN, quaternion_exponential(0.3 * state.p[k, 1:]))
+        # no place far from where the bodies are
+        Q, K = [Pose(length * FIXED_PLACE, turn) for turn in (near, OTHER_TURN)]
+        self.Q, M, L = Q, Q * K.inverse(), self.pose * Q.inverse()
+        self.poses = {"": self.pose, "Q": Q, "K": K, "L": L, "M": M, "I": self.pose.inverse()}
+        self.maps, spin = _rate_maps(Q), Q.R.T @ omega
+        twist = np.append(Q.R.T @ state.v[k], spin)
+        self.rates: dict[str, Any] = {"pdot": quaternion_rate(Q.p, spin), "dr": self.pose.r - L.r}
+        self.rates["shift"] = np.append(Q.r - M.r, K.forms["phi"])
+        for name, matrix in self.maps.items():
+            if "pdot" not in name:
+                self.rates[name] = np.linalg.solve(matrix, twist if len(matrix) == 6 else spin)
+
+    def given(self, name: str) -> Any:
+        if name[0] in "'-0123456789":
+            return name[1:-1] if name[0] == "'" else int(name)
+        pose, _, form = name.rpartition(".")
+        return self.poses[pose].forms[form] if form not in self.rates else self.rates[form]
+
+    def read(self, form: str, value: Array) -> dict[str, Array]:
+        """Take a result to quantities of the body."""
+        if form in self.maps:
+            *linear, angular = (self.maps[form] @ value).reshape(-1, 3) @ self.Q.R.T
+            if not linear:
+                return {"frame_angular_velocity": angular}
+            by = "_by_tangent_operator"
+            return {f"body_velocity{by}": linear[0], f"frame_angular_velocity{by}": angular}
+        pose, _, form = form.rpartition(".")
+        found, above = {}, self.pose * self.poses[pose].inverse() if pose else None
+        if (turn := self._attitude(form, value)) is not None:
+            found["frame_axes"] = ((above.R @ turn if above else turn) @ PROBE).T
+        if (place := self._place(form, value)) is not None:
+            found["body_position"] = above.r + above.R @ place if above else place
+        return found
+
+    def _attitude(self, form: str, value: Array) -> Array | None:
+        inverse, form = form.startswith("-"), form.removeprefix("-")
+        match form:
+            case "R":
+                return value.reshape(3, 3)
+            case "p" | "rp" | "xyzw" | "rxyzw":
+                return rotation_matrix(np.roll(value[-4:], form.endswith("w")))
+            case "phi" | "xi" | "rphi":
+                return rotation_matrix(quaternion_exponential(value[-3:] / 2))
+            case "skew" | "log":
+                return rotation_matrix(quaternion_exponential(_vector_of(value) / 2))
+            case "xyz" | "rxyz":
+                return _turned(value[-3:])
+            case "rpy":
+                return _turned(-value).T
+            case "zyz":
+                return _about(2, value[0]) @ _about(1, value[1]) @ _about(2, value[2])
+            case "H" | "G":
+                return value[:3, :3]
+            case "X" | "XI":  # both blocks are the turn
+                turn = (value[:3, :3] + value[3:, 3:]) / 2
+                return turn if form == "X" else turn.T
+            case "Rx" | "Ry" | "Rz":
+                turns = [_about(axis, angle) for axis, angle in enumerate(self.pose.forms["xyz"])]
+                turns["xyz".index(form[1])] = value[:3, :3].T if inverse else value[:3, :3]
+                return np.asarray(turns[0] @ turns[1] @ turns[2])
+        return None
+
+    def _place(self, form: str, value: Array) -> Array | None:
+        sign = -1 if form.startswith("-") else 1
+        match form.removeprefix("-"):
+            case "r" | "rp" | "rxyzw" | "rphi" | "rxyz":
+                return value[:3]
+            case "H" | "T":
+                return sign * (value[:3, 3] if len(value) == 4 else _vector_of(value[3:]))
+            case "G":
+                return value[3:6, 6]
+            case "S":
+                return _vector_of(value)
+            case "X" | "XI":
+                turn = value[:3, :3]
+                return _vector_of(value[3:, :3] @ turn.T if form == "X" else -turn.T @ value[3:, :3])
+            case "xi":
+                return _place_on_se3(value)
+            case "log":
+                return _place_on_se3(np.append(value[:3, 3], _vector_of(value)))
+            case "Tx" | "Ty" | "Tz":
+                moved = value[:3, 3] if len(value) == 4 else _vector_of(value[3:])
+                is_other = np.arange(3) != "xyz".index(form[-1])
+                return np.asarray(sign * moved + is_other * self.pose.r)
+        return None
+
+
+def _vector_of(matrix: Array) -> Array:
+    """The vector of a matrix of a cross product."""
+    return np.array([matrix[2, 1], matrix[0, 2], matrix[1, 0]])
+
+
+def add_pose_answers(
+    answers: Sequence[dict[str, dict[Call, Array]]],
+    states: Sequence[State],
+    table: Mapping[str, str],
+    call: Callable[[str, Sequence[Any], Sequence[str]], Sequence[Any]],
+) -> None:
+    """Call all functions of a table on all bodies at the first states, and add what they say to the answers.
+
+    Args:
+        answers: of the surface, at these states.
+        table: by name of the engine what a function is given and returns.
+        call: takes a name, the values that it is given and the forms of the results to the results.
+
+    """
+    for answer, state in zip(answers, states[:POSE_STATES], strict=False):
+        for (quantity, name), vectors in _pose_answers(table, call, state).items():
+            answer.setdefault(quantity, {})[name,] = np.concatenate([np.atleast_2d(one) for one in vectors])
+
+
+def _pose_answers(
+    table: Mapping[str, str], call: Callable[[str, Sequence[Any], Sequence[str]], Sequence[Any]], state: State
+) -> dict[tuple[str, str], list[Array]]:
+    rows: dict[tuple[str, str], list[Array]] = {}
+    turns = rotation_matrix(state.p)
+    for k in range(len(state.p)):
+        body = _Body(state, k, turns[k] @ state.omega[k])
+        for name, text in table.items():
+            given, _, returned = text.partition(" -> ")
+            forms = returned.split()
+            arguments = [body.given(one) for one in given.split()]
+            results = call(name, arguments, forms)
+            if forms[0].startswith("@"):
+                rate = body.given(forms.pop(0)[1:])
+                results = [np.reshape(results[0], (-1, len(rate))) @ rate]
+            for form, value in zip(forms, results, strict=True):
+                for quantity, vector in body.read(form, np.asarray(value, float)).items():
+                    rows.setdefault((quantity, name), []).append(vector)
+    return rows
