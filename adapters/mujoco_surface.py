@@ -74,7 +74,7 @@ POSE_FUNCTIONS = {
 SIZES = {"p": 4, "R": 9, "r": 3, "phi": 3, "w": 3, "pdot": 4, "2pdot": 4}
 
 
-def pose_function(name: str, given: Sequence[Any], forms: Sequence[str]) -> list[Array]:
+def pose_function(name: str, given: Sequence[Any], forms: Sequence[str]) -> list[Any]:
     """Call a function of attitudes or poses; its results come first."""
     arguments = [np.ravel(x) if isinstance(x, np.ndarray) else x for x in given]
     results = [np.empty(SIZES[form.rpartition(".")[2]]) for form in forms]

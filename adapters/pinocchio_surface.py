@@ -23,13 +23,15 @@ from plumbline.model.datatypes import Array, Call, Float, Model
 from plumbline.model.kinematics import rotation_matrix
 from plumbline.model.probe_frames import PROBE_ATTITUDE, probe_points
 
+SPATIAL = "spatial_acceleration"
+
 
 class _Frame(NamedTuple):
     """What vectors in a reference frame are."""
 
     of_point: str = ""  # suffix of quantities of points
     of_rotation: str = ""  # … of rotations
-    of_rate: str = "spatial_acceleration"  # what J̇ q̇ + J q̈ is
+    of_rate: str = SPATIAL  # what J̇ q̇ + J q̈ is
 
 
 FRAMES = {
@@ -50,7 +52,7 @@ POSE_FUNCTIONS = {  # adapters/pose_functions.py describes the forms
     "liegroups.R3": "L.r dr -> r",
 }  # fmt: skip
 OF_MOTIONS = ("exp6", "Jexp6")  # take a pin.Motion
-ANGULAR = {"velocity": "velocity", "acceleration": "acceleration", "spatial_acceleration": "acceleration"}
+ANGULAR = {"velocity": "velocity", "acceleration": "acceleration", SPATIAL: "acceleration"}
 Found = dict[str, dict[Call, Array]]
 
 
@@ -92,7 +94,7 @@ def surface_answer(
     _add_data(found, pin_model, frames, motion)
     _add_centres(found, pin_model, frames, motion)
     _add_regressors(found, pin_model, frames, bodies, motion)
-    _add_torques(found, pin_model, bodies, motion, rates)
+    _add_torques(found, pin_model, motion, rates)
     return found
 
 
@@ -118,86 +120,94 @@ def _rate(by_q: Any, by_v: Any, v: Array, a: Array) -> Array:
     return _product(by_q, v) + _product(by_v, a)
 
 
+class _Twists:
+    """Spatial vectors at the probe frames in one reference frame, by function, what they are and algorithm."""
+
+    def __init__(self, m: pin.Model, data: pin.Data, name: str) -> None:
+        self.m, self.data, self.frame, self.name = m, data, FRAMES[name], name
+        self.reference = getattr(pin.ReferenceFrame, name)
+        self.found: dict[tuple[str, str, str], list[Array]] = defaultdict(list)
+
+    def add(
+        self, function: str, what: str, twist: Any, f: int, by: str = "", is_of_joint: bool = False
+    ) -> None:
+        """Add one of probe frame f, or of its joint, which is moved there."""
+        vector = np.array(getattr(twist, "vector", twist))
+        if is_of_joint:
+            joint, place = self.m.frames[f].parentJoint, self.m.frames[f].placement
+            if what == "acceleration":  # a classical one is moved as the spatial one
+                what, velocity = SPATIAL, pin.getVelocity(self.m, self.data, joint, self.reference)
+                vector[:3] -= np.cross(velocity.angular, velocity.linear)
+            moves = {"LOCAL": place, "WORLD": pin.SE3.Identity()}
+            aligned = pin.SE3(np.eye(3), self.data.oMi[joint].rotation @ place.translation)
+            vector = moves.get(self.name, aligned).actInv(pin.Motion(vector)).vector
+        self.found[function, what, by].append(vector)
+
+    def store(self, found: Found) -> None:
+        """Put all into the answer."""
+        frame = self.frame
+        for (function, what, by), values in self.found.items():
+            call, halves = (function, f"ReferenceFrame.{self.name}"), np.split(np.array(values), 2, 1)
+            found[f"frame_{what}{frame.of_point}{by}"][call] = halves[0]
+            found[f"frame_angular_{ANGULAR[what]}{frame.of_rotation}{by}"][call] = halves[1]
+
+
 def _add_frames(
     found: Found, m: pin.Model, frames: Sequence[int], motion: tuple[Array, Array, Array]
 ) -> None:
-    (q, v, a), data, derived = motion, m.createData(), m.createData()
+    (q, v, a), data, derived, other = motion, m.createData(), m.createData(), m.createData()
     pin.forwardKinematics(m, data, q, v, a)
     pin.updateFramePlacements(m, data)
     pin.computeForwardKinematicsDerivatives(m, derived, q, v, a)
     pin.updateFramePlacements(m, derived)
     pin.computeJointJacobiansTimeVariation(m, data, q, v)
-    other = m.createData()
-    for name, frame in FRAMES.items():
-        reference = getattr(pin.ReferenceFrame, name)
-        # by function, what its vectors are, by which algorithm
-        twists: dict[tuple[str, str, str], list[Array]] = defaultdict(list)
+    for name in FRAMES:
+        twists = _Twists(m, data, name)
+        reference, of_rate = twists.reference, twists.frame.of_rate
         for f in frames:
-            joint, place = m.frames[f].parentJoint, m.frames[f].placement
-            here = {"LOCAL": place, "WORLD": pin.SE3.Identity()}.get(
-                name, pin.SE3(np.eye(3), data.oMi[joint].rotation @ place.translation)
-            )
-            joint_velocity = pin.getVelocity(m, data, joint, reference)
-
-            def add(
-                function: str,
-                what: str,
-                twist: Any,
-                by: str = "",
-                is_of_joint: bool = False,
-                here: pin.SE3 = here,
-                at_joint: Any = joint_velocity,
-                twists: Any = twists,
-            ) -> None:
-                vector = np.array(getattr(twist, "vector", twist))
-                if is_of_joint:  # a classical acceleration is moved as the spatial one
-                    if what == "acceleration":
-                        what, vector[:3] = (
-                            "spatial_acceleration",
-                            vector[:3] - np.cross(at_joint.angular, at_joint.linear),
-                        )
-                    vector = here.actInv(pin.Motion(vector)).vector
-                twists[function, what, by].append(vector)
-
-            for of, number in (("Frame", f), ("Joint", joint)):
-
-                def read(function: str, d: Any = data, number: int = number, r: Any = reference) -> Any:
-                    return getattr(pin, function)(m, d, number, r)
-
-                is_of_joint = of == "Joint"
-                plain = "" if is_of_joint else of
-                J, dJ = read(f"get{of}Jacobian"), read(f"get{of}JacobianTimeVariation")
-                by_q, by_v = read(f"get{of}VelocityDerivatives", derived)[:2]
-                add(f"get{plain}Velocity", "velocity", read(f"get{plain}Velocity"), "", is_of_joint)
-                add(f"get{of}Jacobian", "velocity", _product(J, v), "", is_of_joint)
-                rate = _rate(dJ, J, v, a)
-                by = "_by_jacobian_rate"
-                add(f"get{of}JacobianTimeVariation", frame.of_rate, rate, by, is_of_joint)
-                by, function = "_by_derivative", f"get{of}VelocityDerivatives"
-                add(function, "velocity", _product(by_v, v), by, is_of_joint)
-                # its rate in the world's axes is that of spatial vectors, too
-                add(function, "spatial_acceleration", _rate(by_q, by_v, v, a), by, is_of_joint)
-                function = f"get{of}AccelerationDerivatives"
-                *_, of_v, of_a = read(function, derived)
-                add(function, "spatial_acceleration", _rate(of_v, of_a, v / 2, a), by, is_of_joint)
-                function = f"get{plain}Acceleration"
-                add(function, "spatial_acceleration", read(function), "", is_of_joint)
-                if reference != pin.ReferenceFrame.WORLD:
-                    function = f"get{plain}ClassicalAcceleration"
-                    add(function, "acceleration", read(function), "", is_of_joint)
+            joint = m.frames[f].parentJoint
+            _read_twists(twists, "Frame", f, f, derived, v, a)
+            _read_twists(twists, "Joint", joint, f, derived, v, a)
             J = np.array(pin.computeFrameJacobian(m, other, q, f, reference))
-            dJ = pin.frameJacobianTimeVariation(m, other, q, v, f, reference)
-            add("computeFrameJacobian", "velocity", _product(J, v))
-            add("frameJacobianTimeVariation", frame.of_rate, _rate(dJ, J, v, a), "_by_jacobian_rate")
+            rate = _rate(pin.frameJacobianTimeVariation(m, other, q, v, f, reference), J, v, a)
+            twists.add("computeFrameJacobian", "velocity", _product(J, v), f)
+            twists.add("frameJacobianTimeVariation", of_rate, rate, f, "_by_jacobian_rate")
             if name == "LOCAL":
                 J = pin.computeJointJacobian(m, other, q, joint)
-                add("computeJointJacobian", "velocity", _product(J, v), "", True)
-        for (function, what, by), values in twists.items():
-            call, (linear, angular) = (function, f"ReferenceFrame.{name}"), np.split(np.array(values), 2, 1)
-            found[f"frame_{what}{frame.of_point}{by}"][call] = linear
-            found[f"frame_angular_{ANGULAR[what]}{frame.of_rotation}{by}"][call] = angular
+                twists.add("computeJointJacobian", "velocity", _product(J, v), f, is_of_joint=True)
+        twists.store(found)
         if name != "WORLD":
             _add_points(found, m, derived, frames, name, v, a)
+
+
+def _read_twists(
+    twists: _Twists, of: str, number: int, f: int, derived: pin.Data, v: Array, a: Array
+) -> None:
+    """Add what all functions of a frame or a joint give."""
+    is_of_joint = of == "Joint"
+    plain = "" if is_of_joint else of
+
+    def read(function: str, data: pin.Data = twists.data) -> Any:
+        return getattr(pin, function)(twists.m, data, number, twists.reference)
+
+    J, dJ = read(f"get{of}Jacobian"), read(f"get{of}JacobianTimeVariation")
+    by_q, by_v = read(f"get{of}VelocityDerivatives", derived)[:2]
+    *_, of_v, of_a = read(f"get{of}AccelerationDerivatives", derived)
+    by = "_by_derivative"
+    for function, what, twist, how in (
+        (f"get{plain}Velocity", "velocity", read(f"get{plain}Velocity"), ""),
+        (f"get{plain}Acceleration", SPATIAL, read(f"get{plain}Acceleration"), ""),
+        (f"get{of}Jacobian", "velocity", _product(J, v), ""),
+        (f"get{of}JacobianTimeVariation", twists.frame.of_rate, _rate(dJ, J, v, a), "_by_jacobian_rate"),
+        (f"get{of}VelocityDerivatives", "velocity", _product(by_v, v), by),
+        # the derivatives of vectors in the world's axes are those of spatial ones
+        (f"get{of}VelocityDerivatives", SPATIAL, _rate(by_q, by_v, v, a), by),
+        (f"get{of}AccelerationDerivatives", SPATIAL, _rate(of_v, of_a, v / 2, a), by),
+    ):
+        twists.add(function, what, twist, f, how, is_of_joint)
+    if twists.name != "WORLD":
+        function = f"get{plain}ClassicalAcceleration"
+        twists.add(function, "acceleration", read(function), f, "", is_of_joint)
 
 
 def _add_points(
@@ -391,77 +401,75 @@ def _add_regressors(
         found["frame_angular_velocity_local"][function,] = np.array([twist[3:] for twist in twists])
 
 
-def _add_torques(
-    found: Found,
-    m: pin.Model,
-    bodies: Sequence[pin.Inertia],
-    motion: tuple[Array, Array, Array],
-    rates: Array,
-) -> None:
+def _add_torques(found: Found, m: pin.Model, motion: tuple[Array, Array, Array], rates: Array) -> None:
     (q, v, a), data, zero, terms = motion, m.createData(), np.zeros(m.nv), m.createData()
+    pin.computeAllTerms(m, terms, q, v)
+    M = _add_products(found, m, motion, terms, rates)
     none = pin.StdVec_Force()
     none.extend([pin.Force.Zero()] * m.njoints)
+    gravity = {
+        ("computeGeneralizedGravity", "Data.g"): pin.computeGeneralizedGravity(m, data, q).copy(),
+        ("computeStaticTorque",): pin.computeStaticTorque(m, data, q, none).copy(),
+    }
+    tau, rotors = pin.rnea(m, data, q, v, a).copy(), m.armature * a
+    parameters = np.concatenate([inertia.toDynamicParameters() for inertia in m.inertias[1:]])
+    rest = pin.rnea(m, data, q, zero, a)  # without the terms of velocities
+    coriolis = _product(pin.computeCoriolisMatrix(m, data, q, v), v) + rest
+    derived, pool, columns = m.createData(), pin.ModelPool(m, 1), (x[:, None] for x in motion)
+    _, of_v, of_a = pin.computeRNEADerivatives(m, derived, q, v, a)
+    by_regressor = _product(pin.computeJointTorqueRegressor(m, data, q, v, a), parameters)
+    dynamics = {  # with the rotors
+        ("rnea", "Data.tau"): tau,
+        ("nonLinearEffects",): pin.nonLinearEffects(m, data, q, v) + M @ a,
+        ("nle", "Data.nle"): pin.nle(m, data, q, v) + M @ a,
+        ("computeAllTerms", "Data.nle"): terms.nle + M @ a,
+        ("rneaInParallel", "ModelPool"): np.ravel(pin.rneaInParallel(1, pool, *columns)),
+        ("computeJointTorqueRegressor", "Data.jointTorqueRegressor"): by_regressor + rotors,
+    }
+    derivative = _rate(of_v, of_a, v / 2, a) + gravity["computeGeneralizedGravity", "Data.g"]
+    again = pin.rnea(m, data, q, v, pin.aba(m, data, q, v, tau).copy())
+    _add_energies(found, m, parameters, motion, none)
+    found["generalized_gravity"] |= _on_rates(gravity, rates)
+    for by, values in (
+        ("", dynamics),
+        ("_by_derivative", {("computeRNEADerivatives", "Data.dtau_dv"): derivative}),
+        ("_by_aba", {("aba", "Data.ddq"): again}),
+        ("_by_coriolis_matrix", {("computeCoriolisMatrix", "Data.C"): coriolis}),
+    ):
+        own = {call: value - rotors for call, value in values.items()}
+        found[f"inverse_dynamics{by}"] |= _on_rates(own, rates)
+
+
+def _on_rates(forces: dict[Call, Array], rates: Array) -> dict[Call, Array]:
+    """Forces on ν in place of those on v."""
+    return {call: (rates.T @ value)[:, None] for call, value in forces.items()}
+
+
+def _add_products(
+    found: Found, m: pin.Model, motion: tuple[Array, Array, Array], terms: pin.Data, rates: Array
+) -> Array:
+    """Add products with the mass matrix, its factors and its inverse; return the matrix."""
+    (q, v, _), data = motion, m.createData()
     M = np.reshape(pin.crba(m, data, q), (m.nv, m.nv)).copy()
     momentum = M @ v
     pin.cholesky.decompose(m, data)
-    U, D = np.reshape(data.U, M.shape), np.ravel(data.D)
-    through = {
-        ("cholesky.decompose", "cholesky.solve"): np.ravel(pin.cholesky.solve(m, data, momentum)),
-        ("cholesky.computeMinv",): _product(pin.cholesky.computeMinv(m, data), momentum),
-    }
-    by_aba = {("computeMinverse", "Data.Minv"): _product(pin.computeMinverse(m, data, q), momentum)}
-    pin.computeAllTerms(m, terms, q, v)
-    all_terms = np.reshape(terms.M, M.shape)
-    all_terms = np.triu(all_terms) + np.triu(all_terms, 1).T
+    U, D, upper = np.reshape(data.U, M.shape), np.ravel(data.D), np.triu(np.reshape(terms.M, M.shape))
     world = np.reshape(pin.crba(m, m.createData(), q, pin.Convention.WORLD), M.shape)
     momenta = {
         ("crba", "Data.M"): momentum,
         ("crba", "Convention.WORLD"): world @ v,
         ("cholesky.decompose", "Data.U", "Data.D"): U @ (D * (U.T @ v)),
-        ("computeAllTerms", "Data.M"): all_terms @ v,
+        ("computeAllTerms", "Data.M"): upper @ v + np.triu(upper, 1).T @ v,
     }
-    gravity = {
-        ("computeGeneralizedGravity", "Data.g"): pin.computeGeneralizedGravity(m, data, q).copy(),
-        ("computeStaticTorque",): pin.computeStaticTorque(m, data, q, none).copy(),
+    through = {
+        ("cholesky.decompose", "cholesky.solve"): M @ np.ravel(pin.cholesky.solve(m, data, momentum)),
+        ("cholesky.computeMinv",): M @ _product(pin.cholesky.computeMinv(m, data), momentum),
     }
-    tau = pin.rnea(m, data, q, v, a).copy()
-    parameters = np.concatenate([inertia.toDynamicParameters() for inertia in m.inertias[1:]])
-    rotors = m.armature * a
-    rest = pin.rnea(m, data, q, zero, a) - rotors  # without the terms of velocities
-    coriolis = _product(pin.computeCoriolisMatrix(m, data, q, v), v) + rest
-    derived, pool = m.createData(), pin.ModelPool(m, 1)
-    _, of_v, of_a = pin.computeRNEADerivatives(m, derived, q, v, a)
-    dynamics = {
-        ("rnea", "Data.tau"): tau - rotors,
-        ("nonLinearEffects",): pin.nonLinearEffects(m, data, q, v) + M @ a - rotors,
-        ("nle", "Data.nle"): pin.nle(m, data, q, v) + M @ a - rotors,
-        ("computeAllTerms", "Data.nle"): terms.nle + M @ a - rotors,
-        ("rneaInParallel", "ModelPool"): np.ravel(
-            pin.rneaInParallel(1, pool, q[:, None], v[:, None], a[:, None])
-        )
-        - rotors,
-        ("computeJointTorqueRegressor", "Data.jointTorqueRegressor"): _product(
-            pin.computeJointTorqueRegressor(m, data, q, v, a), parameters
-        ),
-    }
-    by_derivative = {
-        ("computeRNEADerivatives", "Data.dtau_dv"): _rate(of_v, of_a, v / 2, a)
-        + gravity["computeGeneralizedGravity", "Data.g"]
-        - rotors,
-    }
-    again = {("aba", "Data.ddq"): pin.aba(m, data, q, v, tau).copy()}
-    _add_energies(found, m, parameters, motion, none)
-    for quantity, values in (
-        ("generalized_momentum", momenta),
-        ("momentum_through_inverse", {call: M @ x for call, x in through.items()}),
-        ("momentum_through_inverse_by_aba", {call: M @ x for call, x in by_aba.items()}),
-        ("generalized_gravity", gravity),
-        ("inverse_dynamics", dynamics),
-        ("inverse_dynamics_by_derivative", by_derivative),
-        ("inverse_dynamics_by_aba", {call: pin.rnea(m, data, q, v, x) - rotors for call, x in again.items()}),
-        ("inverse_dynamics_by_coriolis_matrix", {("computeCoriolisMatrix", "Data.C"): coriolis}),
-    ):
-        found[quantity] |= {call: (rates.T @ value)[:, None] for call, value in values.items()}
+    by_aba = {("computeMinverse", "Data.Minv"): M @ _product(pin.computeMinverse(m, data, q), momentum)}
+    found["generalized_momentum"] |= _on_rates(momenta, rates)
+    found["momentum_through_inverse"] |= _on_rates(through, rates)
+    found["momentum_through_inverse_by_aba"] |= _on_rates(by_aba, rates)
+    return M
 
 
 def _add_energies(
