@@ -121,7 +121,7 @@ def _rate(by_q: Any, by_v: Any, v: Array, a: Array) -> Array:
 
 
 class _Twists:
-    """Spatial vectors at the probe frames in one reference frame, by function, what they are and algorithm."""
+    """Spatial vectors at the probe frames in one reference frame: by function, what they are, algorithm."""
 
     def __init__(self, m: pin.Model, data: pin.Data, name: str) -> None:
         self.m, self.data, self.frame, self.name = m, data, FRAMES[name], name
@@ -407,7 +407,7 @@ def _add_torques(found: Found, m: pin.Model, motion: tuple[Array, Array, Array],
     M = _add_products(found, m, motion, terms, rates)
     none = pin.StdVec_Force()
     none.extend([pin.Force.Zero()] * m.njoints)
-    gravity = {
+    gravity: dict[Call, Array] = {
         ("computeGeneralizedGravity", "Data.g"): pin.computeGeneralizedGravity(m, data, q).copy(),
         ("computeStaticTorque",): pin.computeStaticTorque(m, data, q, none).copy(),
     }
@@ -465,7 +465,9 @@ def _add_products(
         ("cholesky.decompose", "cholesky.solve"): M @ np.ravel(pin.cholesky.solve(m, data, momentum)),
         ("cholesky.computeMinv",): M @ _product(pin.cholesky.computeMinv(m, data), momentum),
     }
-    by_aba = {("computeMinverse", "Data.Minv"): M @ _product(pin.computeMinverse(m, data, q), momentum)}
+    by_aba: dict[Call, Array] = {
+        ("computeMinverse", "Data.Minv"): M @ _product(pin.computeMinverse(m, data, q), momentum)
+    }
     found["generalized_momentum"] |= _on_rates(momenta, rates)
     found["momentum_through_inverse"] |= _on_rates(through, rates)
     found["momentum_through_inverse_by_aba"] |= _on_rates(by_aba, rates)
