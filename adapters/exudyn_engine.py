@@ -321,6 +321,7 @@ class Exudyn(ExudynAdapter):
         "is that of a joint with one turn, not of a universal joint",
     }
     builds_trees = builds_elements = moves_loops = True
+    unwritten_ways = ("two welded halves",)
     welding_unsupported_reason = ""
     is_single_step: bool = False  # full Newton iterations to `STEP_SETTINGS`; multipliers are sampled too
 
@@ -328,21 +329,22 @@ class Exudyn(ExudynAdapter):
         with silence_engine():
             return [_evaluate_state(ExudynChain(model, at, self.body_pieces(model))) for at in states]
 
-    def written(self, model: Model, state: State) -> dict[str, Any]:
+    def written(self, model: Model, state: State, moves: bool = False) -> dict[str, Any]:
         """Return the items of the assembled system, and what the read-out needs, of one state."""
         with silence_engine():
-            chain = ExudynChain(model, state)
+            chain = _chain_that_moves(model, state) if moves else ExudynChain(model, state)
+            system = written_items(chain.mbs)  # as it is before a solver has it
             _, _, C = _system_matrices(chain)
         used = np.flatnonzero(np.any(C != 0, axis=1))
         if model.has_loops:
             used = used[independent_rows(C[used])]
         rates = np.zeros((0, 0)) if model.has_loops else _coordinate_rate_map(model, state)
-        fields = {"qdot": chain.qdot.ravel(), "p": state.p, "A": rotation_matrix(state.p), "used": used}
+        fields = {"qdot": chain.qdot.ravel(), "A": rotation_matrix(state.p), "used": used}
         fields |= {"elastic": np.array(elastic_energy(model, state)), "joint_rates": rates}
         fields |= {"gravity": model.gravity, "proximal": model.proximal, "near": model.body[:, 1]}
         joints = [None if joint is None else int(joint) for joint in chain.joints]
         pushes = [(k, int(item), is_push, axis.tolist()) for k, item, is_push, axis in chain.connectors]
-        parts = {"items": written_items(chain.mbs), "joints": joints, "pushes": pushes}
+        parts = {"items": system, "joints": joints, "pushes": pushes}
         held = [chain.joint_rows(k) for k in range(len(joints))]
         bodies = {"nodes": [*map(int, chain.nodes)], "bodies": [*map(int, chain.piece_bodies)], "held": held}
         return parts | bodies | {"fields": fields}

@@ -460,17 +460,19 @@ class ExudynTree(ExudynAdapter):
         with silence_engine():
             return [_evaluate_state(_KinematicTree(model, state)) for state in states]
 
-    def written(self, model: Model, state: State) -> dict[str, Any]:
+    def written(self, model: Model, state: State, moves: bool = False) -> dict[str, Any]:
         """Return the items of the assembled system, and what the read-out needs, of one state."""
         with silence_engine():
             tree = _KinematicTree(model, state)
             gravity = np.array(tree.mbs.GetObjectParameter(tree.tree, "gravity"))
             found = written_items(tree.mbs)
         fields = {"rates": tree.initial_angle_rates, "joint_rates": tree.linkage.W, "gravity": gravity}
-        fields |= {"frames": tree.body_axes_of_links, "A": tree.linkage.attitude, "mass": model.mass}
-        fields |= {"inertia": model.inertia, "elastic": np.array(elastic_energy(model, state))}
+        fields |= {"frames": tree.body_axes_of_links, "A": tree.linkage.attitude}
+        fields |= {"elastic": np.array(elastic_energy(model, state))}
+        links = [(x.parent, None if x.joint in SLIDES else x.axis.tolist()) for x in tree.linkage.links]
         sensors = {str(output).split(".")[-1]: [*map(int, own)] for output, own in tree.sensors.items()}
-        return {"items": found, "sensors": sensors, "fields": fields}
+        bodies = tree.linkage.link_of_body
+        return {"items": found, "sensors": sensors, "links": links, "bodies": bodies, "fields": fields}
 
     def _simulate(
         self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float

@@ -114,6 +114,7 @@ LARGEST_REGULARISATIONS, RATIO, REGULARISATIONS = (0.027, 2.7e-4, 2.7e-6), 3.0, 
 SEQUENCES = (1.0, 1.3, 1.7, 1.15, 1.5)  # of them: factors of the largest; three are compared
 # Of motions: the error of smaller ones is rounding, and as 1/R what steps leave of gaps in dependent rows.
 LARGEST_RUN_REGULARISATION, RUN_REGULARISATIONS = 2.7e-4, 3
+RUN_SOLREF = -(STABILISATION**2), -2 * STABILISATION  # of welds
 RUN_ITERATIONS = 3  # of Newton's method on welds, a linear problem: the second and third remove rounding
 MAX_ORDER_ERROR = 0.1
 MIN_SOFTNESS = 1e-9  # a smaller relative effect of R is rounding
@@ -201,23 +202,32 @@ class Mujoco(MetamorphicHooks):
         with _raise_on_warnings(chain.d):
             return [chain.quantities(state) for state in states]
 
-    def written(self, model: Model, state: State) -> dict[str, Any]:
+    def written(self, model: Model, state: State, moves: bool = False) -> dict[str, Any]:
         """Return the MJCF, the numbers that it lacks, and what the read-out needs, of one state."""
-        soft = _SoftMechanism(model, "", has_text=True) if self.is_soft(model) else None
-        tree = soft.tree if soft else _MujocoChain(model, has_text=True)
+        parts, soft = self.body_pieces(model), None
+        if self.is_soft(model):
+            soft = _SoftMechanism(model, self.option, parts, has_text=True)
+        tree = soft.tree if soft else _MujocoChain(model, parts, has_text=True)
         there = soft.state(state) if soft else state
         rates, loads = tree.set_state(there), ("proximal", "force", "moment", "drag_force", "drag_moment")
         fields = {name: getattr(tree.d, name).copy() for name in ("qpos", "qvel", "qfrc_applied")}
-        fields |= {name: getattr(tree.model, name) for name in (*loads, "gravity")}
-        fields |= {"link": np.array(tree.link_ids), "joint_rates": rates}
-        if soft:
+        fields |= {f"link_{name}": getattr(tree.model, name) for name in loads}
+        fields |= {"gravity": model.gravity, "link": np.array(tree.link_ids), "joint_rates": rates}
+        if soft and moves:
+            fields["scales"] = LARGEST_RUN_REGULARISATION / RATIO ** np.arange(RUN_REGULARISATIONS)
+        elif soft:
             largest = _usable_regularisation(soft, state, there)
             fields["scales"] = largest / RATIO ** np.arange(REGULARISATIONS)
-        place = soft.cut.place if soft and soft.cut else np.arange(len(model.kind))
-        fields |= {"bodies": place[: model.n], "joints": place}
-        return {"text": tree.text, "numbers": tree.numbers, "softness": SOFTNESS, "ratio": RATIO} | {
-            "fields": fields
-        }
+        bodies, joints = soft.places() if soft else (np.arange(model.n), np.arange(len(model.kind)))
+        fields |= {"bodies": bodies, "joints": joints}
+        constants = dict[str, Array]()
+        if soft and soft.rods:
+            along = kinematics.joint_coordinates(model, state)[0][soft.rods]
+            fields |= {"tied": np.array(soft.rods), "along": along}
+            constants = {name: getattr(tree.m, name) for name in ("tendon_length0", "tendon_invweight0")}
+        settings = {"softness": SOFTNESS, "ratio": RATIO, "iterations": RUN_ITERATIONS, "solref": RUN_SOLREF}
+        numbers = {"text": tree.text, "numbers": tree.numbers, "constants": constants}
+        return settings | numbers | {"dense": self.option == DENSE, "fields": fields}
 
     def is_soft(self, model: Model) -> bool:
         """Whether constraints hold it: loops, options of joints, pitches."""
@@ -264,7 +274,7 @@ class Mujoco(MetamorphicHooks):
             tree = soft.tree
             tree.soften(LARGEST_RUN_REGULARISATION / RATIO**k)
             tree.m.opt.iterations = RUN_ITERATIONS
-            tree.m.eq_solref[:] = -(STABILISATION**2), -2 * STABILISATION
+            tree.m.eq_solref[:] = RUN_SOLREF
             run = self._sampled_run(tree, soft.state(state), times, integrator, resolution)
             runs.append(soft.cut.source_run(run) if soft.cut else run)
         limit: dict[str, Any] = {}
@@ -636,6 +646,13 @@ class _SoftMechanism:
         if self.tree.model.kind != self.opened.kind:
             there = state_of_cylinders(self.opened, self.tree.model, there)
         return there
+
+    def places(self) -> tuple[Int[Indices, "bodies"], Int[Indices, "joints"]]:
+        """Which bodies of the tree are the mechanism's, and which hold its joints; −1 for a tie."""
+        place = self.cut.place if self.cut else np.arange(self.opened.n)
+        if not self.rodless:
+            return place[: self.source.n], place
+        return place[np.argsort(self.rodless.order)], np.append(place, -1)[self.rodless.joint]
 
     def quantities(self, state: State, there: State) -> StateQuantities:
         """Evaluate what is determinate, without a mass matrix; ``there`` is the state of the tree."""

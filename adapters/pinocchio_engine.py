@@ -118,7 +118,7 @@ class PinocchioChain:
         change: Change = Change(),  # noqa: B008
     ):
         self.source_model, self.algorithm = model, change.algorithm or algorithm
-        parts = parts or undivided_bodies(model)
+        self.parts = parts = parts or undivided_bodies(model)
         self.pin_model = pin.Model()
         self.pin_model.gravity = pin.Motion(model.gravity, np.zeros(3))
         self.body_joints: list[int] = []  # joint of body k
@@ -484,29 +484,39 @@ class PinocchioChain:
         )
 
     def written(self, state: State) -> dict[str, Any]:
-        """Return joints, bodies and welds, and the state with its loads and torques, as numbers."""
+        """Return joints, bodies, springs and welds, and the state, as numbers."""
         engine, model, (q, v) = self.pin_model, self.source_model, self.coordinates(state)
-        self.loads = list(self.constant_loads)
-        self._add_up_loads()
-        self.update_loads(q, v)
         joints = [
             (int(engine.parents[j]), _joint_call(engine.joints[j]), _placed(engine.jointPlacements[j]))
             for j in range(1, engine.njoints)
         ]
         bodies = [(j, _placed(at)) for j, at in zip(self.body_joints, self.placements, strict=True)]
         masses = [
-            (*body, m, J) for body, m, J in zip(bodies, model.mass.tolist(), model.inertia, strict=True)
+            (j, _placed(at * translation(part.centre)), float(part.mass), part.inertia)
+            for j, at, own in zip(self.body_joints, self.placements, self.parts, strict=True)
+            for part in own
         ]
         for k in np.flatnonzero(model.rods[: model.n]).tolist():
             axial = np.diag([0.0, 0.0, ROD_AXIAL_INERTIA * np.trace(model.inertia[k])])
             masses.append((self.body_joints[k] - 1, (np.eye(3), np.zeros(3)), 0.0, axial))
         welds = [[bodies[k] for k in pair] for pair in self.ends]
-        fields = {"gravity": model.gravity, "q": q, "v": v, "torque": self.joint_torque(q, v)}
-        fields |= {"armature": engine.armature.copy(), "loads": np.array([f.vector for f in self.fext])}
-        fields |= {"elastic": np.array(elastic_energy(model, state)), "joint_rates": self.rate_map(state, q)}
+        loads = ("force", "moment", "drag_force", "drag_moment")
+        fields = {"gravity": model.gravity, "q": q, "v": v, "armature": engine.armature.copy()}
+        fields |= {f"link_{name}": getattr(model, name) for name in loads}
+        fields |= {name: getattr(self, name) for name in ("effort", "damping", "stiffness", "rest")}
+        fields |= {"of_q": self.scalars[0], "of_v": self.scalars[1], "joint_rates": self.rate_map(state, q)}
+        fields["elastic"] = np.array(elastic_energy(model, state))
         place = np.arange(len(model.kind))
         settings: dict[str, Any] = {"proximal": PROXIMAL_SETTINGS, "algorithm": self.algorithm}
+        settings |= {"stabilisation": STABILISATION, "has_elements": model.has_joint_elements}
+        balls = zip(*(at.tolist() for at in self.sprung_balls), self.ball_rest, strict=True)
+        numbers = zip(model.spring_stiffness, model.spring_damping, model.spring_length, strict=True)
+        springs = [
+            ([(j, _placed(at)) for j, at in ends], [*map(float, own)])
+            for ends, own in zip(self.spring_ends, numbers, strict=True)
+        ]
         parts = {"joints": joints, "masses": masses, "bodies": bodies, "welds": welds}
+        settings |= {"sprung_balls": list(balls), "springs": springs}
         reason = "scripts do not part the bodies that Pinocchio merges at a weld"
         if any(kind.is_rigid for kind in model.kinds):
             settings["missing"] = dict.fromkeys(("joint_reaction", "joint_moment"), reason)
@@ -775,10 +785,11 @@ class Pinocchio(PinocchioAdapter):
         chain = PinocchioChain(*given, change=change)
         return [chain.quantities(state) for state in states]
 
-    def written(self, model: Model, state: State) -> dict[str, Any]:
+    def written(self, model: Model, state: State, moves: bool = False) -> dict[str, Any]:
         """Return the numbers of the engine's model at a state, see `PinocchioChain.written`."""
         if not model.has_loops:
-            return PinocchioChain(model, self.usual_algorithm).written(state)
+            algorithm = "aba" if moves else self.option or self.usual_algorithm
+            return PinocchioChain(model, algorithm, self.body_pieces(model)).written(state)
         cut = cut_open(model)
         found = PinocchioChain(cut.model, self.usual_algorithm, ends=cut.ends).written(cut.state(state))
         found["fields"] |= {"bodies": cut.place[: model.n], "joints": cut.place}

@@ -41,7 +41,7 @@ from adapters.pinocchio_common import (
 from plumbline.model.datatypes import Array, Indices, Model, State, StateQuantities, Unsupported
 from plumbline.model.kinematics import JointFrame, joint_coordinates, rotation_matrix, velocity_jacobian
 from plumbline.model.loops import independent_rows
-from plumbline.model.welding import BodyParts, undivided_bodies
+from plumbline.model.welding import BodyParts
 
 MAX_BODIES = 30  # bodies; the engine's workspace grows with N³: 0.4 GB here, 1.5 GB at 50
 
@@ -50,7 +50,7 @@ class _FreeFlyerSystem:
     """A `Model` as free bodies and constraints. Pinocchio's q is (7 N,), its v (6 N,)."""
 
     def __init__(self, model: Model, parts: BodyParts, use_kkt_inverse: bool = False):
-        self.source_model, self.use_kkt_inverse = model, use_kkt_inverse
+        self.source_model, self.parts, self.use_kkt_inverse = model, parts, use_kkt_inverse
         self.pin_model = pin.Model()
         self.pin_model.gravity = pin.Motion(model.gravity, np.zeros(3))
         for k in range(model.n):
@@ -112,19 +112,23 @@ class _FreeFlyerSystem:
     def written(self, state: State) -> dict[str, Any]:
         """Return bodies, joints' points and directions, and the state with its loads, as numbers."""
         model = self.source_model
+        masses = [
+            (k + 1, part.centre, float(part.mass), part.inertia)
+            for k, own in enumerate(self.parts)
+            for part in own
+        ]
         self.quantities(state)
         q, v, tau, rates = self._coordinates(state)
         kept = self._solve_constraint_rows(state, q, v, tau)[2]
         fields = {"q": q, "v": v, "torque": tau, "joint_rates": rates, "kept": kept}
         fields |= {"gravity": model.gravity, "omega": state.omega, "A": rotation_matrix(state.p)}
-        fields |= {"mass": model.mass, "inertia": model.inertia}
         joints = []
         for k, (kind, bodies) in enumerate(zip(model.kinds, model.body + 1, strict=True)):
             bend = model.length[k] * self.udot[k] @ self.udot[k] if kind.holds_distance else 0.0
             ends = list(zip(bodies.tolist(), model.point[k], strict=True))
             joints.append((ends, self._held_directions(k, state), self.allowed[k], bend, kind.has_attitude))
         uses_contacts = all(kind.is_spherical for kind in model.kinds) and not model.has_loops
-        return {"joints": joints, "contacts": uses_contacts, "fields": fields}
+        return {"joints": joints, "masses": masses, "contacts": uses_contacts, "fields": fields}
 
     def _solve_constraint_rows(
         self, state: State, q: Array, v: Array, tau: Array
@@ -235,11 +239,11 @@ class PinocchioMaximal(PinocchioAdapter):
         "without inertia",
     }
     builds_trees = True
-    options = loop_options = ("inverse of the KKT matrix",)
+    options = loop_options = unwritten_ways = ("inverse of the KKT matrix",)
 
-    def written(self, model: Model, state: State) -> dict[str, Any]:
+    def written(self, model: Model, state: State, moves: bool = False) -> dict[str, Any]:
         """Return the numbers of the engine's model at a state, see `_FreeFlyerSystem.written`."""
-        return _FreeFlyerSystem(model, undivided_bodies(model)).written(state)
+        return _FreeFlyerSystem(model, self.body_pieces(model)).written(state)
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
         if model.n > MAX_BODIES:

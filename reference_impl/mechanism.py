@@ -198,7 +198,7 @@ class Mechanism:
 
     @property
     def has_chain_joints(self) -> bool:
-        """Whether every body is joined to the one before, the first to the world, by bare rods and balls."""
+        """Whether every body hangs from the one before, the first from the world, by a bare rod or ball."""
         return _has_chain_joints(self)
 
     @property
@@ -314,8 +314,7 @@ def _has_joint_elements(mechanism: Mechanism) -> bool:
 def _has_chain_joints(mechanism: Mechanism) -> bool:
     if mechanism.has_loops or mechanism.has_elements or not all(x.holds_no_turn for x in mechanism.kinds):
         return False
-    is_row = bool(np.all(mechanism.body[:, 0] == np.arange(mechanism.n) - 1))
-    return is_row and not np.any(mechanism.point[0, 0])
+    return bool(np.all(mechanism.body[:, 0] == np.arange(mechanism.n) - 1))
 
 
 @lru_cache(maxsize=64)

@@ -76,7 +76,13 @@ MODEL_GAPS: Mapping[str, Callable[[Model], bool]] = {
     "point masses": lambda model: model.lacks_inertia,
     "bodies": lambda model: model.n > 1,
     "angles": lambda model: any(kind.has_attitude for kind in model.kinds),
+    "elements": lambda model: model.has_elements,
+    "other joints": lambda model: not all(kind.holds_no_turn for kind in model.kinds),
+    "branches": lambda model: not np.array_equal(model.body[:, 0], np.arange(len(model.kind)) - 1),
+    "pivots": lambda model: bool(np.any(model.point[model.body[:, 0] < 0, 0])),
 }
+# What columns without `builds_trees` cannot express.
+TREE_GAPS = "point masses", "elements", "other joints", "branches", "pivots"
 PARTIAL_GAPS = {"bodies", "angles"}  # of some such mechanisms, which the adapter refuses itself
 
 
@@ -208,8 +214,11 @@ class Adapter(ABC):
             answers = [replace(answer, joint_moment=None) for answer in answers]
         return answers
 
-    def written(self, model: Model, state: State) -> dict[str, Any]:
+    def written(self, model: Model, state: State, moves: bool = False) -> dict[str, Any]:
         """Write what the engine itself holds of a mechanism at a state, for a stand-alone script.
+
+        Args:
+            moves: whether the script runs from there; else it evaluates the state.
 
         Returns:
             What the template of the engine's scripts takes; ``fields`` are its arrays by name.
@@ -317,7 +326,7 @@ class Adapter(ABC):
         """Refuse what the adapter does not build, and elements unless it evaluates states with them."""
         if self.builds_trees and model.has_loops and self.loops_unsupported_reason:
             raise Unsupported(self.loops_unsupported_reason, "loops")
-        if not self.builds_trees and (model.lacks_inertia or not model.has_chain_joints):
+        if not self.builds_trees and any(MODEL_GAPS[gap](model) for gap in TREE_GAPS):
             reason = f"the adapter of {self.title} covers chains of rods and balls from the origin"
             raise Unsupported(reason, "trees")
         for gap, reason in self.gaps.items():

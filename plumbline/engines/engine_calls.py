@@ -12,7 +12,6 @@ from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass, field, replace
 from importlib import metadata
 from io import StringIO
-from typing import Any
 
 import numpy as np
 
@@ -33,7 +32,6 @@ from plumbline.model.datatypes import (
     Trajectory,
     Unsupported,
 )
-from plumbline.model.loops import determinate_projectors, wrench_length
 from plumbline.processes.exceptions import describe_exception
 
 SURFACE_STATES = 8  # of a scenario, at which what engines report besides the state quantities is compared
@@ -221,20 +219,6 @@ def stack_answers(answers: Sequence[SurfaceAnswer]) -> dict[str, dict[Call, Arra
         }
         for quantity, calls in (answers[0] if answers else {}).items()
     }
-
-
-def write_mechanism(engine: str, model: Model, state: State) -> dict[str, Any]:
-    """Write what an engine holds of a mechanism at a state; of loops, which part of wrenches is unique.
-
-    Raises:
-        Unsupported: the adapter cannot write it; the message is the reason.
-
-    """
-    found = load_adapter(engine).written(model, state)
-    projectors = determinate_projectors(model, state) if model.has_loops else None
-    if projectors is not None:
-        found["fields"] |= {"unique": projectors, "arm": np.array(wrench_length(model))}
-    return found
 
 
 def run_refinement(

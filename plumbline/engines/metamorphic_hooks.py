@@ -33,6 +33,7 @@ class MetamorphicHooks(Adapter):
     unmoved_options: ClassVar[Mapping[str, str]] = {}  # those whose motions are not compared: why
     usual_linear_solver: ClassVar[str] = ""  # of implicit steps, or of the equations of motion
     linear_solvers: ClassVar[tuple[str, ...]] = ()  # the others
+    unwritten_ways: ClassVar[tuple[str, ...]] = ()  # those that its scripts cannot show
     welding_unsupported_reason: ClassVar[str] = "the adapter welds nothing"  # empty where it does
     option: str = ""  # the one of `options`, `joint_options` or `linear_solvers` in use
     has_welded_halves: bool = False  # whether `body_pieces` divides every body

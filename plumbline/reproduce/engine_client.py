@@ -6,12 +6,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from plumbline.engines import engine_calls
-from plumbline.engines.metamorphic_hooks import metamorphic_hooks
+from plumbline.engines.metamorphic_hooks import MetamorphicHooks, metamorphic_hooks
 from plumbline.engines.registry import load_adapter
 from plumbline.measurements.relation_result import OPTION_PREFIX
 from plumbline.measurements.state_relations import WELDED_HALVES
 from plumbline.model.datatypes import Integrator, Model, State, StateQuantities
+from plumbline.model.loops import determinate_projectors, wrench_length
 from plumbline.processes.remote_python import call_remote
 
 
@@ -49,6 +52,23 @@ class EngineClient:
         found: StateQuantities = self.call(_evaluate_variant, variant, model, state)
         return found
 
+    def write(self, model: Model, state: State, variant: str = "", moves: bool = False) -> dict[str, Any]:
+        """Write what the engine holds of a mechanism, see `Adapter.written`.
+
+        Args:
+            variant: as of `evaluate`.
+            moves: whether the engine is to run from there.
+
+        Returns:
+            The adapter's answer; of loops also which part of the wrenches is unique.
+
+        Raises:
+            Unsupported: the adapter cannot write it; the message is the reason.
+
+        """
+        found: dict[str, Any] = self.call(_write_variant, variant, model, state, moves)
+        return found
+
     def integrator(self, name: str) -> Integrator:
         """Return the declaration of one of the engine's integrators.
 
@@ -71,11 +91,21 @@ class EngineClient:
         return printed
 
 
-def _evaluate_variant(engine: str, variant: str, model: Model, state: State) -> StateQuantities:
+def _set_to_variant(engine: str, variant: str) -> MetamorphicHooks:
     adapter = metamorphic_hooks(load_adapter(engine))
     if variant == WELDED_HALVES:
-        adapter = adapter.with_welded_halves()
-    elif variant:
-        adapter = adapter.with_option({OPTION_PREFIX + way: way for way in adapter.ways}[variant])
-    (found,) = adapter.evaluate(model, [state])
+        return adapter.with_welded_halves()
+    return adapter.with_option({OPTION_PREFIX + x: x for x in adapter.ways}[variant]) if variant else adapter
+
+
+def _evaluate_variant(engine: str, variant: str, model: Model, state: State) -> StateQuantities:
+    (found,) = _set_to_variant(engine, variant).evaluate(model, [state])
+    return found
+
+
+def _write_variant(engine: str, variant: str, model: Model, state: State, moves: bool) -> dict[str, Any]:
+    found = _set_to_variant(engine, variant).written(model, state, moves)
+    projectors = determinate_projectors(model, state) if model.has_loops else None
+    if projectors is not None:
+        found["fields"] |= {"unique": projectors, "arm": np.array(wrench_length(model))}
     return found

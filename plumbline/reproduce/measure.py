@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -56,6 +57,20 @@ class Evidence:
     expected: dict[str, Array]  # value of each quantity, at a state or at the end of a run
     # (N,) or a number: of the norm of the error, per body (of attitudes as quaternions), or of each entry
     bound: dict[str, Array]
+    variant: str = field(default="", kw_only=True)  # how the engine computes: "by …", "two welded halves"
+
+    def written(self, engine: EngineClient) -> dict[str, Any]:
+        """Write what the engine holds of the case, for the script.
+
+        Args:
+            engine: the one whose rows disagree; this evidence may be about its other formulation.
+
+        Raises:
+            Unsupported: the adapter cannot write it; the message is the reason.
+
+        """
+        moves, case = bool(self.case.steps), self.case
+        return replace(engine, name=self.engine).write(case.model, case.state, self.variant, moves)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +78,6 @@ class StateEvidence(Evidence):
     """A state at which the engine's answers differ from the expected ones."""
 
     certified: bool  # whether the truth is certified; else the notes' equations in double precision
-    variant: str = ""  # how the engine computes ("by …", "two welded halves"); empty as usual
     relation: str = ""  # of this state, by which it was found
 
 
@@ -185,7 +199,7 @@ class StateMeasure:
         uncertain = answers.limit_error or {}
         bound = {q: np.asarray(allowed.tolerance(q), float) + uncertain.get(q, 0.0) for q in offered}
         ratio = _largest_ratio(found, right, bound)
-        return StateEvidence(case, ratio, self.engine.name, right, bound, certified, self.variant)
+        return StateEvidence(case, ratio, self.engine.name, right, bound, certified, variant=self.variant)
 
 
 @dataclass(frozen=True)
@@ -281,7 +295,9 @@ class ConvergenceMeasure:
 
         """
         model, count = case.model, 1
-        if self.level == "invariants" and (model.has_drag or np.any(model.moment)):
+        if self.level == "invariants" and (
+            model.is_dissipative or np.any(model.moment) or np.any(model.effort)
+        ):
             count = min(WORK_SAMPLES, round(case.until / case.steps[0]))
             if count < 16:
                 return None
@@ -367,9 +383,10 @@ class ConvergenceMeasure:
 
 
 def _zeros(case: ReproductionCase, invariant: str) -> Array:
-    """Expected drift of an invariant: one number, or one row for each body."""
-    width = {"joint_gap": 3, "gap_rate": 3, "norm_drift": 1}.get(invariant)
-    return np.zeros((case.model.n, width) if width else ())
+    """Expected drift of an invariant: one number, or one row for each joint or body."""
+    joints, bodies = len(case.model.kind), case.model.n
+    shapes = {"joint_gap": (joints, 3), "gap_rate": (joints, 3), "norm_drift": (bodies, 1)}
+    return np.zeros(shapes.get(invariant, ()))
 
 
 def _excess(row: Row) -> float:

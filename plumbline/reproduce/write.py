@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from plumbline.engines import engine_calls, environments
+from plumbline.engines import environments
 from plumbline.judging.known_issues import project_known_issues
 from plumbline.judging.rows import Verdict
 from plumbline.measurements.order_and_limit import STEP_EXPONENTS
@@ -24,8 +24,8 @@ from plumbline.model.sampling import compared_states
 from plumbline.processes.exceptions import PlumblineError
 from plumbline.processes.worker_pool import Limits, Outcome, ResultCache, Task, WorkerPool
 from plumbline.reproduce.engine_client import EngineClient
-from plumbline.reproduce.measure import Disagreement, Evidence
-from plumbline.reproduce.render import is_at_state, no_script_reason, render_script
+from plumbline.reproduce.measure import Disagreement
+from plumbline.reproduce.render import no_script_reason, render_script
 from plumbline.reproduce.shrink import OutOfTime, ReproductionCase
 from plumbline.storage.results_store import read_results, write_atomically
 from plumbline.storage.script_index import read_script_index, script_name, scripts_folder, write_script_index
@@ -176,7 +176,7 @@ def make_script(disagreement: Disagreement, row: StoredRow) -> tuple[str, str]:
     try:
         for find in (disagreement.shrink, lambda: disagreement.measure(disagreement.case)):
             if (evidence := find()) is not None:
-                text = _text(disagreement.engine, row, evidence)
+                text = render_script(row, evidence, evidence.written(disagreement.engine))
                 if _largest_printed_ratio(disagreement.engine.run_script(text)) > 1:
                     return text, ""
     except OutOfTime:
@@ -184,20 +184,6 @@ def make_script(disagreement: Disagreement, row: StoredRow) -> tuple[str, str]:
     except Unsupported as refusal:
         return "", str(refusal)
     return "", "called again, the engine agrees: nothing to show"
-
-
-def _text(engine: EngineClient, row: StoredRow, evidence: Evidence) -> str:
-    """Render a script; the templates build chains of rods and balls, others are written as engines hold them.
-
-    Raises:
-        Unsupported: the adapter cannot write the mechanism; the message is the reason.
-
-    """
-    case = evidence.case
-    if case.model.has_chain_joints:
-        return render_script(row, evidence)
-    client = replace(engine, name=evidence.engine)
-    return render_script(row, evidence, client.call(engine_calls.write_mechanism, case.model, case.state))
 
 
 def find_disagreement(document: dict[str, Any], rows: list[StoredRow], seconds: float) -> Disagreement:
@@ -226,11 +212,6 @@ def find_disagreement(document: dict[str, Any], rows: list[StoredRow], seconds: 
     if scenario is None:
         raise NotReproducible(f"the results do not hold the scenario {row['scenario']!r}")
     model = Model.from_fields(scenario["model"])
-    if not (model.has_chain_joints or is_at_state(row)):
-        raise NotReproducible(
-            "scripts of runs, of steps and of an engine's second ways write out chains of rods and ball "
-            "joints; of this mechanism there are scripts of states"
-        )
     start = State(**{name: np.array(value, float) for name, value in scenario["state"].items()})
     state = complete_state(model, start)
     if row["level"] in ("trajectory", "invariants"):

@@ -17,12 +17,12 @@ from plumbline.model.kinematics import complete_state, quaternion_product, stret
 AXES = ("x", "y", "z")
 INERTIA_ENTRIES = {"xx": (0, 0), "yy": (1, 1), "zz": (2, 2), "xy": (0, 1), "xz": (0, 2), "yz": (1, 2)}
 UNITS = {
-    "gravity": "m/s²", "mass": "kg", "inertia": "kg m²", "proximal": "m", "distal": "m", "length": "m",
+    "gravity": "m/s²", "mass": "kg", "inertia": "kg m²", "proximal": "m", "anchor": "m", "length": "m",
     "pitch": "m/rad",
     "force": "N", "moment": "N m", "drag_force": "N s/m", "drag_moment": "N m s", "attitude": "rad",
     "omega": "rad/s", "direction": "rad", "rod_rate": "1/s",
-    # of trees: the far point of a joint, its axes in both bodies; elements of turns; springs between points
-    "anchor": "m", "frame": "rad", "body_frame": "rad", "armature": "kg m²", "damping": "N m s",
+    # a joint's axes in both bodies; elements of turns; springs between points
+    "frame": "rad", "body_frame": "rad", "armature": "kg m²", "damping": "N m s",
     "stiffness": "N m", "rest": "rad", "effort": "N m", "coordinate": "rad", "rate": "rad/s",
     "position": "m", "velocity": "m/s", "spring_point": "m", "spring_stiffness": "N/m",
     "spring_damping": "N s/m", "spring_length": "m",
@@ -71,8 +71,8 @@ class Parameter:
 def list_parameters(model: Model, state: State) -> list[Parameter]:
     """List every parameter of a model and of its initial state.
 
-    The distal point of the last body of a chain is no parameter, because nothing hangs there.  Attitudes and
-    directions of rods count as small rotations: about the body's axes, and about two axes across the rod.
+    Attitudes and directions of rods count as small rotations: about the body's axes, and about two axes
+    across the rod.
 
     Returns:
         Gravity's components, then body by body its model parameters, those of its joint and its initial
@@ -104,22 +104,19 @@ def list_parameters(model: Model, state: State) -> list[Parameter]:
 
 
 def _span(model: Model, k: int) -> float:
-    """A body's size: distance of its points of a chain, or its near point, and radius of gyration."""
-    sizes = [model.proximal[k], model.distal[k] if model.has_chain_joints else np.zeros(3)]
+    """A body's size: distance of its near point and of those on which others hang, and radius of gyration."""
+    sizes = [model.proximal[k], *model.point[model.body[:, 0] == k, 0]]
     gyration = np.sqrt(np.trace(model.inertia[k]) / (2 * model.mass[k]))
     return max(float(gyration), *(float(np.linalg.norm(x)) for x in sizes))
 
 
 def _geometry(model: Model, k: int, span: float) -> Iterator[Parameter]:
-    """Points and axes of a body's joint, and of a chain the point where the next body hangs."""
+    """Points and axes of a joint; ``span`` is the size of its near body."""
     kind = model.kinds[k]
     if kind.holds_nothing:
         return
     yield from _components("proximal", k, model.proximal[k], span)
-    if not model.has_chain_joints:
-        yield from _components("anchor", k, model.point[k, 0], span)
-    elif k + 1 < model.n:
-        yield from _components("distal", k, model.distal[k], span)
+    yield from _components("anchor", k, model.point[k, 0], span)
     if kind.own_number:
         yield _parameter(kind.own_number, k, "", model.length[k], span)
     if not kind.has_attitude or (kind.is_spherical and model.stiffness[k, 0]):
@@ -275,7 +272,7 @@ def derivative(model: Model, state: State, parameter: Parameter) -> dict[str, Ar
 
 
 _FIELDS = {  # where they are not named as the kind
-    "proximal": "point", "distal": "point", "anchor": "point", "frame": "turn", "body_frame": "turn",
+    "proximal": "point", "anchor": "point", "frame": "turn", "body_frame": "turn",
     "pitch": "length",
     "omega": "omega", "position": "r", "velocity": "v",
 }  # fmt: skip
@@ -296,9 +293,7 @@ def _model_derivative(model: Model, parameter: Parameter) -> dict[str, Array]:
         return {name: _unit(array, k, _column(model, parameter))}
     *where, axis = entry.split() or [""]
     place: list[int] = [] if kind == "gravity" else [k]
-    if kind == "distal":  # where the next body hangs
-        place = [k + 1, 0]
-    elif name == "point":
+    if name == "point":
         place.append(int(kind == "proximal"))
     elif where:
         place.append(int(where == ["second"]))

@@ -379,7 +379,7 @@ def perturbed_motions(
 
 
 def _simulate_batch(motion: AccurateMotion, cases: Sequence[tuple[Model, State]]) -> list[Trajectory]:
-    """Runs of all cases by their deviations from the first, which is the accurate motion, unstabilised."""
+    """Runs of all cases by their deviations from the first, the accurate motion, each on its joints."""
     times, substeps, n = motion.times, motion.substeps, motion.model.n
     system = eliminated_system([model for model, _ in cases], np.concatenate([s.x for _, s in cases]))
     r, p, v = (np.concatenate([getattr(state, name) for _, state in cases]) for name in ("r", "p", "v"))
@@ -410,7 +410,7 @@ def _simulate_batch(motion: AccurateMotion, cases: Sequence[tuple[Model, State]]
                 r, p, v, pdot = (part.T for q in true(stage) + delta for part in (q[:3], q[3:]))
                 x = winding.coordinates(r, p, v, pdot, x)[0]
         y = true(stage) + delta
-        samples.append(np.stack(system.project(y[0], y[1])) if isinstance(system, TreeSystem) else y)
+        samples.append(np.stack(system.project(y[0], y[1])))
     # (cases, 2, T, N, 7)
     found = np.moveaxis(
         np.array(samples).reshape(len(times), 2, 7, len(cases), -1), (3, 1, 0, 4, 2), (0, 1, 2, 3, 4)

@@ -125,6 +125,8 @@ class StructuredSystem:
         self.inverse_mass = 1 / mass  # (M,) 1/kg
         self.J, self.K = last(inertia), last(K)  # (3, 3, M)
         self.s = last(points)  # (2, 3, M) m, proximal and distal point, body frame
+        pivots = [chain.point[:, 0] * (chain.body[:, :1] < 0) for chain in chains]
+        self.pivot = last(np.concatenate(pivots))  # (3, M) m, of the first bodies; 0 of the others
         self.lever = float(np.abs(points).max())  # m
         self.free_acceleration = last(weight / mass[:, None])  # (3, M) m/s²
         self.drag_rate = drag_force / mass  # (M,) 1/s
@@ -231,7 +233,7 @@ class StructuredSystem:
         sigma, omega = rates[0], rates[1:4]
         velocity = _matrix_vector(R, _matrix_vector(_tilde(omega), self.s))
         velocity += 2 * sigma * (Rs + self.s)
-        d = q[:3] + As[0] - self._at_parent(q[:3] + As[1])
+        d = q[:3] + As[0] - self._at_parent(q[:3] + As[1]) - self.pivot
         return d, v[:3] + velocity[0] - self._at_parent(v[:3] + velocity[1])
 
     def constraints(
@@ -276,7 +278,7 @@ class StructuredSystem:
             excess = (norm - 1) * self.s
             As, off = norm * Rs + excess, 2 * excess
             far = self._at_parent(np.concatenate([q[:3] + As[1], off[1]]))
-            d = q[:3] + As[0] - far[:3]
+            d = q[:3] + As[0] - far[:3] - self.pivot
             self._check_rods(q, d)
             U, U_near, U_far = (self._padded_rows(w) for w in (2 * d, 2 * d - off[0], 2 * d + far[3:]))
             rows = np.empty((2, c, 3, self.body_count))

@@ -18,7 +18,7 @@ from plumbline.measurements.state_relations import QUANTITIES, STATE_RELATIONS, 
 from plumbline.model.step_methods import JointSpaceMethod
 from plumbline.reproduce.engine_client import EngineClient
 from plumbline.reproduce.measure import ConvergenceMeasure, RelationMeasure, StateMeasure, StepMeasure
-from plumbline.reproduce.render import no_script_reason
+from plumbline.reproduce.render import no_script_reason, render_script
 from plumbline.reproduce.shrink import ReproductionCase
 from tests.helpers import pendulums
 from tests.helpers.pendulums import JOINT_PATTERNS
@@ -34,6 +34,12 @@ def stored_row(engine: str, **more):
     """A stored row about an engine of this environment; its texts are hostile."""
     row = {"scenario": HOSTILE, "quantity": HOSTILE, "integrator": HOSTILE, "extra": {"state": 3.0}}
     return row | {"engine": engine, "engine_version": load_adapter(engine).version()} | more
+
+
+def script_of(evidence, **row) -> str:
+    """The script that shows evidence, as `write_scripts` makes it; ``row`` are fields of the stored row."""
+    system = evidence.written(EngineClient(evidence.engine))
+    return render_script(stored_row(evidence.engine, **row), evidence, system)
 
 
 def state_case(joints: str, loads: bool = False, drag: bool = False, rate: float = 3.0) -> ReproductionCase:

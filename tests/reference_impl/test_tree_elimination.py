@@ -123,6 +123,24 @@ def test_both_integrators_agree_on_a_tree():
     np.testing.assert_allclose(one.p, other.p, atol=1e-9)
 
 
+@pytest.mark.parametrize("joints", [[0, 0, 0], [1, 0, 1], [1, 1]])
+def test_chains_from_any_point_move_as_trees_do(joints):
+    chain = random_model(np.random.default_rng(3), joints)
+    point = chain.point.copy()
+    point[0, 0] = 0.3, -0.2, 0.5
+    moved = chain.changed(point=point)
+    parts, own = off_manifold(moved, 1, 1e-3), eliminated_system([moved])
+    assert isinstance(own, StructuredSystem)
+    np.testing.assert_allclose(
+        accelerations(own, parts), accelerations(TreeSystem([moved]), parts), rtol=1e-9
+    )
+    r, p, v, pdot = off_manifold(moved, 1, 0.0)
+    on = component_first(r, p), component_first(v, pdot)
+    assert np.max(np.abs(own.constraints(*on)[0])) < 1e-14
+    off = on[0] + 1e-3, on[1]
+    np.testing.assert_allclose(own.project(*off), TreeSystem([moved]).project(*off), atol=1e-9)
+
+
 def test_chains_keep_their_own_form():
     chain = random_model(np.random.default_rng(0), [1, 0])
     tree = random_tree(np.random.default_rng(0), 2, ("hinge",))

@@ -1,4 +1,4 @@
-"""Scripts of mechanisms that are no chains: what an engine holds, written out, gives the recorded numbers."""
+"""Scripts of trees, loops and elements: what an engine holds, written out, gives the recorded numbers."""
 
 import subprocess
 import sys
@@ -8,17 +8,28 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from plumbline.engines.engine_calls import write_mechanism
 from plumbline.engines.registry import load_adapter
+from plumbline.judging.refinement_analysis import RefinementAnalysis
+from plumbline.judging.rows import RowContext
 from plumbline.measurements.state_relations import QUANTITIES
 from plumbline.model.datatypes import Unsupported
 from plumbline.reproduce.engine_client import EngineClient
-from plumbline.reproduce.measure import Disagreement, StateMeasure
+from plumbline.reproduce.measure import ConvergenceMeasure, Disagreement, StateMeasure
 from plumbline.reproduce.render import render_script
 from plumbline.reproduce.shrink import ReproductionCase
 from plumbline.reproduce.write import make_script
 from tests.helpers.catalogue import catalogue_scenarios
-from tests.helpers.reproduction import defective, run_alone, stored_row
+from tests.helpers.reproduction import (
+    DRIFTS,
+    defective,
+    execute,
+    other_answer,
+    run_alone,
+    script_of,
+    state_evidence,
+    step_evidence,
+    stored_row,
+)
 
 for name in ("mujoco", "pinocchio", "exudyn", "flint"):
     pytest.importorskip(name)
@@ -57,7 +68,7 @@ def test_a_script_gives_the_recorded_numbers(engine, scenario, tmp_path):
     case = case_of(scenario)
     evidence = StateMeasure(EngineClient(engine), (*QUANTITIES, "mass_matrix"))(case)
     (answer,) = load_adapter(engine).evaluate(case.model, [case.state])
-    system = write_mechanism(engine, case.model, case.state)
+    system = evidence.written(EngineClient(engine))
     recorded = {q: np.asarray(getattr(answer, q), float) for q in evidence.expected}
     script = render_script(stored_row(engine), replace(evidence, expected=recorded), system)
     assert "plumbline" not in script
@@ -88,6 +99,97 @@ def test_what_a_script_cannot_show_is_a_sentence():
     case, row = case_of("hand-on-welds"), stored_row("pinocchio")
     evidence = StateMeasure(EngineClient("pinocchio"), ("joint_reaction",))(case)
     with pytest.raises(Unsupported, match="merges at a weld"):
-        render_script(row, evidence, write_mechanism("pinocchio", case.model, case.state))
+        render_script(row, evidence, evidence.written(EngineClient("pinocchio")))
     with pytest.raises(Unsupported, match="writes no mechanisms"):
-        write_mechanism("reference", case.model, case.state)
+        EngineClient("reference").write(case.model, case.state)
+    case = replace(case_of("sprung-hinge"), until=1.0, steps=(2.0**-6, 2.0**-7, 2.0**-8))
+    drift = ConvergenceMeasure(EngineClient("mujoco"), "RK4", "invariants", ("energy_drift",))(case)
+    with pytest.raises(Unsupported, match="energy of rotors"):
+        script_of(drift)
+
+
+MOTIONS = [
+    ("mujoco", "implicit", "loaded-tree"),
+    ("mujoco", "RK4", "four-bar"),
+    ("mujoco", "RK4", "sprung-hinge"),
+    ("pinocchio", "rkmk4", "loaded-tree"),
+    ("pinocchio", "semi-implicit-euler", "four-bar"),
+    ("pinocchio", "rkmk4", "sprung-hinge"),
+    ("exudyn", "trapezoidal", "loaded-tree"),
+    ("exudyn", "generalized-alpha", "four-bar"),
+    ("exudyn", "trapezoidal", "sprung-hinge"),
+    ("exudyn-tree", "RK44", "loaded-tree"),
+    ("exudyn-tree", "RK44", "sprung-hinge"),
+]
+
+
+@pytest.mark.parametrize(("engine", "integrator", "scenario"), MOTIONS)
+def test_a_script_of_runs_gives_the_recorded_motion(engine, integrator, scenario):
+    """Of trees, loops and mechanisms with springs; the error over its bound is that of the harness."""
+    steps = tuple(2.0**-k for k in (6, 7, 8))
+    measure = ConvergenceMeasure(EngineClient(engine), integrator, "trajectory", ("order", "position_limit"))
+    case = replace(case_of(scenario), until=0.0625, steps=steps)
+    found, names = execute(script_of(measure(case)))
+    assert len(found) == 5
+    _, runs = measure.run(case, measure.sample_times(case))
+    for run, mine in zip(runs, names["runs"], strict=True):
+        for name, values in zip(("r", "p", "v"), mine, strict=False):
+            own = getattr(run.trajectory, name)
+            off = (
+                np.abs(values - own)
+                if name != "p"
+                else np.minimum(np.abs(values - own), np.abs(values + own))
+            )
+            assert np.max(off) < 1e-10, (name, run.resolution)
+
+
+@pytest.mark.parametrize(
+    ("engine", "integrator", "scenario"),
+    [
+        ("mujoco", "RK4", "loaded-tree"),
+        ("pinocchio", "rkmk4", "four-bar"),
+        ("exudyn-tree", "RK44", "sprung-hinge"),
+    ],
+)
+def test_a_script_of_a_step_finds_what_the_harness_finds(engine, integrator, scenario):
+    evidence = step_evidence(engine, integrator, case_of(scenario), 2, 0.01)
+    found, _ = execute(script_of(evidence))
+    assert evidence.ratio < 1 and len(found) == 4 and max(found) < 1
+    late = {q: x * (1 + 1e-9) for q, x in evidence.expected.items()}
+    assert min(execute(script_of(replace(evidence, expected=late)))[0]) > 1
+
+
+@pytest.mark.parametrize(
+    ("engine", "relation", "scenario"),
+    [
+        ("mujoco", "by dense mass matrix", "four-bar"),
+        ("mujoco", "by joint equalities", "sprung-hinge"),
+        ("mujoco", "two welded halves", "loaded-tree"),
+        ("pinocchio", "by cholesky", "loaded-tree"),
+        ("pinocchio", "two welded halves", "sprung-hinge"),
+        ("pinocchio", "as pinocchio-maximal", "four-bar"),
+    ],
+)
+def test_a_script_calls_the_engine_in_its_second_way(engine, relation, scenario):
+    evidence = other_answer(engine, relation, case_of(scenario))
+    script, usual = script_of(evidence), script_of(state_evidence(engine, evidence.case))
+    assert script.split("found, why")[0] != usual.split("found, why")[0]
+    assert max(execute(script)[0]) < 1
+
+
+@pytest.mark.parametrize("scenario", ["tree-of-seven", "four-bar"])
+def test_a_script_measures_drifts_as_the_harness_does(scenario):
+    steps = tuple(2.0**-k for k in (6, 7, 8))
+    case = replace(case_of(scenario), until=1.0, steps=steps)
+    measure = ConvergenceMeasure(EngineClient("exudyn"), "trapezoidal", "invariants", DRIFTS)
+    evidence = measure(case)
+    found, names = execute(script_of(evidence))
+    assert len(found) == len(evidence.drifts) >= 3 and max(found) < 1
+    truth, runs = measure.run(case, measure.sample_times(case))
+    analysis = RefinementAnalysis(
+        RowContext("", "", "", "", ""), case.model, truth, measure.integrator, runs, 1.0
+    )
+    for quantity in {"joint_gap", "gap_rate", "norm_drift"} & {*evidence.drifts}:
+        harness = getattr(analysis.invariant_drifts[-1], quantity)[-1]
+        own = names[quantity](*names["runs"][-1])
+        np.testing.assert_allclose(own, harness, rtol=1e-6, atol=1e-13)
