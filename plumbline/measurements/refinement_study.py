@@ -17,14 +17,15 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 
 from plumbline.engines import engine_calls
 from plumbline.engines.engine_calls import RefinementRun, RefinementStudy
 from plumbline.measurements.order_and_limit import ORDER_MARGIN, max_norm, observed_order, romberg
-from plumbline.model.datatypes import Array, Float, Integrator, Model, State
-from plumbline.model.invariants import INVARIANT_UNITS, compute_invariants, invariant_scales
+from plumbline.model.datatypes import Array, Float, Integrator, Model, State, Trajectory
+from plumbline.model.invariants import INVARIANT_UNITS, Invariants, compute_invariants, invariant_scales
 from plumbline.model.kinematics import stretched_length
 from plumbline.truth.ground_truth import RUN_ROUNDING  # a constant, no truth
 
@@ -86,7 +87,7 @@ def is_resolved(model: Model, integrator: Integrator, runs: Sequence[RefinementR
         limit = romberg(samples, integrator.error_exponents)
         if limit.uncertainty[-1] > STOP_MARGIN * rounding * scale:
             return False
-    drifts = [compute_invariants(model, trajectory) for trajectory in trajectories]
+    drifts = [_invariants(model, trajectory) for trajectory in trajectories]
     for name in INVARIANT_UNITS:
         series = [getattr(drift, name) for drift in drifts]
         floor = rounding_floor(finest.steps, scales[name])
@@ -95,6 +96,11 @@ def is_resolved(model: Model, integrator: Integrator, runs: Sequence[RefinementR
         if romberg(series, integrator.error_exponents).uncertainty[-1] > floor:
             return False
     return True
+
+
+@lru_cache(maxsize=8)  # every further run of a study asks for those of all before
+def _invariants(model: Model, run: Trajectory) -> Invariants:
+    return compute_invariants(model, run)
 
 
 def run_samples(runs: Sequence[RefinementRun], name: str) -> list[Float[Array, "samples bodies width"]]:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.polynomial.legendre import legder, leggauss, legvander
+from numpy.typing import NDArray
 
 from plumbline.model.datatypes import JOINT_ELEMENTS, ZERO_INERTIA, Array, Float, Model, Trajectory
 from plumbline.model.kinematics import (
@@ -274,9 +276,8 @@ def _power(model: Model, run: Trajectory, omega: Array) -> Array:
 
 def _integrated_power(model: Model, run: Trajectory, width: int) -> Array:
     """Integral (T,) [J] of the power, over a motion that is known from ``width`` samples around."""
-    nodes, weights = leggauss(GAUSS_NODES)
+    _, weights = leggauss(GAUSS_NODES)
     half = np.diff(run.t)[:, None] / 2
-    times = (run.t[:-1, None] + half + half * nodes).ravel()
     # p and −p are the same attitude: the one that the rates lead to
     omega = angular_velocity(run.p, run.pdot)
     turn = half[..., None] * (omega[1:] + omega[:-1]) / 2
@@ -284,31 +285,30 @@ def _integrated_power(model: Model, run: Trajectory, width: int) -> Array:
     sign = np.where(np.sum(ahead * run.p[1:], axis=-1, keepdims=True) < 0, -1.0, 1.0)
     sign = np.cumprod(np.concatenate([np.ones_like(sign[:1]), sign]), axis=0)
     place, motion = (np.concatenate([a, sign * b], -1) for a, b in ((run.r, run.p), (run.v, run.pdot)))
-    y, rate = hermite_interpolation(run.t, place, motion, times.reshape(half.size, -1), width)
+    times, window, *matrices = _interpolation(run.t.tobytes(), width)
+    known = np.concatenate([x.reshape(len(run.t), -1)[window] for x in (place, motion)], axis=1)
+    y, rate = ((part @ known).reshape(-1, *place.shape[1:]) for part in matrices)
     dense = Trajectory(times, y[..., :3], y[..., 3:], rate[..., :3], rate[..., 3:], run.steps, run.initial_x)
     power = _power(model, dense, angular_velocity(dense.p, dense.pdot)).reshape(half.size, -1)
     return np.concatenate([[0.0], np.cumsum(half[:, 0] * (power @ weights))])
 
 
-def hermite_interpolation(
-    times: Float[Array, "samples"],
-    y: Float[Array, "samples ..."],
-    rate: Float[Array, "samples ..."],
-    at: Float[Array, "intervals m"],
-    width: int,
-) -> tuple[Float[Array, "points ..."], Float[Array, "points ..."]]:
+@lru_cache(maxsize=32)  # the runs of a study have the same samples, and those of all engines
+def _interpolation(samples: bytes, width: int) -> tuple[Array, NDArray[np.intp], Array, Array]:
     """Interpolate by polynomials through values and rates of samples.
 
     Args:
-        times: [s] of the samples, T ≥ 2.
-        rate: their rates [1/s].
-        at: times [s] within each interval.
+        samples: times [s] of T ≥ 2 samples.
         width: how many samples around an interval its polynomial passes through, all where there are fewer.
 
     Returns:
-        Values and rates at these times.
+        Times of Gauss's nodes of all intervals, the samples (T − 1, width) of each, and the matrices that
+        take their values and rates to values, and to rates, at its nodes.
 
     """
+    times = np.frombuffer(samples)
+    half, (nodes, _) = np.diff(times)[:, None] / 2, leggauss(GAUSS_NODES)
+    at = times[:-1, None] + half + half * nodes
     count, width = len(times) - 1, min(width, len(times))
     first = np.clip(np.arange(count) - (width - 2) // 2, 0, len(times) - width)
     window = first[:, None] + np.arange(width)
@@ -320,10 +320,13 @@ def hermite_interpolation(
         values = legvander((t - middle) / scale, 2 * width - 1)
         return values, values @ derivative / scale[..., None]
 
-    known = np.concatenate([x.reshape(len(times), -1)[window] for x in (y, rate)], axis=1)
-    coefficients = np.linalg.solve(np.concatenate(basis(times[window]), axis=1), known)
-    found = [(part @ coefficients).reshape(-1, *y.shape[1:]) for part in basis(at)]
-    return found[0], found[1]
+    equations, found = np.concatenate(basis(times[window]), axis=1), list[Array]()
+    for wanted in basis(at):
+        matrix = np.zeros_like(wanted)
+        for _ in range(2):  # refined once
+            matrix += np.linalg.solve(equations.mT, (wanted - matrix @ equations).mT).mT
+        found.append(matrix)
+    return at.ravel(), window, found[0], found[1]
 
 
 def compute_invariants(model: Model, run: Trajectory) -> Invariants:
