@@ -15,6 +15,31 @@ CHANGES = {"missing": "were missing", "doubled": "were doubled", "halved": "were
 
 
 @dataclass(frozen=True)
+class Condition:
+    """What steps of a run that differ have in common: bounds of a quantity, or a period of their numbers."""
+
+    quantity: str  # step, angle of joint 2, turn of joint 1, angular velocity of body 3, …
+    unit: str = ""
+    least: float | None = None
+    most: float | None = None
+    period: int = 0  # 1: every step
+
+
+@dataclass(frozen=True)
+class Occurrence:
+    """Which steps of a run differ from the declared one."""
+
+    first_step: int  # from 1
+    time: float  # s, where it starts
+    steps: int  # that differ
+    compared: int
+    # each describes all steps that differ and, but for exceptions among those that agree, no others; several
+    # that the motion does not distinguish
+    conditions: tuple[Condition, ...] = ()
+    exceptions: int = 0
+
+
+@dataclass(frozen=True)
 class Cause:
     """One change by which an engine would return what it returned.
 
@@ -36,6 +61,7 @@ class Cause:
     needs: tuple[str, ...] = ()  # of what is unexplained: without one of them the difference vanishes
     general: str = ""  # the term, or of an output the change, without a place that is in its words
     equal: tuple[Cause, ...] = ()  # causes from which the data cannot distinguish it
+    occurrence: Occurrence | None = None  # in a run that is compared step by step
 
     @property
     def is_explained(self) -> bool:
@@ -93,7 +119,30 @@ def describe(causes: Sequence[Cause]) -> str:
     left = [cause.left for cause in named if cause.left is not None]
     if left and not parts[1:]:
         parts.append(f"this explains the difference to {max(left):.2g} of the rounding bound")
-    return "; ".join(parts)
+    where = [cause.occurrence for cause in causes if cause.occurrence is not None]
+    return "; ".join(parts + [_describe_occurrence(one) for one in where[:1]])
+
+
+def _describe_occurrence(where: Occurrence) -> str:
+    words = f"first in step {where.first_step} of a run (t = {where.time:.6g} s), in {where.steps} of "
+    words += f"{where.compared} steps"
+    if not where.conditions:
+        return f"{words}, which no range of time, position or rate separates from the others"
+    conditions = [_describe_condition(one) for one in where.conditions]
+    return f"{words}: {' or, which the data cannot distinguish, '.join(conditions)}"
+
+
+def _describe_condition(one: Condition) -> str:
+    if one.period:
+        return "every step" if one.period == 1 else f"one in {one.period}"
+    if one.quantity == "step":
+        if one.least == one.most:
+            return f"step {one.least:.0f}"
+        upto = "on" if one.most is None else f"to step {one.most:.0f}"
+        return f"from step {one.least:.0f} {upto}"
+    above = "" if one.least is None else f" above {one.least:.15g}{one.unit}"
+    below = "" if one.most is None else f" below {one.most:.15g}{one.unit}"
+    return f"{one.quantity}{above}{' and' * bool(above and below)}{below}"
 
 
 def _with_equal(cause: Cause) -> str:

@@ -182,7 +182,7 @@ def measure_step_scatter(
         turned, start = (model, state) if turns is None else _turned(model, state, turns)
         run = ask(step, turned, start)
         formula = FormulaSteps(method, turned, [start], [(0, h, run.angle_axes)], [RESIDUAL_STEPS])
-        return formula.residuals(method, [run])
+        return formula.residuals(method, [run], turned)
 
     return _scatter(error)
 

@@ -19,7 +19,7 @@ from typing import Any
 
 from packaging.version import InvalidVersion, Version
 
-from plumbline.diagnosis.cause import Cause, describe, join_words
+from plumbline.diagnosis.cause import Cause, Condition, Occurrence, describe, join_words
 from plumbline.judging.rows import VERDICT_STYLES, Row, Verdict
 
 CLASSES = {  # of quantities, in the order in which one follows from another
@@ -121,6 +121,9 @@ def cause_of_record(record: Mapping[str, Any]) -> Cause:
     """Read a cause that a row holds as plain data."""
     plain: dict[str, Any] = {name: tuple(x) if isinstance(x, list) else x for name, x in record.items()}
     plain["equal"] = tuple(map(cause_of_record, record["equal"]))
+    if where := record.get("occurrence"):
+        conditions = tuple(Condition(**one) for one in where["conditions"])
+        plain["occurrence"] = Occurrence(**where | {"conditions": conditions})
     return Cause(**plain)
 
 

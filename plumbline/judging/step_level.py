@@ -6,8 +6,7 @@ One step and ten from several states; and every step of a run, each from the eng
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -189,7 +188,6 @@ def _run_rows(
         return one(Verdict.UNSUPPORTED, attempt.refusal, attempt.gap)
     if not HAS_EXTENDED_PRECISION:
         return one(Verdict.UNSUPPORTED, NO_EXTENDED_PRECISION)
-    condition: Callable[[int, int], str] = partial(_time, run)
     more = dict[str, float]()
     if isinstance(method, ConstrainedMethod):
         parts = constrained_deviations(method, model, run, h)
@@ -204,11 +202,11 @@ def _run_rows(
             steps = RunSteps(method, model, state, h, run)
         except EngineFailure as error:
             return one(Verdict.FAILED, str(error))
-        found, condition = steps.compare(), steps.condition
+        found = steps.compare()
         more = {"fastest_mode": steps.fastest_mode} if np.isfinite(steps.fastest_mode) else {}
     alias = None if model.has_drag else integrator.alias_of
     return [
-        _run_row(context, integrator, quantity, deviations, h, condition, alias, answer.cpu_time, more)
+        _run_row(context, integrator, quantity, deviations, h, run, alias, answer.cpu_time, more)
         for quantity, deviations in found.items()
     ]
 
@@ -228,13 +226,9 @@ def _left_out_words(found: StepDeviations, unit: str) -> tuple[str, float]:
     return words, float(wrong)
 
 
-def _time(run: StepRun, index: int, _: int) -> str:
-    return f"t = {run.trajectory.t[index]:.6g} s"
-
-
 def _run_row(
     context: RowContext, integrator: Integrator, quantity: str, found: StepDeviations, h: float,
-    condition: Callable[[int, int], str], alias: str | None, cpu_time: float, more: dict[str, float],
+    run: StepRun, alias: str | None, cpu_time: float, more: dict[str, float],
 ) -> Row:  # fmt: skip
     """The row of one quantity at every step: the worst step decides, the first wrong one is named."""
     (name, unit), ratios = RUN_QUANTITIES[quantity], found.ratios
@@ -249,11 +243,10 @@ def _run_row(
     what = f"{name} of {count} steps of {h:.4g} s"
     if ratio > 1:
         first = int(wrong[0])
-        at = int(np.argmax(ratios[first])) if has_bodies else 0
         verdict = Verdict.DISAGREES
         reason = (
             f"{context.title} does not take the declared step of {integrator.name}: {what} is off first at "
-            f"step {first + 1} ({condition(first, at)}), and at {len(wrong)} in all; at most by "
+            f"step {first + 1} (t = {run.trajectory.t[first]:.6g} s), and at {len(wrong)} in all; at most by "
             f"{found.errors[worst, column]:.3g} {unit} at step {worst + 1}, {ratio:.3g} times the rounding "
             "bound"
         )

@@ -53,6 +53,8 @@ class JointSpaceMethod:
     is_damping_symmetric: bool = False  # (D + Dᵀ)/2 in place of D
     correction_terms: int | None = None  # of dexp⁻¹ after v; None: all
     step_factor: float = 1.0  # on h
+    acceleration_factor: float = 1.0  # on all accelerations
+    rate_factor: float = 1.0  # on the velocities after a step
     substeps: int = 1  # so many steps of h / substeps each
     reuses_acceleration: bool = False  # the first of a step is the last one computed in the step before
 

@@ -171,6 +171,23 @@ class _Run(_Part):
     seed: int | None = None
 
 
+class _Condition(_Part):
+    quantity: str
+    unit: str
+    least: float | None
+    most: float | None
+    period: _Count
+
+
+class _Occurrence(_Part):
+    first_step: _Count
+    time: float
+    steps: _Count
+    compared: _Count
+    conditions: list[_Condition]
+    exceptions: _Count
+
+
 class _Cause(_Part):
     kind: Literal["number", "term", "output", "frame", "method", "rounding", "refusal", "unexplained"]
     term: str
@@ -186,6 +203,7 @@ class _Cause(_Part):
     needs: list[str] = []
     general: str = ""
     equal: list[_Cause]
+    occurrence: _Occurrence | None = None
 
 
 class _Row(_Part):

@@ -321,7 +321,7 @@ class StepCharts:
             (..., nv).
 
         """
-        return self._solved(q, v)[0]
+        return np.asarray(self._solved(q, v)[0] * LongDouble(self.method.acceleration_factor))
 
     def damped_acceleration(self, q: list[Array], v: Array, h: Array, forces: Forces) -> Array:
         """Return (M + h D)⁻¹ M v̇ with D = −∂(M v̇)/∂v of some of the forces, in the sparsity of M.
@@ -341,7 +341,8 @@ class StepCharts:
         if forces == "joint dampers":  # as rotors of inertia h c
             added = factor * h[..., None] * self.model.damping
             damped = replace(self.model, armature=self.model.armature + added)
-            return self._solved(q, v, damped if np.any(self.model.damping) else None)[0]
+            found, *_ = self._solved(q, v, damped if np.any(self.model.damping) else None)
+            return np.asarray(found * LongDouble(self.method.acceleration_factor))
         if forces == "applied" and not own and not self.model.is_dissipative:
             return self.acceleration(q, v)
         M, D = self._mass_matrix(q), np.zeros((*v.shape, self.nv), LongDouble)

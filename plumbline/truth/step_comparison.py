@@ -243,8 +243,8 @@ class FormulaSteps:
                 found[quantity].add(error, limit[quantity], scale[quantity], place)
         return found
 
-    def residuals(self, method: JointSpaceMethod, runs: Sequence[StepRun]) -> Array:
-        """Return the differences of an engine's first steps from those of another formula.
+    def residuals(self, method: JointSpaceMethod, runs: Sequence[StepRun], model: Model) -> Array:
+        """Return the differences of an engine's first steps from those of another formula or mechanism.
 
         Args:
             method: the other formula, in the same coordinates.
@@ -256,7 +256,7 @@ class FormulaSteps:
 
         """
         sizes, axes = [h for _, h in self.places], [run.angle_axes for run in runs]
-        motions = joint_space_steps(self.model, self.starts, sizes, method, RESIDUAL_STEPS, axes)
+        motions = joint_space_steps(model, self.starts, sizes, method, RESIDUAL_STEPS, axes)
         found = []
         for i, run in enumerate(runs):
             count = min(RESIDUAL_STEPS, len(run.trajectory.t) - 1)
@@ -516,7 +516,9 @@ def _separation(links: BodyStates, i: int, count: int, weights: dict[str, Array]
     return float(np.max(found))
 
 
-def _differences(true: BodyStates | State, t: Trajectory, count: int | slice) -> dict[str, Array]:
+def _differences(
+    true: BodyStates | State, t: Trajectory, count: int | slice | NDArray[np.intp]
+) -> dict[str, Array]:
     """Differences (..., N, ·) of bodies; of attitudes twice those of quaternions as they are."""
     p: Any = t.p[count].astype(np.longdouble)
     sign = np.where(np.sum(p * true.p, axis=-1, keepdims=True) < 0, -1, 1)
@@ -772,7 +774,7 @@ class RunSteps(StepsFromSamples):
         """
         motion = run.trajectory
         assert motion.coordinates is not None and motion.velocities is not None
-        self.state, self.motion = state, motion
+        self.state, self.motion, self.angle_axes = state, motion, run.angle_axes
         self.fastest_mode = np.nan  # 1/s, of the linearised equations along the run; of `compare`
         charts = StepCharts(model, method, [state], [run.angle_axes])
         count = len(motion.velocities) - 1
@@ -895,17 +897,30 @@ class RunSteps(StepsFromSamples):
         worst = np.maximum(np.max(ratios, axis=0), clock[:, None])
         return StepDeviations(worst, np.ones_like(worst), np.full_like(worst, np.inf))
 
-    def condition(self, index: int, body: int) -> str:
-        """Describe a sample: its time, how fast a body turns, and where its joint is."""
-        here, motions = self.here, self.model.kinds[body].motions
-        spin = float(np.linalg.norm(here.omega[index, body]))
-        words = f"t = {self.motion.t[index]:.6g} s, body {body + 1} turns at {spin:.3g} rad/s"
-        if motions:
-            x = ", ".join(f"{float(x):.4g}" for x in here.x[index, body, : len(motions)])
-            return f"{words}, its joint at {x} (rad or m)"
-        cosine = abs(float(np.sum(here.p[index, body] * here.p[0, body])))
-        turned = 2 * np.arccos(min(1.0, cosine))
-        return f"{words}, {turned:.3g} rad from its attitude at the start"
+    def differences_from(
+        self, method: JointSpaceMethod, model: Model, run: StepRun, at: NDArray[np.intp]
+    ) -> Array:
+        """Compare some steps with those of another formula or mechanism.
+
+        Args:
+            run: the engine's steps, or what its samples should be.
+            at: numbers of the steps, from 0.
+
+        Returns:
+            By quantity, step and body vectors of three or four components (4, steps, N, 4), in rounding
+            bounds of the declared formula.
+
+        """
+        charts, motion = StepCharts(model, method, [self.state], [self.angle_axes]), self.motion
+        assert motion.coordinates is not None and motion.velocities is not None
+        start = charts.divided(motion.coordinates[at], motion.velocities[at])
+        after = charts.bodies(*coordinates_after(charts, *start, [self.h]))
+        off = _differences(after, run.trajectory, at + 1)
+        padded = [
+            np.pad(x / self.of_step[name][at][..., None], ((0, 0), (0, 0), (0, 4 - x.shape[-1])))
+            for name, x in off.items()
+        ]
+        return np.array(padded)
 
 
 # -- constraints and an iterative solver -------------------------------------------------------------

@@ -94,7 +94,7 @@ def coordinates_after(
         for _ in range(method.substeps):
             tree.is_new_step = True
             q, v = _STEPS[method.formula](tree, method, q, v, h)
-    return q, v
+    return q, v * LongDouble(method.rate_factor)
 
 
 def fastest_rates(model: Model, states: Sequence[State], iterations: int = 12) -> Array:

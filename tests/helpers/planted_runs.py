@@ -31,6 +31,8 @@ class RunMistake:
     defect: Defect
     first_step: int | None = None  # None: where the motion meets the condition
     quantities: tuple[str, ...] = ()  # of which one must report it; none: any of every step
+    # of the condition that the diagnosis names: its quantity and bound; of numbers of steps the first one
+    condition: tuple[str, float] = ("step", 0.0)
 
     @property
     def name(self) -> str:
@@ -174,34 +176,35 @@ def slower_than(rate: float) -> When:
 
 
 def _mistake(
-    name: str, mechanism: str, integrator: str, patch_: Patch | None, first: int | None = None,
+    name: str, mechanism: str, integrator: str, patch_: Patch | None, where: int | tuple[str, float] = 0,
     engine: str = "mujoco", run: Any = None, quantities: tuple[str, ...] = (),
 ) -> RunMistake:  # fmt: skip
+    first, condition = (where, ("step", float(where))) if isinstance(where, int) else (None, where)
     defect = Defect(name, engine=engine, mechanism=mechanism, integrator=integrator, patch=patch_, run=run)
-    return RunMistake(defect, first, quantities)
+    return RunMistake(defect, first or None, quantities, condition)
 
 
 _RODS, _BALLS, _SKEW, _TREE, _LOOP = (
     "double-tumbling-rods", "double-tumbling-balls", "double-hinge-skew", "loaded-tree", "four-bar",
 )  # fmt: skip
-_EULER = "semi-implicit-euler"
+_EULER, _RATE, _ANGLE = "semi-implicit-euler", "largest rate of a coordinate", "angle of joint 2"
 _OF_MUJOCO = (
     ("masses", _scaled_masses, (
         ("from step 500 on", _BALLS, "RK4", from_step(500), 500),
         ("in four steps", _RODS, "RK4", steps(300, 303), 300),
         ("every hundredth step", _SKEW, "Euler", every(100), 100),
-        ("beyond half a turn", _SKEW, "RK4", beyond_angle(1, np.pi), None),
-        ("at high rates", _SKEW, "implicit", faster_than(5.0), None),
-        ("at low rates", _SKEW, "RK4", slower_than(1.5), None),
+        ("beyond half a turn", _SKEW, "RK4", beyond_angle(1, np.pi), (_ANGLE, np.pi)),
+        ("at high rates", _SKEW, "implicit", faster_than(5.0), (_RATE, 5.0)),
+        ("at low rates", _SKEW, "RK4", slower_than(1.5), 119),
         ("in the last step", _BALLS, "Euler", from_step(600), 600),
         ("in the first step", _RODS, "RK4", steps(1, 1), 1),
-        ("beyond two radians", _BALLS, "RK4", beyond_turn(0, 2.0), None),
+        ("beyond two radians", _BALLS, "RK4", beyond_turn(0, 2.0), ("turn of joint 1", 2.0)),
     )),
     ("gravity", _scaled_gravity, (
         ("from step 500 on", _RODS, "Euler", from_step(500), 500),
         ("in four steps", _BALLS, "implicit", steps(520, 523), 520),
         ("every hundredth step", _SKEW, "RK4", every(100), 100),
-        ("beyond a quarter turn", _SKEW, "Euler", beyond_angle(1, np.pi / 2), None),
+        ("beyond a quarter turn", _SKEW, "Euler", beyond_angle(1, np.pi / 2), (_ANGLE, np.pi / 2)),
     )),
     ("time step", _scaled_step, (
         ("from step 500 on", _BALLS, "Euler", from_step(500), 500),
@@ -211,7 +214,7 @@ _OF_MUJOCO = (
     ("velocities", _scaled_rates, (
         ("after step 250", _BALLS, "RK4", steps(250, 250), 250),
         ("every hundredth step", _RODS, "implicit", every(100), 100),
-        ("at high rates", _BALLS, "Euler", faster_than(6.0), None),
+        ("at high rates", _BALLS, "Euler", faster_than(6.0), (_RATE, 6.0)),
     )),
 )  # fmt: skip
 _OF_PINOCCHIO = (

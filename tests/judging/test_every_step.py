@@ -10,18 +10,19 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
+from plumbline.diagnosis.integrator_search import explain_disagreeing_steps
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.rows import RowContext, Verdict
 from plumbline.judging.step_level import judge_steps
 from plumbline.measurements.single_steps import run_counts, run_step_study
-from plumbline.model.random_mechanisms import random_loop_mechanism, random_tree
-from plumbline.model.sampling import compared_states, random_states
+from plumbline.model.sampling import compared_states
+from plumbline.studies.random_steps import mechanism_of
 from plumbline.truth import step_formulas
 from plumbline.truth.step_comparison import RUN_QUANTITIES
 from tests.helpers.catalogue import catalogue_scenarios
 from tests.helpers.nightly_tests import SLOW, some_fast
 from tests.helpers.planted_runs import RUN_MISTAKES
-from tests.helpers.planting import ELEMENTS, planted
+from tests.helpers.planting import planted
 
 if not step_formulas.HAS_EXTENDED_PRECISION:
     pytest.skip("no extended precision on this machine", allow_module_level=True)
@@ -81,6 +82,34 @@ def test_a_mistake_inside_a_run_is_reported_with_its_step(mistake):
     first = mistake.first_step
     assert first is None or abs(found - first) <= 1, (found, first)
     assert all(f"at step {row.extra['first_step']:.0f} (t = " in row.reason for row in steps)
+
+
+@pytest.mark.parametrize("mistake", some_fast(RUN_MISTAKES, 16))
+def test_a_mistake_inside_a_run_is_named_with_its_condition(mistake):
+    """A factor of 1 + 1e-9, and in which steps it acts; in the first step it is below what is diagnosed."""
+    defect = mistake.defect
+    model, states = subject(defect.mechanism)
+    with planted(defect) as adapter:
+        integrator = adapter.integrator(defect.integrator)
+        with patch("plumbline.engines.engine_calls.load_adapter", lambda _: adapter):
+            answer = run_step_study(adapter.name, integrator, model, states)
+        with patch("plumbline.diagnosis.integrator_search.load_adapter", lambda _: adapter):
+            found = explain_disagreeing_steps(
+                defect.engine, integrator.name, model, states, answer, is_known=False
+            )
+    (cause,) = found.causes
+    is_fitted = defect.engine != "exudyn" and mistake.first_step != 1
+    assert cause.is_explained == is_fitted and (cause.amount != () or not is_fitted), found.text
+    if mistake.quantities:  # only the first of the single steps is wrong
+        return
+    where, (quantity, bound) = cause.occurrence, mistake.condition
+    assert where.first_step == mistake.first_step or mistake.first_step is None
+    assert any(
+        one.quantity == quantity
+        and (one.period > 1 or abs(abs(one.least or one.most) - bound) <= 0.02 * bound * (quantity != "step"))
+        for one in where.conditions
+    ), found.text
+    assert f"first in step {where.first_step} of a run" in found.text
 
 
 def test_the_given_state_the_times_and_the_number_of_steps_are_compared():
@@ -151,14 +180,6 @@ def test_an_adapter_without_coordinates_says_so():
     assert row.verdict == Verdict.INFORMATION and "coordinates" in row.reason
 
 
-def random_mechanism(seed):
-    rng = np.random.default_rng([30, seed])
-    if seed % 3 == 2:
-        return random_loop_mechanism(seed, int(rng.integers(3, 6)), ("universal",), elements=ELEMENTS)
-    model = random_tree(rng, int(rng.integers(1, 7)), elements=ELEMENTS if seed % 2 else ())
-    return model, random_states(model, 1, seed)[0]
-
-
 def alarms(adapter, integrator, model, state):
     rows = rows_of(adapter, integrator, model, [state])
     return [r.reason for r in rows if r.verdict in (Verdict.DISAGREES, Verdict.FAILED)]
@@ -171,7 +192,7 @@ SEEDS = [*range(60), 82, 84, 132, 138, 148, 154, 166, 250, 286, 298]
 @pytest.mark.parametrize("seed", [pytest.param(k, marks=SLOW * (k > 0)) for k in SEEDS])
 def test_no_false_alarm_on_random_mechanisms(seed):
     """Pinocchio's steps by aba lose digits on record: then those by crba and a dense solve have to agree."""
-    model, state = random_mechanism(seed)
+    model, state = mechanism_of(seed)
     for engine in ENGINES:
         adapter = load_adapter(engine)
         for integrator in [i for i in adapter.integrators if i.method is not None]:
