@@ -388,6 +388,8 @@ class _MujocoChain:
         self.text, self.numbers = model_text(spec, m) if has_text else ("", {})
         d = mujoco.MjData(m)
         mujoco.mj_setConst(m, d)
+        # The compiler takes axes of inertia that are turned by less than 1e-6 rad as those of the body.
+        m.body_sameframe[~given] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
         ties = constraints.ties
         m.tendon_length0[m.ntendon - len(ties) :] = [tie.length for tie in ties]
         # MuJoCo's own are of the reference pose, where free bodies are in one place

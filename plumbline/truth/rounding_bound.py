@@ -419,7 +419,15 @@ class _Terms:
             "angular_acceleration": np.max([t.alpha, moment / inertia, turning], 0),
             "joint_reaction": np.max([t.F, weight, t.m * t.a], 0),
             "joint_moment": np.max(
-                [t.moment, t.arm * t.F, t.J * t.alpha, np.sum(t.element_size, -1), (lever @ (t.m * t.g))], 0
+                [
+                    t.moment,
+                    t.arm * t.F,
+                    t.J * t.alpha,
+                    t.spin,
+                    np.sum(t.element_size, -1),
+                    lever @ (t.m * t.g),
+                ],
+                0,
             ),
         }
         rods, of_joints = np.zeros(t.a.shape), np.zeros((len(total), 2))
