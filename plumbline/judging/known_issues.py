@@ -60,7 +60,7 @@ from plumbline.truth.surface_truth import SURFACE_QUANTITIES
 RowKind = tuple[str, str, str, str, str]  # of a row: engine, its version, level, integrator, quantity
 KNOWN_ISSUES_FILE = Path(__file__).with_name("known_issues.yaml")
 DIAGNOSED_LEVELS = ("state", "step")  # whose rows have causes
-FOLLOWING_LEVELS = ("trajectory", "invariants")  # whose rows follow from those
+FOLLOWING_LEVELS = ("surface", "trajectory", "invariants")  # whose rows follow from those
 LEVELS: tuple[Level, ...] = ("state", "surface", "step", "invariants", "trajectory", "relations", "model")
 ANY_LENGTH = 10**9  # bodies
 # Bounds are 64 roundings of the largest term and more: an answer that is off by a million times the quantity

@@ -100,6 +100,7 @@ TREE_JOINTS = {
     "long-hinge": ("hinge",),
     "planar-top": ("planar",),
     "slider-on-arm": ("hinge", "slide"),
+    "small-products-of-inertia": ("hinge",),
     "spring-pendulum": ("free",),
     "sprung-ball": ("ball", "ball"),
     "sprung-ball-on-slide": ("slide", "ball"),
