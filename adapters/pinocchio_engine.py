@@ -38,6 +38,7 @@ off on the catalogue's ten balls, 2e-8 on thirty, 8e-3 on fifty, where `crba` is
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
@@ -226,8 +227,15 @@ class PinocchioChain:
             for place, n in zip(self.placements, model.moment, strict=True)
         ]
         self.constant_loads = list(self.loads)
+        self.constant_wrenches = [load.vector.copy() for load in self.loads]
         self.has_force = np.any(model.force != 0, axis=1).tolist()
         self.has_body_drag = ((model.drag_force != 0) | (model.drag_moment != 0)).tolist()
+        # in the joints' frames: wrenches by forces at the centres of mass in these axes, and by velocities
+        self.pulls = [_pull(place) for place in self.placements]
+        self.drags = [
+            place.toDualActionMatrix() @ np.diag(np.repeat(sizes, 3)) @ place.toActionMatrixInverse()
+            for place, *sizes in zip(self.placements, model.drag_force, model.drag_moment, strict=True)
+        ]
         varying = np.logical_or(self.has_force, self.has_body_drag)
         varying[model.spring_body[model.spring_body >= 0]] = True
         self.spring_ends = [
@@ -239,6 +247,7 @@ class PinocchioChain:
             ]
             for bodies, points in zip(model.spring_body, model.spring_point, strict=True)
         ]  # joint and place in its frame of each end; joint 0 is the world
+        self.spring_pulls = [[_pull(place) for _, place in ends] for ends in self.spring_ends]
         self.bodies_with_varying_loads = [int(k) for k in np.flatnonzero(varying)]
         self._add_up_loads()
 
@@ -324,37 +333,38 @@ class PinocchioChain:
             return
         data, model = self.data, self.source_model
         pin.forwardKinematics(self.pin_model, data, q, v)
+        poses, motions, found = data.oMi, data.v, dict[int, Array]()
         for k in self.bodies_with_varying_loads:
-            j, centre = self.body_joints[k], self.placements[k]
-            force, moment = np.zeros(3), model.moment[k]
+            j, wrench = self.body_joints[k], self.constant_wrenches[k]
             if self.has_force[k]:
-                force = model.force[k].dot((data.oMi[j] * centre).rotation)  # Rᵀ F
+                wrench = wrench + self.pulls[k].dot(model.force[k].dot(poses[j].rotation))  # Rᵀ F
             if self.has_body_drag[k]:
-                motion = centre.actInv(data.v[j])  # of the centre of mass, body axes
-                force = force - model.drag_force[k] * motion.linear
-                moment = moment - model.drag_moment[k] * motion.angular
-            self.loads[k] = centre.act(pin.Force(force, moment))
+                wrench = wrench - self.drags[k].dot(motions[j].vector)
+            found[k] = wrench
         for i in range(len(model.spring_body)):
-            self._add_spring(i)
+            self._add_spring(i, found)
+        for k, wrench in found.items():
+            self.loads[k] = pin.Force(wrench)
         self._add_up_loads()
 
-    def _add_spring(self, i: int) -> None:
-        """Add to the loads what a spring between points does to its bodies."""
-        data, model, frames, rates = self.data, self.source_model, [], []
-        for joint, place in self.spring_ends[i]:
-            frames.append(data.oMi[joint] * place)
-            rates.append(frames[-1].rotation @ place.actInv(data.v[joint]).linear)
-        d, rate = frames[1].translation - frames[0].translation, rates[1] - rates[0]
-        length = np.sqrt(d @ d)
+    def _add_spring(self, i: int, wrenches: dict[int, Array]) -> None:
+        """Add to the wrenches on bodies what a spring between points does to them."""
+        poses, motions, model = self.data.oMi, self.data.v, self.source_model
+        (near, at), (far, there) = self.spring_ends[i]
+        turns = poses[near].rotation, poses[far].rotation
+        d = poses[far].act(there.translation) - poses[near].act(at.translation)
+        rates = [
+            turn.dot(pull.T.dot(motions[joint].vector))  # velocities of points are dual to forces on them
+            for turn, pull, (joint, _) in zip(turns, self.spring_pulls[i], self.spring_ends[i], strict=True)
+        ]
+        rate, length = rates[1] - rates[0], math.sqrt(d.dot(d))
         tension = model.spring_stiffness[i] * (length - model.spring_length[i])
-        tension += model.spring_damping[i] * (d @ rate) / length
-        pull = d * (tension / length)
-        for b, sign, frame, (_, place) in zip(
-            model.spring_body[i], (1, -1), frames, self.spring_ends[i], strict=True
-        ):
+        tension += model.spring_damping[i] * d.dot(rate) / length
+        force = d * (tension / length)
+        ends = zip(model.spring_body[i].tolist(), (1, -1), turns, self.spring_pulls[i], strict=True)
+        for b, sign, turn, pull in ends:
             if b >= 0:
-                force = pin.Force(sign * pull.dot(frame.rotation), np.zeros(3))
-                self.loads[b] = self.loads[b] + place.act(force)
+                wrenches[b] = wrenches[b] + pull.dot(sign * force.dot(turn))
 
     def joint_torque(self, q: Float[Array, "nq"], v: Float[Array, "nv"]) -> Float[Array, "nv"]:
         """Evaluate springs, dampers and efforts of the joints."""
@@ -690,6 +700,11 @@ def _joint_motion(joint: Any, q: Array) -> tuple[Array, Array]:
     pin.forwardKinematics(alone, data, q)
     turn = data.oMi[number].rotation.copy()
     return turn, np.reshape(pin.computeJointJacobian(alone, data, q, number), (6, -1)).copy()
+
+
+def _pull(place: pin.SE3) -> Float[Array, "6 3"]:
+    """Return what takes a force at a place, in the axes of its joint's frame, to the wrench in that frame."""
+    return np.asarray(place.toDualActionMatrix()[:, :3] @ place.rotation.T)
 
 
 def _placed(placement: pin.SE3) -> tuple[Array, Array]:
