@@ -69,6 +69,11 @@ class Cause:
         return self.kind not in ("unexplained", "rounding", "refusal")
 
     @property
+    def is_in_words(self) -> bool:
+        """Whether it is a change without a fitted amount, which explains nothing by chance."""
+        return bool(self.change) and (self.kind != "output" or not self.amount)
+
+    @property
     def identity(self) -> tuple[str, str, str]:
         """What two rows with the same cause have in common: all but place, digits and evidence."""
         if self.kind == "output":

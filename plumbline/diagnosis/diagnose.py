@@ -102,6 +102,7 @@ class _Diagnosing:
         rest = order[len(first) :]
         spread = np.linspace(0, len(rest) - 1, min(len(rest), count - len(first))).round().astype(int)
         self.order, self.places = order, sorted([*first, *(rest[i] for i in spread)])
+        self.differences: dict[View, Difference] = {}
         self.searches: dict[View, Search] = {}
         self.loss: Cause | None = None
         self.named: dict[str, Cause] = {}
@@ -114,11 +115,17 @@ class _Diagnosing:
         """States of the fit: of views that are evaluated one by one the two worst."""
         return self.places if view == View() else self.order[:2]
 
+    def difference(self, view: View) -> Difference:
+        """The difference at the states of a view."""
+        if view not in self.differences:
+            places = self._places(view)
+            self.differences[view] = Difference(self.model, self.reported, self.truth, view, places)
+        return self.differences[view]
+
     def search(self, view: View) -> Search:
         """The candidates of a view, screened once."""
         if view not in self.searches:
-            difference = Difference(self.model, self.reported, self.truth, view, self._places(view))
-            self.searches[view] = Search(difference)
+            self.searches[view] = Search(self.difference(view))
         return self.searches[view]
 
     def causes(self) -> tuple[Cause, ...]:
@@ -132,23 +139,34 @@ class _Diagnosing:
             )
         wrong = self.wrong(MIN_DIAGNOSABLE_RATIO)
         self.loss = self._digit_loss(wrong)
-        found = self._single(View()) or self._outputs_alone(wrong)
+        found = self._in_words(wrong) or self._single(View()) or self._outputs_alone(wrong)
         if not found and self.loss:
             return (*dict.fromkeys(self.named.values()), self.loss)
+        found = found or self._single(View(), are_sums_apart=True)
+        beside = () if found else self._with_outputs(wrong, self.search(View()))
+        if beside and all(cause.is_in_words for cause in beside):
+            return beside
         return (
             found
-            or self._single(View(), are_sums_apart=True)
             or self._single_of_loops(BODIES_KEPT, wrong)
-            or self._two_or_more(wrong)
+            or self._two_or_more(beside)
             or self._single_of_loops(ENDS_BY_TWISTS, wrong)  # says nothing of wrenches
             or self._forces()
             or self._partly(wrong)
             or (self._unexplained(wrong),)
         )
 
-    def _two_or_more(self, wrong: Sequence[str]) -> tuple[Cause, ...]:
-        """Several causes; outputs with fitted amounts, or two of them, where no two numbers explain it."""
-        beside = self._with_outputs(wrong)
+    def _in_words(self, wrong: Sequence[str]) -> tuple[Cause, ...]:
+        """Outputs of one class, beside at most one term that is left out: what is tried without a search."""
+        found = self._outputs_alone(wrong) if len(wrong) == 1 or set(wrong) <= set(WRENCHES) else ()
+        if not found and set(VECTORS[:2]) & set(wrong):
+            found = self._with_outputs(
+                wrong, Search(self.difference(View()), of_terms_alone=True), [WRENCHES]
+            )
+        return found if all(cause.is_in_words for cause in found) else ()
+
+    def _two_or_more(self, beside: tuple[Cause, ...]) -> tuple[Cause, ...]:
+        """Causes with others in outputs; three, or fitted amounts in them, only where no two numbers do."""
         is_simple = len(beside) <= 2 and not any(one.kind == "output" and one.amount for one in beside)
         return (beside if is_simple else ()) or self._pairs() or beside
 
@@ -217,10 +235,9 @@ class _Diagnosing:
         others = [i for i in self.order if i not in self._places(view)][: 2 * state_count(self.model)]
         if not found or not others:
             return list(found)
-        there = Difference(self.model, self.reported, self.truth, view, others)
-        quantities = set(self.search(view).difference.quantity[mask])
-        kept = there.of(quantities)
-        accepted = max(self.search(view).difference.accepted(mask), there.accepted(kept))
+        there, here = Difference(self.model, self.reported, self.truth, view, others), self.difference(view)
+        kept = there.of(set(here.quantity[mask]))
+        accepted = max(here.accepted(mask), there.accepted(kept))
         with_changes = [one for one in found if all(c.change is not None for c in one.combination)]
         effects = there.evaluate([(one.combination, one.amounts) for one in with_changes])
         left = np.abs(there.values - effects)[:, kept] if len(effects) else np.zeros((0, 1))
@@ -280,14 +297,15 @@ class _Diagnosing:
         self.named = self._name_outputs(wrong, self.outputs())
         return tuple(dict.fromkeys(self.named.values())) if len(self.named) == len(wrong) else ()
 
-    def _with_outputs(self, wrong: Sequence[str]) -> tuple[Cause, ...]:
+    def _with_outputs(
+        self, wrong: Sequence[str], search: Search, classes: Sequence[tuple[str, ...]] = ()
+    ) -> tuple[Cause, ...]:
         """One cause in what is evaluated, and others in some outputs."""
-        groups: list[tuple[str, ...]] = [tuple(self.named)] if self.named else []
-        groups += [(q,) for q in wrong if (q,) not in groups]
-        groups += [
-            some for some in (WRENCHES, SUMS, SUMS[:2]) if set(some) & set(wrong) and some not in groups
-        ]
-        search = self.search(View())
+        groups = list(classes)
+        if not groups:
+            groups = [tuple(self.named)] if self.named else []
+            groups += [(q,) for q in wrong if (q,) not in groups]
+            groups += [x for x in (WRENCHES, SUMS, SUMS[:2]) if set(x) & set(wrong) and x not in groups]
         for left_out in groups:
             mask = ~search.difference.of(left_out)
             values = search.difference.values[mask]
@@ -341,7 +359,7 @@ class _Diagnosing:
 
     def _forces(self) -> tuple[Cause, ...]:
         """The only place of unknown forces of a tree; where sums are right and accelerations are not."""
-        difference = self.search(View()).difference
+        difference = self.difference(View())
         if self.model.has_loops or np.any(np.abs(difference.values[difference.of(SUMS)]) > ACCEPTED_RATIO):
             return ()
         if np.max(np.abs(difference.values[difference.of(VECTORS[:2])])) <= ACCEPTED_RATIO:

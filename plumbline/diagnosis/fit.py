@@ -181,17 +181,18 @@ def _split(combination: Combination, *arrays: Array) -> Iterator[tuple[Any, ...]
 class Search:
     """All candidates of a view, screened against a difference."""
 
-    def __init__(self, difference: Difference) -> None:
-        """List the candidates and evaluate their slopes and whole effects."""
+    def __init__(self, difference: Difference, *, of_terms_alone: bool = False) -> None:
+        """List the candidates, or terms alone, and evaluate their slopes and whole effects."""
         self.difference = difference
         view, model = difference.view, difference.model
         case = difference.predictor.case
         # other numbers act as in joint coordinates
         is_of_lengths = view.are_bodies_kept or view.end_rows == "twists"
-        self.numbers = [one for one in number_edits(case) if not is_of_lengths or one.cause.unit in LENGTHS]
+        every = () if of_terms_alone else number_edits(case)
+        self.numbers = [one for one in every if not is_of_lengths or one.cause.unit in LENGTHS]
         self.fixed = list[Edit]()
         if not is_of_lengths:
-            self.fixed = list(reading_edits(case))
+            self.fixed = [] if of_terms_alone else list(reading_edits(case))
             terms = Terms(difference.predictor)
             flat = difference.flat_vectors
             self.numbers += [Edit(cause, effect=flat(effect)) for cause, effect in terms.linear()]

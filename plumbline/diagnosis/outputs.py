@@ -37,6 +37,7 @@ MAX_RATIO = 2.0  # in bounds: of what is returned and of the right quantity
 FACTOR_ROUNDING = 1e-6  # of a fitted share of a part: a word for 0, 1, 2 or −1 times
 LOADING = ("force", "moment", "drag_force", "drag_moment", "spring_damping", "spring_stiffness")
 SPRINGS, CLOSING_JOINTS = "the springs between points", "those of the closing joints"
+MAX_PARTS = 1000  # of which every two are tried
 SHARES = {-1.0: "without {}", 1.0: "with twice {}", -2.0: "with {} of the opposite sign"}
 
 
@@ -231,7 +232,7 @@ class Outputs:
     @staticmethod
     def _two_parts(off: Array, A: Array, parts: list[Part], cause: MakeCause, limit: float) -> Cause | None:
         """Two parts of shares in words: each lacks, counts twice or has the opposite sign."""
-        if len(A) > 200:
+        if len(A) > MAX_PARTS:
             return None
         gram, along, square = A @ A.T, A @ off, float(off @ off)
         size = np.diag(gram)
