@@ -290,11 +290,11 @@ class _Selector(BaseModel):
     intermittent: str = _field("Why the verdict may or may not occur.", "")
     extra_refinements_only: bool = _field("Whether the nightly's smaller steps alone show it.", False)
 
-    def check(self, engine: str, mechanism: Mechanism | None, has_cause: bool) -> None:
-        """Raise the validation error of what an entry with a mechanism may not expect."""
+    def check(self, engine: str, mechanism: Mechanism | None, cause: str) -> None:
+        """Raise the validation error of what an entry with a mechanism or kind of cause may not expect."""
         is_size_computed = mechanism == "missing term"
         missing = [] if self.max_ratio or self.max_ratio_by_inertia or is_size_computed else ["max_ratio"]
-        missing += [] if mechanism or has_cause else ["cause or mechanism"]
+        missing += [] if mechanism or cause else ["cause or mechanism"]
         if self.verdict == "disagrees" and missing:
             raise invalid_value_error(
                 f"expects a disagreement without {' and '.join(missing)}",
@@ -304,7 +304,8 @@ class _Selector(BaseModel):
         if self.verdict == "disagrees" and "*" in (self.engine or engine):
             raise invalid_value_error("expects a disagreement of every engine", "the engine that is wrong")
         is_random = all(name.startswith(f"{RANDOM_FAMILY}-") for name in self.scenario)
-        if self.intermittent and not (self.verdict == "unresolved" or mechanism == "rounding" or is_random):
+        is_rounding = "rounding" in (mechanism, cause)
+        if self.intermittent and not (self.verdict == "unresolved" or is_rounding or is_random):
             raise invalid_value_error(
                 "is intermittent",
                 "`intermittent` for the verdict unresolved, the mechanism rounding, or random scenarios "
@@ -394,7 +395,8 @@ class _Entry(_Selector):
     @model_validator(mode="after")
     def _check_rows(self) -> _Entry:
         for selector in self.rows or [self]:
-            selector.check(self.engine, self.mechanism, self.cause is not None or self.needs is not None)
+            cause = self.cause.kind if self.cause else "unexplained" if self.needs is not None else ""
+            selector.check(self.engine, self.mechanism, cause)
         return self
 
     def every_issue(self) -> Iterator[KnownIssue]:
