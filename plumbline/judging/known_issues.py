@@ -559,6 +559,7 @@ class KnownIssues:
         self._shown_by_states = {
             e.name for e in self.issues if e.level in DIAGNOSED_LEVELS and e.diagnosis is not None
         }
+        self._by_engine: dict[str, list[KnownIssue]] = {}
         self._by_kind: dict[RowKind, list[KnownIssue]] = {}  # a cache: rows are many, kinds few
         self.used_ids: set[str] = set()
         self.matched_ids: set[str] = set()
@@ -575,7 +576,10 @@ class KnownIssues:
             return []
         kind = row.engine, row.engine_version, row.level, row.integrator, row.quantity
         if kind not in self._by_kind:
-            self._by_kind[kind] = [e for e in self.issues if e.matches_kind(kind)]
+            engine = row.engine.partition("@")[0]
+            if engine not in self._by_engine:
+                self._by_engine[engine] = [e for e in self.issues if fnmatchcase(engine, e.engine)]
+            self._by_kind[kind] = [e for e in self._by_engine[engine] if e.matches_kind(kind)]
         return [e for e in self._by_kind[kind] if fnmatchcase(row.scenario, e.scenario)]
 
     def mark_known(

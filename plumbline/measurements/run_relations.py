@@ -22,6 +22,7 @@ from plumbline.model.invariants import attitude_error, position_error
 from plumbline.model.kinematics import angular_velocity, stretched_length
 from plumbline.processes.exceptions import describe_exception
 from plumbline.truth.ground_truth import RUN_ROUNDING
+from plumbline.truth.predictability_horizon import perturbation_growth
 from plumbline.truth.rounding_bound import remembered_rounding_bound
 
 REVERSED_IN_TIME = "reversed in time"
@@ -198,10 +199,6 @@ def run_tolerance(integrator: Integrator, model: Model, state: State, end: float
 @lru_cache(maxsize=8)  # all integrators of an engine run for the same times
 def _growth(model: Model, state: State, end: float) -> float:
     """The largest growth of perturbations up to a time [s]."""
-    from plumbline.truth.predictability_horizon import (
-        perturbation_growth,  # with SciPy: not in a run's own process
-    )
-
     return float(np.max(perturbation_growth(model, state, np.array([0.0, end / 2, end]))))
 
 

@@ -23,6 +23,7 @@ from plumbline.model.sampling import derive_seed
 from plumbline.truth import TruthUnavailable
 from plumbline.truth.certificate_proof import ProvedMotion
 from plumbline.truth.certified_state import certify_state
+from plumbline.truth.predictability_horizon import perturbation_growth_and_runs, predictability_horizon
 from plumbline.truth.rounding_bound import RoundingBound, rounding_bounds
 from plumbline.truth.surface_truth import SurfaceTruth, surface_truth
 
@@ -67,16 +68,12 @@ class MotionTruth:
     @property
     def horizon(self) -> float:
         """Predictability horizon T_h [s], from the rounding of a run and the truth's uncertainty."""
-        from plumbline.truth.predictability_horizon import predictability_horizon
-
         rounding = self.length * RUN_ROUNDING
         return predictability_horizon(self.trajectory.t, self.growth, rounding, self.uncertainty["position"])
 
     @property
     def wanted_time(self) -> float:
         """How long a run should be compared [s]: the duration, up to the horizon of rounding alone."""
-        from plumbline.truth.predictability_horizon import predictability_horizon
-
         return predictability_horizon(self.trajectory.t, self.growth, self.length * RUN_ROUNDING)
 
 
@@ -135,7 +132,7 @@ def motion_truth(
 
     """
     # with SciPy: not in a run's own process, which needs the classes of this module
-    from plumbline.truth import predictability_horizon, trajectory_truth
+    from plumbline.truth import trajectory_truth
 
     singular = ""
     if model.has_loops:
@@ -148,9 +145,7 @@ def motion_truth(
     if max_compiled_bodies is None:
         max_compiled_bodies = trajectory_truth.MAX_COMPILED_BODIES
     truth = trajectory_truth.trajectory_truth(model, state, times, closed_form, max_compiled_bodies, proof)
-    growth, runs = predictability_horizon.perturbation_growth_and_runs(
-        model, state, times, perturbed_models(model, state)
-    )
+    growth, runs = perturbation_growth_and_runs(model, state, times, perturbed_models(model, state))
     growth, length = np.maximum.accumulate(growth), float(np.sum(stretched_length(model)))
     # what is free or slides leaves the stretched mechanism
     length = max(length, float(np.max(np.linalg.norm(truth.trajectory.r, axis=-1))))

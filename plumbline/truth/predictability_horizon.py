@@ -29,9 +29,6 @@ from plumbline.model.kinematics import (
 )
 from plumbline.model.loops import assembled
 from plumbline.model.sampling import derive_seed
-from reference_impl.fast.chain_elimination import component_first
-from reference_impl.fast.collocation import integrate_collocation
-from reference_impl.fast.tree_elimination import TreeSystem, eliminated_system
 
 PERTURBATION_SIZE = 1e-7  # of each angle [rad], of each rate relative to the largest rate of the motion
 PERTURBATION_COUNT = 4  # random directions
@@ -169,6 +166,10 @@ def perturbed_states(
 
 def _integrate_batch(models: list[Model], states: list[State], times: Array) -> list[Array]:
     """r, p, ṙ, ṗ, x (runs, T, N, ·) of a batch of mechanisms of as many bodies, from times[0]."""
+    # with SciPy: not in a run's own process
+    from reference_impl.fast.collocation import integrate_collocation
+    from reference_impl.fast.tree_elimination import eliminated_system
+
     pairs = zip(models, states, strict=True)
     system = eliminated_system(models, np.concatenate([joint_coordinates(*pair)[2] for pair in pairs]))
     r, p, v = (np.concatenate([getattr(state, name) for state in states]) for name in ("r", "p", "v"))
@@ -190,6 +191,9 @@ def project_to_manifold(model: Model, r: Array, p: Array, v: Array, pdot: Array)
         pdot: (N, 4) ṗ [1/s].
 
     """
+    from reference_impl.fast.chain_elimination import component_first
+    from reference_impl.fast.tree_elimination import TreeSystem, eliminated_system
+
     system = eliminated_system([model])
     if isinstance(system, TreeSystem):
         q, qdot = system.project(component_first(r, p), component_first(v, pdot))
