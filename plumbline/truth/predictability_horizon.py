@@ -19,13 +19,9 @@ from plumbline.model.kinematics import (
     complete_state,
     cross,
     joint_coordinates,
-    joint_vectors,
     quaternion_conjugate,
     quaternion_product,
     quaternion_rate,
-    rotate_vectors,
-    rotation_matrix,
-    state_from_minimal,
 )
 from plumbline.model.loops import assembled
 from plumbline.model.sampling import derive_seed
@@ -181,8 +177,7 @@ def _integrate_batch(models: list[Model], states: list[State], times: Array) -> 
 def project_to_manifold(model: Model, r: Array, p: Array, v: Array, pdot: Array) -> State:
     """Return the state on the constraint manifold next to an integrated one.
 
-    Where the integrated form has no projection, it has the same minimal coordinates; else r, p, ω′ and ṙ are
-    those of the nearest state, and joint coordinates are not computed.
+    Joint coordinates are not computed.
 
     Args:
         r: (N, 3) centres of mass [m], world frame.
@@ -192,21 +187,11 @@ def project_to_manifold(model: Model, r: Array, p: Array, v: Array, pdot: Array)
 
     """
     from reference_impl.fast.chain_elimination import component_first
-    from reference_impl.fast.tree_elimination import TreeSystem, eliminated_system
+    from reference_impl.fast.tree_elimination import eliminated_system
 
-    system = eliminated_system([model])
-    if isinstance(system, TreeSystem):
-        q, qdot = system.project(component_first(r, p), component_first(v, pdot))
-        p, zeros = np.ascontiguousarray(q[3:].T), np.zeros((model.n, 3))
-        return State(p, angular_velocity(p, qdot[3:].T), zeros, zeros, q[:3].T, qdot[:3].T)
-    p = p / np.linalg.norm(p, axis=1, keepdims=True)
-    omega = angular_velocity(p, pdot)
-    A = rotation_matrix(p)
-    near, far = (v + rotate_vectors(A, cross(omega, s)) for s in (model.proximal, model.distal))
-    gap_rate = near - np.concatenate([np.zeros((1, 3)), far[:-1]])
-    ell = np.where(model.rods, model.length, np.inf)[:, None]
-    u, udot = joint_vectors(model, r, p) / ell, gap_rate / ell
-    return state_from_minimal(model, *_unit_coordinates(model, p, omega, u, udot))
+    q, qdot = eliminated_system([model]).project(component_first(r, p), component_first(v, pdot))
+    p, zeros = np.ascontiguousarray(q[3:].T), np.zeros((model.n, 3))
+    return State(p, angular_velocity(p, qdot[3:].T), zeros, zeros, q[:3].T, qdot[:3].T)
 
 
 def _interpolate_states(model: Model, base: State, other: State, part: float) -> State:

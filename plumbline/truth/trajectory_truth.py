@@ -36,11 +36,9 @@ from typing import Literal, NamedTuple
 
 from plumbline.engines.integrators import runge_kutta_4
 from plumbline.model.datatypes import EngineFailure
-from plumbline.model.invariants import attitude_error, joint_vector_rates
+from plumbline.model.invariants import attitude_error
 from plumbline.model.kinematics import (
-    forward_kinematics,
     joint_coordinates,
-    joint_vectors,
     with_joint_coordinates,
 )
 from plumbline.model.loops import MIN_MOTION_SINGULAR_VALUE, regular_rank, smallest_singular_value
@@ -415,26 +413,10 @@ def _simulate_batch(motion: AccurateMotion, cases: Sequence[tuple[Model, State]]
     found = np.moveaxis(
         np.array(samples).reshape(len(times), 2, 7, len(cases), -1), (3, 1, 0, 4, 2), (0, 1, 2, 3, 4)
     )
-    runs = [
+    return [
         Trajectory(times, q[..., :3], q[..., 3:], rate[..., :3], rate[..., 3:], substeps, start.x)
         for (_, start), (q, rate) in zip(cases, found, strict=True)
     ]
-    if isinstance(system, TreeSystem):  # whose samples have been projected
-        return runs
-    return [_on_manifold(model, run) for (model, _), run in zip(cases, runs, strict=True)]
-
-
-def _on_manifold(model: Model, run: Trajectory) -> Trajectory:
-    """The run of a chain with unit quaternions, and points that satisfy the joints exactly."""
-    omega = angular_velocity(run.p, run.pdot)
-    ell = np.where(model.rods, model.length, np.inf)[:, None]
-    u = joint_vectors(model, run.r, run.p) / ell
-    u = u / np.where(model.rods[:, None], np.linalg.norm(u, axis=-1, keepdims=True), 1.0)
-    udot = joint_vector_rates(model, run, omega) / ell
-    udot = udot - np.sum(udot * u, axis=-1, keepdims=True) * u
-    p = run.p / np.linalg.norm(run.p, axis=-1, keepdims=True)
-    _, _, r, v = forward_kinematics(model, p, omega, u, udot)
-    return Trajectory(run.t, r, p, v, quaternion_rate(p, omega), run.steps)
 
 
 REGULARITY_RTOL = 1e-9
