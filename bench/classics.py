@@ -112,7 +112,6 @@ def _true_crank_direction(_: Scenario, times: Array) -> Array:
     return np.array([[np.cos(beta), np.sin(beta)]])
 
 
-EXPLICIT = (("mujoco", "RK4"), ("exudyn-tree", "RK44"), ("pinocchio", "rkmk4"))
 PROBLEMS = {
     "A01": Problem(
         "a01-simple-pendulum", 2000.0, 0.5, _pendulum_position, _closed_form_position, 1e-3,

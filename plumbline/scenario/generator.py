@@ -44,9 +44,6 @@ MAX_LOOP_BODIES = 8  # of random mechanisms with loops
 SPECIAL_INDICES = (0, 2)  # modulo 5: of scenarios with special values
 SPECIAL_CHANCE = 0.4  # of each kind of special value in such a scenario
 MOTION_SAMPLE = 2.0**-5  # s, the coarsest step of an order-4 method; the work of loads is a quadrature
-LOADED_MOTION_SAMPLE = (
-    2.0**-7
-)  # s, as the catalogue's: the work of loads and drag is a quadrature over samples
 RANDOM_PURPOSE = (
     "Nobody chose it, so nobody's blind spot shaped it: generic geometry, full inertia, rates and loads "
     "shows any mistake that a symmetric or planar case hides."
