@@ -21,6 +21,7 @@ terms.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -329,6 +330,18 @@ def evaluate_or_refusal(evaluate: Evaluate, model: Model, state: State) -> State
     return answers
 
 
+def _evaluate_together(
+    evaluate: Evaluate, problems: Sequence[tuple[Model, State]]
+) -> list[StateQuantities | Unsupported]:
+    """Evaluate states in one call where they are of equal mechanisms, one by one where the engine refuses."""
+    (model, _), *rest = problems
+    numbers = [np.asarray(x).tobytes() for x in model.fields.values()]
+    if all([np.asarray(x).tobytes() for x in other.fields.values()] == numbers for other, _ in rest):
+        with suppress(Unsupported):
+            return [*evaluate(model, [state for _, state in problems])]
+    return [evaluate_or_refusal(evaluate, *problem) for problem in problems]
+
+
 def check_state_relation(
     relation: Relation,
     answers: Sequence[StateQuantities | Unsupported],
@@ -355,10 +368,10 @@ def check_state_relation(
     """
     worst, count, unexplained = (0.0, "", 0), 0, 0.0
     refused: Unsupported | None = None
-    for index, state in enumerate(states):
+    others = [relation.transform(model, state) for state in states]
+    answered = _evaluate_together(evaluate_other, others)
+    for index, (state, there, other) in enumerate(zip(states, others, answered, strict=True)):
         here = answers[index]
-        there = relation.transform(model, state)
-        other = evaluate_or_refusal(evaluate_other, *there)
         if isinstance(here, Unsupported):
             refused = here
             continue

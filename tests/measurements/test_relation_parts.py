@@ -64,11 +64,12 @@ def self_relation_result(*shifts, relation=None, refuse=(), refuse_here=()):
         other[index] = replace(other[index], **{quantity: x + off})
     requested = iter(range(3))
 
-    def there(_model, _states):
-        index = next(requested)
-        if index in refuse:
-            raise Unsupported(f"not state {index}")
-        return [other[index]]
+    def there(_model, states):  # all in one call, or one by one
+        indices = range(3) if len(states) == 3 else [next(requested)]
+        for index in refuse:
+            if index in indices:
+                raise Unsupported(f"not state {index}")
+        return [other[index] for index in indices]
 
     reported = [Unsupported(f"nor state {k}") if k in refuse_here else x for k, x in enumerate(reported)]
     relation = relation or Relation("as itself", unchanged, quantity_values)
