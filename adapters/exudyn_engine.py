@@ -37,7 +37,6 @@ from adapters.exudyn_common import (
     initialized_solver,
     items,
     kinetic_energy,
-    make_rigid_body,
     make_settings,
     make_system,
     mass_matrix_and_force,
@@ -47,6 +46,7 @@ from adapters.exudyn_common import (
     written_items,
 )
 from adapters.exudyn_surface import POSE_FUNCTIONS, Probes, pose_function
+from adapters.exudyn_variants import VARIANTS, Change, Joint, Piece
 from adapters.pose_functions import add_pose_answers
 from plumbline.model.datatypes import (
     Array,
@@ -63,10 +63,8 @@ from plumbline.model.datatypes import (
 )
 from plumbline.model.kinematics import (
     JointFrame,
-    angular_velocity,
     elastic_energy,
     joint_coordinates,
-    quaternion_rate,
     rotation_matrix,
     velocity_jacobian,
 )
@@ -76,6 +74,7 @@ from plumbline.model.welding import BodyParts, RigidPart, undivided_bodies
 
 SECOND_AXIS = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # columns x, −z, y of the joint's axes
 SPECTRAL_RADIUS = 0.9
+GENERIC_ROWS = 6  # of a generic joint, free axes included
 STEP_SETTINGS = {
     "solver_atol": NEWTON_TOLERANCE,
     "solver_rtol": NEWTON_TOLERANCE,
@@ -99,7 +98,9 @@ class ExudynChain:
         parts: BodyParts | None = None,
         left_out: frozenset[tuple[int, int]] = frozenset(),
         has_probes: bool = False,
+        change: Change = Change(),  # noqa: B008
     ) -> None:
+        self.change = change
         self.model, self.state, self.left_out = model, state, left_out
         self.mbs, self.container = make_system()
         mbs, parts = self.mbs, parts or undivided_bodies(model)
@@ -118,12 +119,13 @@ class ExudynChain:
         self.x = joint_coordinates(model, state)[2]
         self.connectors: list[tuple[int, Any, bool, Array]] = []
         self.jacobian_rate = np.zeros((0, 0))  # d_t(C_q), where joints need it
-        self.qdot = np.empty((len(self.piece_centre), 7))
-        attitude, pdot = rotation_matrix(state.p), quaternion_rate(state.p, state.omega)
+        self.qdot_of_pieces = list[Array]()
+        self.rates_of_pieces = list[Array]()  # B of θ̇ = B ω′, of the nodes' attitudes
+        attitude = rotation_matrix(state.p)
         for k in range(model.n):
             self.first_piece.append(len(self.piece_bodies))
             for part in parts[k]:
-                self._add_piece(k, part, attitude[k], pdot[k])
+                self._add_piece(k, part, attitude[k])
             self.last_piece.append(len(self.piece_bodies) - 1)
             first, last = self.first_piece[k], self.last_piece[k]
             self._add_joint(k)
@@ -138,18 +140,20 @@ class ExudynChain:
         for k in range(model.n, len(model.kind)):
             self._add_joint(k)
         self.probes = Probes(mbs, model, self.piece_bodies, self.nodes) if has_probes else None
-        mbs.Assemble()
+        self.qdot, self.rates = np.array(self.qdot_of_pieces), np.array(self.rates_of_pieces)
+        self.width = self.qdot.shape[1]
+        change.assemble(mbs)
 
-    def _add_piece(self, k: int, part: RigidPart, attitude: Array, pdot: Array) -> None:
+    def _add_piece(self, k: int, part: RigidPart, attitude: Array) -> None:
         mbs, state = self.mbs, self.state
         arm, arm_rate = attitude @ part.centre, attitude @ np.cross(state.omega[k], part.centre)
-        qdot = self.qdot[len(self.piece_bodies)] = *(state.v[k] + arm_rate), *pdot
-        reference = [*(state.r[k] + arm), *state.p[k]]
-        node = mbs.AddNode(items.NodeRigidBodyEP(referenceCoordinates=reference, initialVelocities=[*qdot]))
-        body = mbs.AddObject(make_rigid_body(node, part.mass, part.inertia))
-        weight = mbs.AddMarker(items.MarkerBodyMass(bodyNumber=body))
-        gravity = self.model.gravity.tolist()
-        mbs.AddLoad(items.LoadMassProportional(markerNumber=weight, loadVector=gravity))
+        velocity, gravity = state.v[k] + arm_rate, self.model.gravity
+        piece = Piece(part, state.r[k] + arm, velocity, state.p[k], state.omega[k], gravity)
+        node, body = self.change.add_body(mbs, piece)
+        own = np.array(mbs.GetNode(node)["referenceCoordinates"])[3:]
+        rates = self.change.rates(own if len(own) == len(piece.turn) else piece.turn)  # p or −p
+        self.qdot_of_pieces.append(np.append(velocity, rates @ state.omega[k]))
+        self.rates_of_pieces.append(rates)
         self.nodes.append(node)
         self.piece_bodies.append(body)
         self.body_of_piece.append(k)
@@ -165,19 +169,13 @@ class ExudynChain:
             return
         held = enumerate(_constrained_axes(kind) or [1] * 3)
         rows = [int(is_held and (k, i) not in self.left_out) for i, is_held in held]
-        if kind.holds_distance:
-            joint = items.ObjectConnectorDistance(markerNumbers=ends, distance=model.length[k])
-        elif kind.is_spherical:
-            joint = items.ObjectJointSpherical(markerNumbers=ends, constrainedAxes=rows)
-        else:
-            turns = rotation_matrix(model.turn[k])
-            joint = items.ObjectJointGeneric(
-                markerNumbers=ends,
-                constrainedAxes=rows,
-                rotationMarker0=turns[0],
-                rotationMarker1=turns[1],
-            )
-        self.joints.append(self.mbs.AddObject(joint))
+        A, turns = rotation_matrix(self.state.p[near]), rotation_matrix(model.turn[k])
+        place = self.state.r[near] + A @ model.proximal[k]
+        points = model.point[k, 0], model.proximal[k]
+        bodies = [self.piece_bodies[self.last_piece[far]] if far >= 0 else self.ground]
+        bodies.append(self.piece_bodies[self.first_piece[near]])
+        joint = Joint(kind, ends, bodies, points, turns, place, A @ turns[1], rows, float(model.length[k]))
+        self.joints.append(self.change.add_joint(self.mbs, joint))
         self._add_joint_elements(k, ends)
 
     def _add_joint_elements(self, k: int, ends: list[Any]) -> None:
@@ -221,7 +219,8 @@ class ExudynChain:
         if self.joints[k] is None:
             return []
         rows = list(self.mbs.systemData.GetObjectLTGAE(self.joints[k]))
-        held = _constrained_axes(self.model.kinds[k]) or [1] * len(rows)
+        held = _constrained_axes(self.model.kinds[k]) if len(rows) == GENERIC_ROWS else []
+        held = held or [1] * len(rows)
         return [row for row, is_held in zip(rows, held, strict=True) if is_held]
 
     def _add_marker(self, piece: int, point: Array) -> Any:
@@ -309,6 +308,7 @@ class Exudyn(ExudynAdapter):
             method=generalized_alpha(SPECTRAL_RADIUS, **STEP_SETTINGS),
         ),
     )
+    variants = VARIANTS
     usual_linear_solver = "EigenSparse"
     linear_solvers = ("EXUdense", "EigenDense")
     gaps: ClassVar[Mapping[str, str]] = {
@@ -327,7 +327,9 @@ class Exudyn(ExudynAdapter):
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
         with silence_engine():
-            return [_evaluate_state(ExudynChain(model, at, self.body_pieces(model))) for at in states]
+            change = self.variant.change if self.variant else Change()
+            parts = self.body_pieces(model)
+            return [_evaluate_state(ExudynChain(model, at, parts, change=change)) for at in states]
 
     def written(self, model: Model, state: State, moves: bool = False) -> dict[str, Any]:
         """Return the items of the assembled system, and what the read-out needs, of one state."""
@@ -338,7 +340,7 @@ class Exudyn(ExudynAdapter):
         used = np.flatnonzero(np.any(C != 0, axis=1))
         if model.has_loops:
             used = used[independent_rows(C[used])]
-        rates = np.zeros((0, 0)) if model.has_loops else _coordinate_rate_map(model, state)
+        rates = np.zeros((0, 0)) if model.has_loops else _coordinate_rate_map(chain)
         fields = {"qdot": chain.qdot.ravel(), "A": rotation_matrix(state.p), "used": used}
         fields |= {"elastic": np.array(elastic_energy(model, state)), "joint_rates": rates}
         fields |= {"gravity": model.gravity, "proximal": model.proximal, "near": model.body[:, 1]}
@@ -475,7 +477,7 @@ def _evaluate_state(chain: ExudynChain) -> StateQuantities:
         ⎡ M  Cᵀ ⎤ ⎡ q̈ ⎤   ⎡ f ⎤
         ⎣ C  0  ⎦ ⎣ λ ⎦ = ⎣ γ ⎦,     γ from the accelerations Exudyn gives the attachments at q̈ = 0.
     """
-    mbs, data, n = chain.mbs, chain.mbs.systemData, len(chain.piece_bodies)
+    mbs, data, n, w = chain.mbs, chain.mbs.systemData, len(chain.piece_bodies), chain.width
     M, f, C = _system_matrices(chain)
     gamma = _constraint_accelerations(chain, C)
     used = np.any(C != 0, axis=1)  # a generic joint's free axes have none
@@ -489,25 +491,26 @@ def _evaluate_state(chain: ExudynChain) -> StateQuantities:
     x[part] = _solve(
         np.block([[M, C_used.T], [C_used, np.zeros((len(C_used), len(C_used)))]]), np.concatenate([f, gamma])
     )
-    data.SetODE2Coordinates_tt(x[: 7 * n])
-    multiplier = x[7 * n :]
+    data.SetODE2Coordinates_tt(x[: w * n])
+    multiplier = x[w * n :]
     joint_rows = [chain.joint_rows(k) for k in range(len(chain.joints))]
     pieces = [chain.first_piece[near] for near in chain.model.body[:, 1]]
     reaction = [
-        -C[rows, 7 * i : 7 * i + 3].T @ multiplier[rows] for i, rows in zip(pieces, joint_rows, strict=True)
+        -C[rows, w * i : w * i + 3].T @ multiplier[rows] for i, rows in zip(pieces, joint_rows, strict=True)
     ]
     turning = [
-        -C[rows, 7 * i + 3 : 7 * i + 7].T @ multiplier[rows]
+        -C[rows, w * i + 3 : w * i + w].T @ multiplier[rows]
         for i, rows in zip(pieces, joint_rows, strict=True)
     ]
     elements = _element_wrenches(chain)
-    momentum = (M @ chain.qdot.ravel()).reshape(n, 7)  # 4LᵀJLṗ = 2LᵀJω′, and L Lᵀ = I gives Jω′ = ½ L (…)
+    momentum = (M @ chain.qdot.ravel()).reshape(n, w)  # of θ̇ = B ω′: Bᵀ (…) = J ω′
     p = chain.state.p[chain.body_of_piece]
-    spin = angular_velocity(p, momentum[:, 3:]) / 4  # angular_velocity is 2 L(p) (…)
+    spin = np.matvec(chain.rates.mT, momentum[:, 3:])
     r = np.array([mbs.GetObjectOutputBody(body, Output.Position) for body in chain.piece_bodies])
-    weight = (M @ np.tile([*chain.model.gravity, 0, 0, 0, 0], n)).reshape(n, 7)[:, :3]
+    still = np.zeros(w - 3)
+    weight = (M @ np.tile([*chain.model.gravity, *still], n)).reshape(n, w)[:, :3]
     kinetic = kinetic_energy(mbs, chain.piece_bodies, float(0.5 * np.sum(chain.qdot * momentum)))
-    rates = None if chain.welds or chain.model.has_loops else _coordinate_rate_map(chain.model, chain.state)
+    rates = None if chain.welds or chain.model.has_loops else _coordinate_rate_map(chain)
     return StateQuantities(
         acceleration=chain.body_outputs(Output.Acceleration),
         angular_acceleration=chain.body_outputs(Output.AngularAccelerationLocal),
@@ -534,13 +537,14 @@ def _element_wrenches(chain: ExudynChain) -> Array:
 
 
 def _joint_moments(chain: ExudynChain, force: list[Array], of_p: list[Array]) -> Array:
-    """Return the moments (J, 3) about the near points from the generalised forces on r and p (4,).
+    """Return the moments (J, 3) about the near points from the generalised forces on r and θ.
 
-    A ½ L Q_p is the moment about the centre of the piece that the body hangs by; angular_velocity is 2 L (…).
+    With θ̇ = B ω′, A Bᵀ Q is the moment about the centre of the piece that the body hangs by.
     """
     near = chain.model.body[:, 1]
     A = rotation_matrix(chain.state.p)[near]
-    about_centre = angular_velocity(chain.state.p[near], np.array(of_p)) / 4
+    rates = chain.rates[[chain.first_piece[i] for i in near]]
+    about_centre = np.matvec(rates.mT, np.array(of_p))
     centre = np.array([chain.piece_centre[chain.first_piece[i]] for i in near])
     lever = np.matvec(A, chain.model.proximal - centre)
     return np.asarray(np.matvec(A, about_centre) - np.cross(lever, force))
@@ -595,7 +599,8 @@ def _constraint_accelerations(chain: ExudynChain, C: Array) -> Array:
     gamma = np.zeros(len(C))
     data.SetODE2Coordinates_tt(np.zeros(C.shape[1]))
     for i, node in enumerate(chain.nodes):
-        gamma[data.GetNodeLTGAE(node)] = -2 * chain.qdot[i, 3:] @ chain.qdot[i, 3:]
+        if len(rows := list(data.GetNodeLTGAE(node))):  # |p| = 1
+            gamma[rows] = -2 * chain.qdot[i, 3:] @ chain.qdot[i, 3:]
     for k, joint in enumerate(chain.joints):
         if not model.kinds[k].holds_no_turn:
             rows = chain.joint_rows(k)
@@ -605,20 +610,19 @@ def _constraint_accelerations(chain: ExudynChain, C: Array) -> Array:
         if model.length[k] > 0:  # (‖d‖)¨ = (dᵀd̈ + ḋᵀḋ - (‖d‖˙)²) / ‖d‖, and ‖d‖˙ = 0 on the manifold
             d, ddot = (chain.joint_output(k, what) for what in (Output.Position, Output.Velocity))
             bend = (d @ bend + ddot @ ddot) / np.linalg.norm(d)
-        gamma[data.GetObjectLTGAE(joint)] = -bend
+        gamma[data.GetObjectLTGAE(joint)[: np.size(bend)]] = -bend
     for weld, one, other in zip(chain.welds, chain.first_piece, chain.last_piece, strict=False):
         rows = data.GetObjectLTGAE(weld)[:3]
         there, here = (chain.output_at(piece, Output.Acceleration, np.zeros(3)) for piece in (other, one))
-        gamma[rows] = -C[rows, 7 * other : 7 * other + 3] @ (there - here)
+        gamma[rows] = -C[rows, chain.width * other : chain.width * other + 3] @ (there - here)
     return gamma
 
 
-def _coordinate_rate_map(model: Model, state: State) -> Array:
-    """Return the matrix (7N, nu) from ν = (u̇ of the rods, ω′ of all bodies) to (ṙ, ṗ) of all bodies."""
-    rates = velocity_jacobian(model, state).reshape(model.n, 6, -1)
-    ones = np.ones((model.n, 1))
-    pdot = np.stack([quaternion_rate(state.p, ones * axis) for axis in np.eye(3)], axis=2)  # per ω′
-    return np.concatenate([rates[:, :3], pdot @ rates[:, 3:]], axis=1).reshape(7 * model.n, -1)
+def _coordinate_rate_map(chain: ExudynChain) -> Array:
+    """Return the matrix from ν = (u̇ of the rods, ω′ of all bodies) to (ṙ, θ̇) of all bodies."""
+    rates = velocity_jacobian(chain.model, chain.state).reshape(chain.model.n, 6, -1)
+    both = np.concatenate([rates[:, :3], chain.rates @ rates[:, 3:]], axis=1)
+    return both.reshape(chain.width * chain.model.n, -1)
 
 
 def _solve(S: Array, b: Array) -> Array:

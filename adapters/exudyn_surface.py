@@ -159,6 +159,10 @@ OUTPUTS = {
     "AngularAcceleration": _Output("frame_angular_acceleration", "frame_angular_acceleration"),
     "AngularAccelerationLocal": _Output("frame_angular_acceleration_local", read=_in_probe_axes),
 }
+OF_COORDINATES = {  # of nodes, whose first coordinates are those of the centre of mass
+    "CoordinatesTotal": "body_position", "Coordinates_t": "body_velocity",
+    "Coordinates_tt": "body_acceleration",
+}  # fmt: skip
 OF_BODIES = {name: output.quantity for name, output in OUTPUTS.items()}
 OF_NODES = {name: output.of_node for name, output in OUTPUTS.items() if output.of_node}
 OF_MARKERS = {name: output.quantity for name, output in OUTPUTS.items() if output.has_marker}
@@ -175,6 +179,11 @@ class Probes:
             mbs.AddMarker(items.MarkerBodyRigid(bodyNumber=body, localPosition=point))
             for body, point in zip(bodies, self.points, strict=True)
         ]
+        self.markers_of_centres = {
+            "MarkerBodyPosition": [mbs.AddMarker(items.MarkerBodyPosition(bodyNumber=x)) for x in bodies],
+            "MarkerNodePosition": [mbs.AddMarker(items.MarkerNodePosition(nodeNumber=x)) for x in nodes],
+            "MarkerNodeRigid": [mbs.AddMarker(items.MarkerNodeRigid(nodeNumber=x)) for x in nodes],
+        }
         silent = {"writeToFile": False, "storeInternal": False}
         self.sensors: dict[tuple[str, str, str], list[Any]] = defaultdict(list)  # by kind, output, quantity
         for body, point, node, marker in zip(bodies, self.points, nodes, self.markers, strict=True):
@@ -209,4 +218,16 @@ class Probes:
         ]  # fmt: skip
         for quantity, name, call, values in read:
             found[quantity][*call, f"OutputVariableType.{name}"] = OUTPUTS[name].read(np.array(values))
+        for name, quantity in OF_COORDINATES.items():
+            values = [mbs.GetNodeOutput(node, getattr(Output, name))[:3] for node in self.nodes]
+            found[quantity]["MainSystem.GetNodeOutput", f"OutputVariableType.{name}"] = np.array(values)
+        for kind, markers in self.markers_of_centres.items():
+            for name in ("Position", "Velocity"):
+                values = [mbs.GetMarkerOutput(marker, getattr(Output, name)) for marker in markers]
+                found[OUTPUTS[name].of_node][f"itemInterface.{kind}",] = np.array(values)
+        data = mbs.systemData
+        total = np.array(data.GetODE2CoordinatesTotal())
+        for kind, numbers in (("Node", self.nodes), ("Object", self.bodies)):
+            own = np.array([total[getattr(data, f"Get{kind}LTGODE2")(item)][:3] for item in numbers])
+            found["body_position"]["SystemData.GetODE2CoordinatesTotal", f"SystemData.Get{kind}LTGODE2"] = own
         return found

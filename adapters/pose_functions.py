@@ -132,8 +132,8 @@ class Pose:
         return named | dict(zip(("x", "y", "z", "rx", "ry", "rz"), map(float, [*xyz, *self.r]), strict=True))
 
 
-def _rate_maps(Q: Pose) -> dict[str, Array]:
-    """Matrices at Q from the rates of forms to ω in Q's axes, or to the twist in them."""
+def rate_maps(Q: Pose) -> dict[str, Array]:
+    """Return matrices at Q from the rates of forms to ω in Q's axes, or to the twist in them."""
     phi, (a, *_), (u, v, _) = (Q.forms[name] for name in ("phi", "xyz", "rpy"))
     of_xyz = [Q.R.T @ axis for axis in (np.eye(3)[0], _about(0, a)[:, 1], Q.R[:, 2])]
     of_rpy = [np.eye(3)[0], _about(0, u).T[:, 1], (_about(1, v) @ _about(0, u)).T[:, 2]]
@@ -163,7 +163,7 @@ class _Body:
         Q, K = [Pose(length * FIXED_PLACE, turn) for turn in (near, OTHER_TURN)]
         self.Q, M, L = Q, Q * K.inverse(), self.pose * Q.inverse()
         self.poses = {"": self.pose, "Q": Q, "K": K, "L": L, "M": M, "I": self.pose.inverse()}
-        self.maps, spin = _rate_maps(Q), Q.R.T @ omega
+        self.maps, spin = rate_maps(Q), Q.R.T @ omega
         twist = np.append(Q.R.T @ state.v[k], spin)
         self.rates: dict[str, Any] = {"pdot": quaternion_rate(Q.p, spin), "dr": self.pose.r - L.r}
         self.rates["shift"] = np.append(Q.r - M.r, K.forms["phi"])

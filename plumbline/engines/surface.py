@@ -162,6 +162,22 @@ def surface_changes(engine: str) -> SurfaceChanges:
     return SurfaceChanges(engine, metadata.version(surface.package), new, vanished)
 
 
+def other_names(engine: str) -> dict[str, list[str]]:
+    """Find the functions and classes that have several public names; imports the engine.
+
+    Returns:
+        By name the others of the same object.
+
+    """
+    groups: dict[int, list[str]] = {}
+    for one in declared_surface(engine).names:
+        path, _, kind = one.place.partition(" ")
+        if kind in ("functions", "classes"):
+            found = getattr(_resolve(path), one.name.rpartition(".")[2], None)
+            groups.setdefault(id(found), []).append(one.name)
+    return {name: names for names in groups.values() for name in names if len(names) > 1}
+
+
 def _short(place: str, name: str) -> str:
     """The name with its place, without the engine's package."""
     owner = place.partition(" ")[0].partition(".")[2]

@@ -12,7 +12,7 @@ from collections import defaultdict
 from dataclasses import replace
 
 from plumbline.engines.engine_calls import SURFACE_STATES, Evaluation, evaluate_states
-from plumbline.engines.surface import SURFACES
+from plumbline.engines.surface import SURFACES, other_names
 from plumbline.engines.variants import NoAnswer
 from plumbline.judging.rows import Row, RowContext, Verdict
 from plumbline.judging.state_level import judge_variants
@@ -88,6 +88,10 @@ def main() -> None:
             evaluation = evaluate_states(engine, s.model, states)
             for name, quantities in exercised_names(truth, evaluation).items():
                 names[name] |= quantities
+    for engine, names in found.items():
+        for name, same in other_names(engine).items():
+            for other in same if name in names else ():
+                names[other] |= names[name]
     written = {
         engine: {name: sorted(names[name]) for name in sorted(names)} for engine, names in found.items()
     }

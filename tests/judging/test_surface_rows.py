@@ -58,7 +58,7 @@ def test_every_call_agrees_and_a_relative_change_of_1e_6_is_seen(engine, tree):
     assert set(exercised_names(truth, evaluation)) == calls
 
 
-@pytest.mark.parametrize(("engine", "count"), [("mujoco", 30), ("pinocchio", 20)])
+@pytest.mark.parametrize(("engine", "count"), [("mujoco", 30), ("pinocchio", 20), ("exudyn", 15)])
 def test_every_variant_agrees_and_a_relative_change_of_1e_6_is_seen(engine, count, tree):
     model, states, truth = tree
     evaluation = Evaluation(

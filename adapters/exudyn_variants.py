@@ -1,0 +1,337 @@
+"""Other ways to describe the same mechanism to Exudyn in maximal coordinates, as users do.
+
+A `Change` is what the build of a chain does otherwise; `VARIANTS` lists them with the names that each
+exercises.  A node has coordinates of its own for the attitude, whose rates are B ω′.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import exudyn
+import numpy as np
+from exudyn import rigidBodyUtilities
+
+from adapters.exudyn_common import items, make_rigid_body
+from adapters.pose_functions import Pose, rate_maps
+from plumbline.engines.variants import Variant
+from plumbline.model.datatypes import Array, Call, Float, JointKind, Model, Unsupported
+from plumbline.model.kinematics import quaternion_rate, rotation_matrix, rotation_vector
+from plumbline.model.welding import RigidPart
+
+MIN_COS_MIDDLE_ANGLE = 0.03  # of three angles: below, the rates of the others lose digits
+utilities: Any = rigidBodyUtilities  # its functions are untyped
+TURN_TO_X = np.roll(np.eye(3), 1, axis=1)  # columns z, x, y: its x axis is the z axis of what it is in
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A rigid part of a body at its state."""
+
+    part: RigidPart
+    place: Float[Array, "3"]  # m
+    velocity: Float[Array, "3"]  # m/s
+    turn: Float[Array, "4"]
+    spin: Float[Array, "3"]  # rad/s, in its own axes
+    gravity: Float[Array, "3"]  # m/s²
+
+
+@dataclass(frozen=True)
+class Joint:
+    """What a joint holds together."""
+
+    kind: JointKind
+    markers: Sequence[Any]
+    bodies: Sequence[Any]
+    points: Sequence[Array]  # in the bodies
+    turns: Float[Array, "2 3 3"]  # of the joint's axes in the bodies
+    place: Float[Array, "3"]  # of the near point, world
+    axes: Float[Array, "3 3"]  # of the near body, world
+    rows: Sequence[int]
+    length: float
+
+
+def euler_parameter_rates(p: Float[Array, "4"]) -> Float[Array, "4 3"]:
+    """Return B of Euler parameters."""
+    return np.stack([quaternion_rate(p, axis) for axis in np.eye(3)], axis=1)
+
+
+def _angles(p: Float[Array, "4"]) -> Float[Array, "3"]:
+    return np.asarray(Pose(np.zeros(3), p).forms["xyz"])
+
+
+def _angle_rates(p: Float[Array, "4"]) -> Float[Array, "3 3"]:
+    pose = Pose(np.zeros(3), p)
+    if abs(np.cos(pose.forms["y"])) < MIN_COS_MIDDLE_ANGLE:
+        raise Unsupported("the second of a node's three angles is near ±90°, where they lose digits")
+    return np.asarray(np.linalg.inv(rate_maps(pose)["xyzdot"]))
+
+
+def _no_rates_of_its_own(p: Float[Array, "4"]) -> Float[Array, "3 3"]:
+    return np.eye(3)
+
+
+def _node(kind: str, parameters: Callable[[Array], Array], rates: Callable[[Array], Array]) -> Any:
+    """How a body on a node of this kind is added."""
+
+    def add(mbs: Any, piece: Piece) -> tuple[Any, Any]:
+        reference = [*piece.place, *parameters(piece.turn)]
+        velocities = [*piece.velocity, *(rates(piece.turn) @ piece.spin)]
+        item = getattr(items, kind)(referenceCoordinates=reference, initialVelocities=velocities)
+        node = mbs.AddNode(item)
+        body = mbs.AddObject(make_rigid_body(node, piece.part.mass, piece.part.inertia))
+        return node, _with_weight(mbs, body, piece.gravity)
+
+    return add
+
+
+def _with_weight(mbs: Any, body: Any, gravity: Array) -> Any:
+    weight = mbs.AddMarker(items.MarkerBodyMass(bodyNumber=body))
+    mbs.AddLoad(items.LoadMassProportional(markerNumber=weight, loadVector=gravity.tolist()))
+    return body
+
+
+def _by_helper(add: Callable[..., Any], place: str, velocity: str, turn: str, spin: str) -> Any:
+    """Add a body by a function that makes its node too and is given these arguments."""
+
+    def add_body(mbs: Any, piece: Piece) -> tuple[Any, Any]:
+        A = rotation_matrix(piece.turn)
+        inertia = utilities.RigidBodyInertia(piece.part.mass, piece.part.inertia)
+        given = {place: piece.place, velocity: piece.velocity, turn: A, spin: A @ piece.spin}
+        made = add(mbs, inertia=inertia, gravity=piece.gravity.tolist(), **given)
+        body = made[1] if isinstance(made, list | tuple) else made
+        return mbs.GetObject(body)["nodeNumber"], body
+
+    return add_body
+
+
+USUAL_BODY = _node("NodeRigidBodyEP", np.array, euler_parameter_rates)
+
+
+def _set_later(set_parameters: Callable[..., None]) -> Any:
+    """Add a body of another mass and at rest, and set both later."""
+
+    def add(mbs: Any, piece: Piece) -> tuple[Any, Any]:
+        other = RigidPart(2 * piece.part.mass, piece.part.centre, piece.part.inertia)
+        rest = Piece(other, piece.place, 0 * piece.velocity, piece.turn, 0 * piece.spin, piece.gravity)
+        node, body = USUAL_BODY(mbs, rest)
+        rates = [*piece.velocity, *(euler_parameter_rates(piece.turn) @ piece.spin)]
+        set_parameters(mbs, node, body, rates, piece.part.mass)
+        return node, body
+
+    return add
+
+
+def _set_parameters(mbs: Any, node: Any, body: Any, rates: list[float], mass: float) -> None:
+    mbs.SetNodeParameter(node, "initialVelocities", rates)
+    mbs.SetObjectParameter(body, "mass", mass)
+
+
+def _modify(mbs: Any, node: Any, body: Any, rates: list[float], mass: float) -> None:
+    given: Any
+    for name, item, given in (("Node", node, {"initialVelocities": rates}), ("Object", body, {"mass": mass})):
+        whole = getattr(mbs, f"Get{name}")(item) | given
+        seen = {key: value for key, value in whole.items() if not key.startswith("V")}
+        getattr(mbs, f"Modify{name}")(item, seen)
+
+
+def _usual_joint(mbs: Any, joint: Joint) -> Any:
+    ends = list(joint.markers)
+    if joint.kind.holds_distance:
+        return mbs.AddObject(items.ObjectConnectorDistance(markerNumbers=ends, distance=joint.length))
+    if joint.kind.is_spherical:
+        return mbs.AddObject(items.ObjectJointSpherical(markerNumbers=ends, constrainedAxes=joint.rows))
+    far, near = joint.turns
+    item = items.ObjectJointGeneric(
+        markerNumbers=ends, constrainedAxes=joint.rows, rotationMarker0=far, rotationMarker1=near
+    )
+    return mbs.AddObject(item)
+
+
+def _moves(*motions: str) -> Callable[[JointKind], bool]:
+    """Whether a joint has these motions, in turn, all about or along z."""
+    return lambda kind: kind.is_about_z and tuple(what for what, _ in kind.motions) == motions
+
+
+TURNS, SLIDES, BOTH = _moves("turn"), _moves("slide"), _moves("slide", "turn")
+
+
+def _item(kind: str, turn: Array) -> Callable[[Any, Joint], Any]:
+    """A joint of this kind, whose axes are turned in those of the usual one."""
+
+    def add(mbs: Any, joint: Joint) -> Any:
+        far, near = joint.turns @ turn
+        ends = list(joint.markers)
+        make = getattr(items, kind)
+        return mbs.AddObject(make(markerNumbers=ends, rotationMarker0=far, rotationMarker1=near))
+
+    return add
+
+
+def _ball_of_generic(mbs: Any, joint: Joint) -> Any:
+    rows = [*joint.rows, 0, 0, 0]
+    return mbs.AddObject(items.ObjectJointGeneric(markerNumbers=list(joint.markers), constrainedAxes=rows))
+
+
+def _created(function: str, *given: str) -> Callable[[Any, Joint], Any]:
+    """A joint by a function of the system that takes these."""
+
+    def create(mbs: Any, joint: Joint) -> Any:
+        values: dict[str, Any] = {
+            "position": joint.place, "axis": joint.axes[:, 2], "rotationMatrixAxes": joint.axes,
+            "constrainedAxes": list(joint.rows), "distance": joint.length,
+            "localPosition0": joint.points[0], "localPosition1": joint.points[1],
+        }  # fmt: skip
+        own = {name: values[name] for name in given}
+        return getattr(mbs, function)(bodyNumbers=list(joint.bodies), **own)
+
+    return create
+
+
+def _assemble(mbs: Any) -> None:
+    mbs.Assemble()
+
+
+def _assemble_by_parts(mbs: Any) -> None:
+    for part in ASSEMBLY:
+        getattr(mbs, part)()
+    mbs.systemIsConsistent = True  # which only Assemble finds out
+
+
+def _assemble_and_set_state(mbs: Any) -> None:
+    """Carry the state over by all coordinates at once."""
+    mbs.Assemble()
+    data = mbs.systemData
+    state = [np.array(part) for part in data.GetSystemState()]
+    data.SetODE2Coordinates_t(0 * state[1])
+    data.SetSystemState(state)
+
+
+ASSEMBLY = (
+    "AssembleCoordinates", "AssembleLTGLists", "AssembleInitializeSystemCoordinates",
+    "AssembleSystemInitialize",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Change:
+    """What is done otherwise; as it stands nothing."""
+
+    add_body: Callable[[Any, Piece], tuple[Any, Any]] = USUAL_BODY
+    rates: Callable[[Array], Array] = euler_parameter_rates  # p → B
+    joints: Callable[[Any, Joint], Any] = _usual_joint
+    are_meant: Callable[[JointKind], bool] = lambda _: True  # the joints that ``joints`` adds
+    assemble: Callable[[Any], None] = _assemble
+
+    def add_joint(self, mbs: Any, joint: Joint) -> Any:
+        """Add a joint."""
+        return (self.joints if self.are_meant(joint.kind) else _usual_joint)(mbs, joint)
+
+
+def _is_open(model: Model) -> bool:
+    return not model.has_loops
+
+
+def _has_no_axes(model: Model) -> bool:
+    """Whether rates of constraints follow from outputs: others need a polynomial in the coordinates."""
+    return _is_open(model) and all(kind.has_attitude for kind in model.kinds)
+
+
+def _of_joints(
+    names: Call, add: Callable[[Any, Joint], Any], are_meant: Callable[[JointKind], bool]
+) -> Variant:
+    def suits(model: Model) -> bool:
+        return _is_open(model) and any(map(are_meant, model.kinds))
+
+    return Variant("spelling", names, Change(joints=add, are_meant=are_meant), suits)
+
+
+def _is_ball(kind: JointKind) -> bool:
+    return kind.is_spherical and not kind.holds_distance
+
+
+VARIANTS = (
+    Variant(
+        "spelling",
+        ("itemInterface.NodeRigidBodyRxyz",),
+        Change(_node("NodeRigidBodyRxyz", _angles, _angle_rates), _angle_rates),
+        _has_no_axes,
+    ),
+    Variant(
+        "spelling",
+        ("itemInterface.NodeRigidBodyRotVecLG",),
+        Change(_node("NodeRigidBodyRotVecLG", rotation_vector, _no_rates_of_its_own), _no_rates_of_its_own),
+        _has_no_axes,
+    ),
+    Variant(
+        "spelling",
+        ("MainSystem.CreateRigidBody", "rigidBodyUtilities.RigidBodyInertia"),
+        Change(
+            _by_helper(
+                exudyn.MainSystem.CreateRigidBody, "referencePosition", "initialVelocity",
+                "referenceRotationMatrix", "initialAngularVelocity",
+            )
+        ),
+        _is_open,
+    ),
+    Variant(
+        "spelling",
+        ("rigidBodyUtilities.AddRigidBody", "rigidBodyUtilities.GetRigidBodyNode"),
+        Change(
+            _by_helper(
+                utilities.AddRigidBody, "position", "velocity", "rotationMatrix", "angularVelocity"
+            )
+        ),
+        _is_open,
+    ),
+    Variant(
+        "spelling",
+        ("MainSystem.SetNodeParameter", "MainSystem.SetObjectParameter"),
+        Change(_set_later(_set_parameters)),
+        _is_open,
+    ),
+    Variant(
+        "spelling",
+        ("MainSystem.ModifyNode", "MainSystem.ModifyObject"),
+        Change(_set_later(_modify)),
+        _is_open,
+    ),
+    Variant(
+        "option",
+        tuple(f"MainSystem.{part}" for part in ASSEMBLY),
+        Change(assemble=_assemble_by_parts),
+        _is_open,
+    ),
+    Variant(
+        "option",
+        ("SystemData.GetSystemState", "SystemData.SetSystemState"),
+        Change(assemble=_assemble_and_set_state),
+        _is_open,
+    ),
+    _of_joints(("itemInterface.ObjectJointRevoluteZ",), _item("ObjectJointRevoluteZ", np.eye(3)), TURNS),
+    _of_joints(("itemInterface.ObjectJointPrismaticX",), _item("ObjectJointPrismaticX", TURN_TO_X), SLIDES),
+    _of_joints(("itemInterface.ObjectJointGeneric",), _ball_of_generic, _is_ball),
+    _of_joints(
+        ("MainSystem.CreateRevoluteJoint",), _created("CreateRevoluteJoint", "position", "axis"), TURNS
+    ),
+    _of_joints(
+        ("MainSystem.CreatePrismaticJoint",), _created("CreatePrismaticJoint", "position", "axis"), SLIDES
+    ),
+    _of_joints(
+        ("MainSystem.CreateGenericJoint",),
+        _created("CreateGenericJoint", "position", "rotationMatrixAxes", "constrainedAxes"),
+        BOTH,
+    ),
+    _of_joints(
+        ("MainSystem.CreateSphericalJoint",),
+        _created("CreateSphericalJoint", "position", "constrainedAxes"),
+        _is_ball,
+    ),
+    _of_joints(
+        ("MainSystem.CreateDistanceConstraint",),
+        _created("CreateDistanceConstraint", "localPosition0", "localPosition1", "distance"),
+        lambda kind: kind.holds_distance,
+    ),
+)  # fmt: skip
