@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from typing import Any, NamedTuple
 
+import exudyn
 import numpy as np
 
 from adapters.exudyn_common import Output, items
@@ -226,8 +227,10 @@ class Probes:
                 values = [mbs.GetMarkerOutput(marker, getattr(Output, name)) for marker in markers]
                 found[OUTPUTS[name].of_node][f"itemInterface.{kind}",] = np.array(values)
         data = mbs.systemData
-        total = np.array(data.GetODE2CoordinatesTotal())
+        # not GetODE2CoordinatesTotal, which corrupts memory (docs/surface/exudyn_coordinates_total.py)
+        reference = exudyn.ConfigurationType.Reference
+        total = np.array(data.GetODE2Coordinates(reference)) + data.GetODE2Coordinates()
         for kind, numbers in (("Node", self.nodes), ("Object", self.bodies)):
             own = np.array([total[getattr(data, f"Get{kind}LTGODE2")(item)][:3] for item in numbers])
-            found["body_position"]["SystemData.GetODE2CoordinatesTotal", f"SystemData.Get{kind}LTGODE2"] = own
+            found["body_position"][f"SystemData.Get{kind}LTGODE2",] = own
         return found

@@ -811,19 +811,26 @@ class Pinocchio(PinocchioAdapter):
         return found
 
     def _surface(self, model: Model, states: Sequence[State]) -> Sequence[SurfaceAnswer]:
-        chain = PinocchioChain(model, self.usual_algorithm)
-        frames = add_probe_frames(chain.pin_model, chain.body_joints, chain.placements, model)
+        cut = cut_open(model) if model.has_loops else None
+        chain = PinocchioChain(
+            cut.model if cut else model, self.usual_algorithm, ends=cut.ends if cut else ()
+        )
+        own = cut.place[: model.n] if cut else range(model.n)
+        joints, placements = [chain.body_joints[k] for k in own], [chain.placements[k] for k in own]
+        frames = add_probe_frames(chain.pin_model, joints, placements, model)
         chain.data = chain.pin_model.createData()
+        if chain.has_constraints:
+            init_constraint_dynamics(chain.pin_model, chain.data, chain.welds, chain.weld_data)
         inertias = [
             place.act(pin.Inertia(mass, np.zeros(3), inertia))
-            for place, mass, inertia in zip(chain.placements, model.mass, model.inertia, strict=True)
+            for place, mass, inertia in zip(placements, model.mass, model.inertia, strict=True)
         ]
         found = list[dict[str, dict[Call, Array]]]()
         for state in states:
-            q, v = chain.coordinates(state)
+            q, v = chain.coordinates(cut.state(state) if cut else state)
             motion = q, v, chain.acceleration(q, v)
-            answer = surface_answer(chain.pin_model, frames, inertias, motion, chain.rate_map(state, q))
-            found.append(answer)
+            rates = None if cut else chain.rate_map(state, q)
+            found.append(surface_answer(chain.pin_model, frames, inertias, motion, rates))
         add_pose_answers(found, states, POSE_FUNCTIONS, pose_function)
         return found
 

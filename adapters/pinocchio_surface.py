@@ -78,7 +78,7 @@ def surface_answer(
     frames: Sequence[int],
     bodies: Sequence[pin.Inertia],
     motion: tuple[Float[Array, "nq"], Float[Array, "nv"], Float[Array, "nv"]],
-    rates: Float[Array, "nv nu"],
+    rates: Float[Array, "nv nu"] | None,
 ) -> Found:
     """Evaluate all at one state.
 
@@ -86,15 +86,16 @@ def surface_answer(
         frames: the probe frames by body.
         bodies: inertias of the bodies, in their joints' frames.
         motion: q, v and v̇.
-        rates: takes ν to v.
+        rates: takes ν to v; None of loops, whose parts of bodies are no bodies.
 
     """
     found: Found = defaultdict(dict)
     _add_frames(found, pin_model, frames, motion)
     _add_data(found, pin_model, frames, motion)
-    _add_centres(found, pin_model, frames, motion)
     _add_regressors(found, pin_model, frames, bodies, motion)
-    _add_torques(found, pin_model, motion, rates)
+    _add_centres(found, pin_model, frames, motion, rates is None)
+    if rates is not None:
+        _add_torques(found, pin_model, motion, rates)
     return found
 
 
@@ -284,7 +285,7 @@ def _add_data(found: Found, m: pin.Model, frames: Sequence[int], motion: tuple[A
 
 
 def _add_centres(
-    found: Found, m: pin.Model, frames: Sequence[int], motion: tuple[Array, Array, Array]
+    found: Found, m: pin.Model, frames: Sequence[int], motion: tuple[Array, Array, Array], has_parts: bool
 ) -> None:
     (q, v, a), data, derived = motion, m.createData(), m.createData()
     found["total_mass"]["computeTotalMass",] = np.array([[pin.computeTotalMass(m)]])
@@ -299,7 +300,7 @@ def _add_centres(
     rate = _rate(pin.getCenterOfMassVelocityDerivatives(m, derived), jacobian, v, a)
     found["centre_of_mass_acceleration_by_derivative"]["getCenterOfMassVelocityDerivatives",] = rate[None]
     joints = [m.frames[f].parentJoint for f in frames]
-    if len(set(joints)) == len(joints):  # no joint carries two bodies
+    if not has_parts and len(set(joints)) == len(joints):  # no joint carries two bodies
         _add_subtrees(found, m, joints, motion)
     momenta = {
         ("computeCentroidalMomentum", "Data.hg"): pin.computeCentroidalMomentum(m, data, q, v).vector.copy(),

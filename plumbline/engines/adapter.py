@@ -246,8 +246,6 @@ class Adapter(ABC):
 
         """
         self._check_mechanism(model, self.builds_elements)
-        if model.has_loops:  # there is no truth of it yet
-            return []
         with self._checked_refusals(model):
             answers = self._surface(model, states)
         for answer in answers:

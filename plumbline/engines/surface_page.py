@@ -35,7 +35,8 @@ Wrong so far, each with a script or an entry of the known issues, are
   makes ([script](surface/pinocchio_append_model.py)), and the order of the entries of kinematic Hessians in
   Python ([script](surface/pinocchio_kinematic_hessians.py));
 - Exudyn's tangent operators of SE(3), `TExpSE3` and `TExpSE3Inv`
-  ([script](surface/exudyn_tangent_operators.py)).
+  ([script](surface/exudyn_tangent_operators.py)), and `GetODE2CoordinatesTotal`, which corrupts memory
+  ([script](surface/exudyn_coordinates_total.py)).
 
 Written by `python -m plumbline.engines.surface_page > docs/surface.md`.
 """

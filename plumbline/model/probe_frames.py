@@ -22,7 +22,7 @@ def probe_points(model: Model) -> Float[Array, "bodies 3"]:
         that is from the centre, or as far as the body's radius of gyration where the two coincide.
 
     """
-    near = model.proximal
+    near = model.proximal[: model.n]  # of each body's own joint
     arm = np.linalg.norm(near, axis=-1)
     gyration = np.sqrt(np.linalg.norm(model.inertia, axis=(1, 2)) / model.mass)
     size = np.where(arm > 0, arm / 2, gyration)

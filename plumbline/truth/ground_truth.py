@@ -101,8 +101,7 @@ def state_truth(model: Model, states: Sequence[State]) -> StateTruth:
     bits = max(answer.bits for answer in certified)
     method = f"certified: enclosed in ball arithmetic of {bits} bits"
     quantities = [answer.quantities for answer in certified]
-    count = 0 if model.has_loops else SURFACE_STATES
-    surface = surface_truth(model, states[:count], quantities, bounds)
+    surface = surface_truth(model, states[:SURFACE_STATES], quantities, bounds)
     return StateTruth(list(states), quantities, bounds, method, surface=surface)
 
 

@@ -99,16 +99,21 @@ class Motion:
         points = probe_points(model)
         length = norm(points, axis=-1)
         self.arm = given(rotate_vectors(A, points), self.of_turn * length, length)
-        near = norm(model.proximal, axis=-1)
-        self.near = given(rotate_vectors(A, model.proximal), self.of_turn * near, near)
-        force, moment = quantities.joint_reaction, quantities.joint_moment
-        none = np.zeros((model.n, 3))
-        self.force, self.moment = (
-            given(none if value is None else value, np.asarray(getattr(bound, name)), np.asarray(scale[name]))
-            for name, value in (("joint_reaction", force), ("joint_moment", moment))
-        )
-        assert quantities.mass_matrix is not None  # of mechanisms without loops
-        self.mass_matrix, self.mass_matrix_error = quantities.mass_matrix, bound.mass_matrix
+        proximal = model.proximal[: model.n]
+        near = norm(proximal, axis=-1)
+        self.near = given(rotate_vectors(A, proximal), self.of_turn * near, near)
+        none, names = np.zeros((model.n, 3)), ("joint_reaction", "joint_moment")
+        if quantities.mass_matrix is not None:  # of mechanisms without loops
+            values = (getattr(quantities, name) for name in names)
+            self.force, self.moment = (
+                given(
+                    none if value is None else value,
+                    np.asarray(getattr(bound, name)),
+                    np.asarray(scale[name]),
+                )
+                for name, value in zip(names, values, strict=True)
+            )
+            self.mass_matrix, self.mass_matrix_error = quantities.mass_matrix, bound.mass_matrix
         self.axes = A @ rotation_matrix(PROBE_ATTITUDE)  # of the probe frames
         self.point = self.r.plus(self.arm)
         self.point_velocity = self.v.plus(self.w.cross(self.arm))
@@ -343,6 +348,13 @@ SURFACE_QUANTITIES: Mapping[str, tuple[str, Callable[[Motion], Rounded]]] = {
 }
 
 
+# Of mechanisms without loops: their joints' wrenches, and what is on their rates.
+OF_TREES = (
+    "joint_force_local", "joint_moment_local", "generalized_momentum", "momentum_through_inverse",
+    "generalized_gravity", "inverse_dynamics", "kinetic_energy", "mechanical_energy",
+)  # fmt: skip
+
+
 @dataclass(frozen=True, eq=False)
 class SurfaceTruth:
     """The true values of one quantity at S states, and what an engine may be off by."""
@@ -361,7 +373,7 @@ def surface_truth(
     """Compute all quantities of `SURFACE_QUANTITIES`.
 
     Args:
-        states: S states of a mechanism without loops; without any there is no quantity.
+        states: S states; without any there is no quantity, and of loops none of `OF_TREES`.
         quantities: certified, at these states or more.
         bounds: of an engine's rounding, at the same.
 
@@ -369,6 +381,8 @@ def surface_truth(
     motions = [Motion(model, *one) for one in zip(states, quantities, bounds, strict=False)]
     found = dict[str, SurfaceTruth]()
     for name, (_, formula) in SURFACE_QUANTITIES.items() if motions else ():
+        if model.has_loops and name.startswith(OF_TREES):
+            continue
         results = [formula(motion) for motion in motions]
         parts = ([x.value for x in results], [x.tolerance for x in results], [x.size for x in results])
         found[name] = SurfaceTruth(*map(np.array, parts))

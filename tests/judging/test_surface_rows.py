@@ -14,7 +14,8 @@ from plumbline.judging.state_level import judge_variants
 from plumbline.judging.surface_rows import judge_surface
 from plumbline.model.kinematics import quaternion_product, rotation_matrix
 from plumbline.model.random_mechanisms import random_tree
-from plumbline.model.sampling import random_states
+from plumbline.model.sampling import compared_states, random_states
+from plumbline.scenario.loader import load_scenarios
 from plumbline.studies.exercised_names import exercised_names
 from plumbline.truth.ground_truth import state_truth
 from plumbline.truth.surface_truth import SURFACE_QUANTITIES
@@ -56,6 +57,18 @@ def test_every_call_agrees_and_a_relative_change_of_1e_6_is_seen(engine, tree):
     calls = {name for by_call in answers.values() for call in by_call for name in call}
     evaluation = Evaluation([], None, None, 0.0, surface=answers)
     assert set(exercised_names(truth, evaluation)) == calls
+
+
+@pytest.mark.parametrize("engine", ["pinocchio", "exudyn"])
+def test_bodies_of_a_loop_are_compared_and_a_relative_change_of_1e_6_is_seen(engine):
+    (s,) = load_scenarios(["slider-crank"])
+    states = compared_states(s.model, s.state, s.seed, 2)[:2]
+    truth, answers = state_truth(s.model, states), answers_of(engine, s.model, states)
+    found = verdicts(truth, answers)
+    wrong = {name for name, verdict in found.items() if verdict != Verdict.AGREES}
+    assert len(found) >= 10 and wrong == WRONG.get(engine, set()), found
+    more = {name: {call: x * (1 + 1e-6) for call, x in calls.items()} for name, calls in answers.items()}
+    assert set(verdicts(truth, more).values()) == {Verdict.DISAGREES}
 
 
 @pytest.mark.parametrize(("engine", "count"), [("mujoco", 30), ("pinocchio", 20), ("exudyn", 15)])
