@@ -23,6 +23,7 @@ from plumbline.model.welding import RigidPart
 
 MIN_COS_MIDDLE_ANGLE = 0.03  # of three angles: below, the rates of the others lose digits
 utilities: Any = rigidBodyUtilities  # its functions are untyped
+MANY_BODIES = 10
 TURN_TO_X = np.roll(np.eye(3), 1, axis=1)  # columns z, x, y: its x axis is the z axis of what it is in
 
 
@@ -226,12 +227,13 @@ class Change:
     assemble: Callable[[Any], None] = _assemble
 
     def add_joint(self, mbs: Any, joint: Joint) -> Any:
-        """Add a joint."""
+        """Describe a joint to the engine in this way, or in the usual one."""
         return (self.joints if self.are_meant(joint.kind) else _usual_joint)(mbs, joint)
 
 
 def _is_open(model: Model) -> bool:
-    return not model.has_loops
+    """Whether a mechanism has no loops, and so few bodies that one more dense solve is cheap."""
+    return not model.has_loops and model.n <= MANY_BODIES
 
 
 def _has_no_axes(model: Model) -> bool:
