@@ -46,7 +46,7 @@ class Joint:
     kind: JointKind
     markers: Sequence[Any]
     bodies: Sequence[Any]
-    points: Sequence[Array]  # in the bodies
+    points: Sequence[Float[Array, "3"]]  # m, in the bodies
     turns: Float[Array, "2 3 3"]  # of the joint's axes in the bodies
     place: Float[Array, "3"]  # of the near point, world
     axes: Float[Array, "3 3"]  # of the near body, world
