@@ -275,6 +275,7 @@ PAIRS = [
     (TREE, ("mass", "body 2"), ("damping", "joint 1")),
     (TREE, ("near point x", "joint 2"), ("inertia yy", "body 1")),
     (LOOP, ("mass", "body 1"), ("damping", "joint 2")),
+    (LOOP, ("applied moment x", "body 4"), ("centre of mass y", "body 2")),
 ]
 
 
@@ -291,6 +292,27 @@ def test_two_wrong_numbers_are_separated(pair):
     causes = diagnose(model, answers_of(wrong.model, truth), truth).causes
     named = {(c.term, c.place) for one in causes for c in (one, *one.equal)}
     assert len(causes) == 2 and set(places) <= named, describe(causes)
+
+
+def test_a_factor_is_named_beside_the_number_that_has_the_same_effect():
+    """A hinge shows one moment of inertia alone: the whole inertia may be larger."""
+    model, truth = known(TREE, 5)
+    larger = model.inertia * np.array([1.03, 1.0])[:, None, None]
+    (cause,) = diagnose(model, answers_of(replace(model, inertia=larger), truth), truth).causes
+    assert (cause.term, cause.place) == ("inertia yy", "body 1")
+    assert ("inertia", "body 1", (1.03,)) in [(one.term, one.place, one.amount) for one in cause.equal]
+
+
+def test_an_output_and_a_term_that_is_left_out_are_found_without_a_search(monkeypatch):
+    model, truth = known(LOOP, 5)
+    monkeypatch.setattr("plumbline.diagnosis.fit.number_edits", lambda _: pytest.fail("a search"))
+    parts = PARTS[4][2]
+    reported = []
+    for state, a in zip(truth.states, truth.quantities, strict=True):
+        more = sum(share * carried(model, of(model, state, a)) for of, share in parts)
+        reported.append(determinate(model, state, replace(a, joint_reaction=a.joint_reaction + more)))
+    (cause,) = diagnose(model, reported, truth).causes
+    assert cause.change == PARTS[4][1]
 
 
 @pytest.mark.parametrize("name", [CHAIN, TREE, LOOP])
