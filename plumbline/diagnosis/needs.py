@@ -232,6 +232,10 @@ def _wrong(model: Model, states: list[State], quantities: Collection[str], evalu
     bounds = rounding_bounds(model, states)
     wrong = set()
     for q in quantities:
-        if not error_ratio(values_of(answers, q) - right[q], tolerances(bounds, q)) <= VANISHED:
+        is_given = all(getattr(answer, q) is not None for answer in answers)  # else it shows nothing
+        if (
+            not is_given
+            or not error_ratio(values_of(answers, q) - right[q], tolerances(bounds, q)) <= VANISHED
+        ):
             wrong.add(q)
     return wrong

@@ -21,6 +21,7 @@ from packaging.version import InvalidVersion, Version
 
 from plumbline.engines.declared_names import declared_texts
 from plumbline.engines.environments import declared_attribute
+from plumbline.engines.registry import ENGINES
 from plumbline.measurements.order_and_limit import ORDER_MARGIN
 from plumbline.measurements.relation_result import OPTION_PREFIX, OTHER_FORMULATIONS
 from plumbline.measurements.state_relations import WELDED_HALVES
@@ -156,6 +157,8 @@ def no_script_reason(engine: str, row: dict[str, Any]) -> str:
     """
     relation = row["quantity"]
     other = OTHER_FORMULATIONS.get(relation)
+    if engine not in ENGINES:
+        return f"engine {engine} is not registered here: a script would need its adapter"
     for name in (engine, other or engine):
         if not declared_attribute(name, "reproduction_template"):
             return f"engine {name} has no template of scripts"

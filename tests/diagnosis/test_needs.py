@@ -1,5 +1,6 @@
 """What an unexplained difference needs: planted changes of an engine that are active under conditions."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -106,6 +107,19 @@ def test_a_difference_needs_exactly_the_conditions_under_which_it_is_there(famil
     model, states = mechanism(family, conditions)
     needs = find_needs(model, list(states[:4]), ["acceleration"], wrong_under(conditions))["acceleration"]
     assert sorted(needs) == sorted(conditions)
+
+
+def test_a_quantity_that_a_trial_lacks_shows_nothing():
+    """An engine may offer joint moments of some mechanisms only."""
+    model, states = mechanism("chain", ("gravity",))
+    wrong = wrong_under(("gravity",))
+
+    def evaluate(requested, at):
+        found = wrong(requested, at)
+        return found if np.any(requested.gravity) else [replace(a, acceleration=None) for a in found]
+
+    needs = find_needs(model, list(states[:2]), ["acceleration"], evaluate)["acceleration"]
+    assert "gravity" not in needs
 
 
 @pytest.mark.parametrize(("family", "conditions"), cases(len(PLANTED)))

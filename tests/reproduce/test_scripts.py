@@ -215,6 +215,7 @@ def test_literals_are_exact_and_hostile_names_stay_text(tmp_path):
         ("exudyn", "relations", "as exudyn-tree", "-", ""),
         ("mujoco", "step", "step_rate", "RK4", ""),
         ("exudyn", "step", "step_quadrature", "trapezoidal", "steps with constraints have no script"),
+        ("mine", "state", "acceleration", "-", "engine mine is not registered here"),
     ],
 )
 def test_what_has_no_script_is_explained_in_a_sentence(engine, level, quantity, integrator, words):
