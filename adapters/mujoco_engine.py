@@ -51,8 +51,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
+from operator import attrgetter
 from types import MappingProxyType
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, Self
 
 import mujoco
 import numpy as np
@@ -70,6 +71,7 @@ from adapters.mujoco_variants import (
 )
 from adapters.pose_functions import add_pose_answers
 from plumbline.engines.metamorphic_hooks import MetamorphicHooks
+from plumbline.engines.variants import Variant
 from plumbline.model import kinematics
 from plumbline.model.datatypes import (
     ROD,
@@ -127,6 +129,15 @@ def _euler(implicit_forces: Literal["joint dampers", "applied", "all"]) -> Joint
     return JointSpaceMethod(
         "semi-implicit Euler", "joint rotations", ROD_AXIAL_INERTIA / 3, implicit_forces=implicit_forces
     )
+
+
+def _has(name: str) -> bool:
+    """Whether this version has a name, as "mj_step" or "mjtDisableBit.mjDSBL_SPRING"."""
+    try:
+        attrgetter(name)(mujoco)
+    except AttributeError:
+        return False
+    return True
 
 
 class Mujoco(MetamorphicHooks):
@@ -228,6 +239,12 @@ class Mujoco(MetamorphicHooks):
         settings = {"softness": SOFTNESS, "ratio": RATIO, "iterations": RUN_ITERATIONS, "solref": RUN_SOLREF}
         numbers = {"text": tree.text, "numbers": tree.numbers, "constants": constants}
         return settings | numbers | {"dense": self.option == DENSE, "fields": fields}
+
+    def with_variant(self, variant: Variant) -> Self:
+        """Copy the adapter; an older version of the engine lacks some names of variants."""
+        if missing := [name for name in variant.names if not _has(name)]:
+            raise Unsupported(f"this version of MuJoCo has no {', '.join(missing)}")
+        return super().with_variant(variant)
 
     def is_soft(self, model: Model) -> bool:
         """Whether constraints hold it: loops, options of joints, pitches."""

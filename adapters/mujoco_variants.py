@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 
 from plumbline.engines.variants import Variant, VariantKind
-from plumbline.model.datatypes import Array, Call, Float, Model, Unsupported
+from plumbline.model.datatypes import Array, Call, Float, Model
 from plumbline.model.kinematics import quaternion_conjugate, quaternion_product, rotation_matrix
 
 HINGE_ANGLES = np.array([0.4, -0.7, 1.1])  # rad, about x, y, z in turn: far from singular ones
@@ -143,8 +143,6 @@ def _forward_by(*parts: str) -> Callable[[Any, Any], None]:
     """Evaluate by these functions in turn."""
 
     def forward(m: Any, d: Any) -> None:
-        if missing := [part for part in parts if not hasattr(mujoco, part)]:
-            raise Unsupported(f"this version of MuJoCo has no {', '.join(missing)}")
         for part in parts:
             more = (0, d.qfrc_bias) if part == BIAS else ()
             getattr(mujoco, part)(m, d, *more)

@@ -10,7 +10,7 @@ import pytest
 
 from plumbline.measurements.state_relations import QUANTITIES
 from plumbline.model import kinematics
-from plumbline.model.datatypes import EngineFailure
+from plumbline.model.datatypes import EngineFailure, Unsupported
 from plumbline.model.kinematics import complete_state, rotation_matrix
 from plumbline.model.random_mechanisms import ELEMENTS, random_loop_mechanism, random_tree
 from plumbline.model.sampling import random_states
@@ -207,3 +207,10 @@ def test_tendon_equalities_leave_out_the_terms_of_velocities():
         (found,) = engine.evaluate(model, [state])
         end = found.acceleration[0] + np.cross(A @ found.angular_acceleration[0], arm)
         assert end @ state.u[0] == pytest.approx(left_out - carried, abs=1e-10)
+
+
+def test_the_installed_version_has_the_names_of_all_variants_and_a_name_that_it_lacks_is_refused():
+    for variant in Mujoco.variants:
+        assert Mujoco().with_variant(variant).variant is variant
+    with pytest.raises(Unsupported, match=r"no mj_nothing, mjtSolver\.mjSOL_NONE$"):
+        Mujoco().with_variant(replace(Mujoco.variants[0], names=("mj_nothing", "mjtSolver.mjSOL_NONE")))
