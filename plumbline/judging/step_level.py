@@ -41,7 +41,7 @@ NO_COORDINATES = (
 TOTALS = ("run_energy", "run_momentum", "run_equations")  # of the whole mechanism
 DECISIVE = {"run_velocity", "run_rate"}  # rows
 # rad, coarsest step × fastest rate up to which limits may be known to rounding: measured, docs/coverage.md
-MAX_RESOLVED_TURN = 1 / 20
+MAX_RESOLVED_TURN = 1 / 14
 DECIDED, UNDECIDED = (
     {Verdict.AGREES, Verdict.DISAGREES},
     {Verdict.UNRESOLVED, Verdict.FAILED, Verdict.HARNESS_FAILED},

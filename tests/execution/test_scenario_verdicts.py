@@ -172,9 +172,9 @@ def steps_of(bench, engine, integrator):
     return task
 
 
-def two_of_a_family(has_all_studies, name="tumbling-rod"):
+def two_of_a_family(has_all_studies, name="double-tumbling-rods", plainer="double-loaded-balls"):
     """A scenario whose family has a plainer one in the same run."""
-    chosen, other = loader.load_scenarios([name, "drag-rod"])
+    chosen, other = loader.load_scenarios([name, plainer])
     plan = Plan([chosen, other], ["mujoco"], random_state_count=1, has_all_studies=has_all_studies)
     return plan, chosen
 
@@ -182,7 +182,7 @@ def two_of_a_family(has_all_studies, name="tumbling-rod"):
 @pytest.mark.parametrize("is_truth_first", [True, False])
 def test_a_study_of_low_order_is_left_to_the_night_where_steps_decide(engines, is_truth_first):
     plan, chosen = two_of_a_family(has_all_studies=False)
-    assert plan.studied == {"single": "drag-rod"}
+    assert plan.studied == {"double": "double-loaded-balls"}
     bench = ScenarioRun(plan, chosen, {"mujoco": engines["mujoco"]})
     truth = next(x for x in bench.tasks() if x.key.kind == TaskKind.MOTION_TRUTH)
     euler, rk4 = (outcome_of(steps_of(bench, "mujoco", name)) for name in ("Euler", "RK4"))
@@ -191,12 +191,14 @@ def test_a_study_of_low_order_is_left_to_the_night_where_steps_decide(engines, i
         studies += [x.key.integrator for x in bench.on_outcome(outcome) if x.key.kind == TaskKind.TRAJECTORY]
     assert studies == ["RK4"] and bench.left_to_the_night == 1
     (row,) = [r for r in bench.findings().rows if (r.level, r.integrator) == ("trajectory", "Euler")]
-    assert row.verdict == "information" and "of this family the study of drag-rod runs" in row.reason
+    assert (
+        row.verdict == "information" and "of this family the study of double-loaded-balls runs" in row.reason
+    )
 
 
 def test_a_study_of_low_order_runs_where_its_limit_is_known_to_rounding(engines):
-    """A slow motion: tumbling-ball turns by 0.02 rad in the study's coarsest step, tumbling-rod by 0.07."""
-    plan, chosen = two_of_a_family(False, "tumbling-ball")
+    """A slow motion: tumbling-ball turns by 0.02 rad in the study's coarsest step, two rods by 0.08."""
+    plan, chosen = two_of_a_family(False, "tumbling-ball", "drag-rod")
     bench = ScenarioRun(plan, chosen, {"mujoco": engines["mujoco"]})
     truth = next(x for x in bench.tasks() if x.key.kind == TaskKind.MOTION_TRUTH)
     bench.on_outcome(outcome_of(truth))
