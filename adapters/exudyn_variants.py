@@ -24,6 +24,7 @@ from plumbline.model.welding import RigidPart
 MIN_COS_MIDDLE_ANGLE = 0.03  # of three angles: below, the rates of the others lose digits
 utilities: Any = rigidBodyUtilities  # its functions are untyped
 MANY_BODIES = 10
+MAX_ATTITUDE_ERROR = 1e-14  # of entries of rotation matrices that the engine has converted
 TURN_TO_X = np.roll(np.eye(3), 1, axis=1)  # columns z, x, y: its x axis is the z axis of what it is in
 
 
@@ -103,7 +104,11 @@ def _by_helper(add: Callable[..., Any], place: str, velocity: str, turn: str, sp
         given = {place: piece.place, velocity: piece.velocity, turn: A, spin: A @ piece.spin}
         made = add(mbs, inertia=inertia, gravity=piece.gravity.tolist(), **given)
         body = made[1] if isinstance(made, list | tuple) else made
-        return mbs.GetObject(body)["nodeNumber"], body
+        node = mbs.GetObject(body)["nodeNumber"]
+        own = rotation_matrix(np.array(mbs.GetNode(node)["referenceCoordinates"][3:]))
+        if np.max(np.abs(own - A)) > MAX_ATTITUDE_ERROR:
+            raise Unsupported("RotationMatrix2EulerParameters of Exudyn loses digits at an attitude")
+        return node, body
 
     return add_body
 
