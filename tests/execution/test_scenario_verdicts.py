@@ -218,7 +218,7 @@ def test_a_study_of_low_order_runs_where_steps_do_not_decide(engines):
 
 
 def test_every_study_runs_at_night_and_on_the_plainest_scenario(engines):
-    for has_all_studies, name in ((True, "tumbling-rod"), (False, "drag-rod")):
+    for has_all_studies, name in ((True, "double-tumbling-rods"), (False, "double-loaded-balls")):
         plan, _ = two_of_a_family(has_all_studies)
         (chosen,) = [s for s in plan.scenarios if s.name == name]
         bench = ScenarioRun(plan, chosen, {"mujoco": engines["mujoco"]})
