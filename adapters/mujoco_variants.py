@@ -17,6 +17,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from adapters.pose_functions import xyz_angles
 from plumbline.engines.variants import Variant, VariantKind
 from plumbline.model.datatypes import Array, Call, Float, Model
 from plumbline.model.kinematics import quaternion_conjugate, quaternion_product, rotation_matrix
@@ -288,13 +289,8 @@ def _oriented(kind: str, field: str, convert: Callable[[Array], Array]) -> Calla
     return describe
 
 
-def euler_angles(q: Float[Array, "4"]) -> Float[Array, "3"]:
-    """Angles about x, y, z in turn, intrinsic; the first may be any at quarter turns about y, and is kept."""
-    R = rotation_matrix(q / np.linalg.norm(q))
-    first = np.arctan2(-R[1, 2], R[2, 2])
-    c, s = np.cos(first), np.sin(first)
-    rest = np.array([[1, 0, 0], [0, c, s], [0, -s, c]]) @ R  # the turns about y and z
-    return np.array([first, np.arctan2(rest[0, 2], rest[2, 2]), np.arctan2(rest[1, 0], rest[1, 1])])
+def _euler_angles(q: Float[Array, "4"]) -> Float[Array, "3"]:
+    return xyz_angles(rotation_matrix(q / np.linalg.norm(q)))
 
 
 def _axis_angle(q: Float[Array, "4"]) -> Float[Array, "4"]:
@@ -377,7 +373,7 @@ VARIANTS = (
     _free(
         "spelling",
         ("mjtOrientation.mjORIENTATION_EULER", "MjsOrientation"),
-        describe=_oriented("EULER", "euler", euler_angles),
+        describe=_oriented("EULER", "euler", _euler_angles),
     ),
     _free(
         "spelling",

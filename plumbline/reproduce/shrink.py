@@ -95,10 +95,14 @@ class _Search(Generic[M]):
     best: M | None = None
     is_late: bool = False  # whether a candidate was skipped for want of time; the first state never is
     measured: dict[tuple[object, ...], M | None] = field(default_factory=dict)
+    # that were the best: a change that rounding undoes leads back to one, and the search would not end
+    accepted: set[tuple[object, ...]] = field(default_factory=set)
 
     def accepts(self, case: ReproductionCase) -> bool:
-        """Measure a case; where it shows enough, it becomes the best."""
+        """Measure a case; where it shows enough, it becomes the best, once."""
         content = case.content
+        if content in self.accepted:
+            return False
         if content not in self.measured:
             if self.clock() > self.deadline and (self.best is not None or case.steps):
                 self.is_late = True
@@ -108,6 +112,7 @@ class _Search(Generic[M]):
         if found is None or found.ratio <= 1 or found.ratio < self.required_ratio:
             return False
         self.case, self.best = case, found
+        self.accepted.add(content)
         return True
 
 
