@@ -307,3 +307,25 @@ def test_welded_parts_widen_the_bounds_of_every_mechanism():
         for quantity in plain.scale:
             assert np.all(welded.tolerance(quantity) >= plain.tolerance(quantity)), quantity
         assert np.all(welded.acceleration > plain.acceleration)
+
+
+def test_a_joint_moment_that_is_zero_has_a_scale():
+    """A ball on a hinge through its centre turns for ever: the moment is J ω × ω = 0, and is compared with J ω²."""
+    model = scenario_from_dict(
+        {
+            "schema_version": 1, "family": "joint", "title": "A propeller", "purpose": "Balance.",
+            "gravity": [0, 0, -9.81],
+            "bodies": [
+                {
+                    "name": "ball", "mass": 1.0, "inertia": {"principal": [0.02, 0.02, 0.02]},
+                    "parent": "world", "proximal": [0, 0, 0],
+                    "joint": {"kind": "hinge", "axis": [0, 0, 1], "coordinates": [0.3], "rates": [2.0]},
+                }
+            ],
+        },
+        "propeller",
+    )  # fmt: skip
+    bound = state_rounding_bound(model.model, model.state)
+    assert np.all(certify_state(model.model, model.state).quantities.joint_moment == 0)
+    assert bound.relative_bound("joint_moment") <= MAX_RELATIVE_BOUND
+    assert np.all(bound.scale["joint_moment"] > 0)
