@@ -310,7 +310,7 @@ def test_welded_parts_widen_the_bounds_of_every_mechanism():
 
 
 def test_a_joint_moment_that_is_zero_has_a_scale():
-    """A ball on a hinge through its centre turns for ever: the moment is J ω × ω = 0, and is compared with J ω²."""
+    """A ball that turns on a hinge through its centre: the moment, J ω × ω = 0, is compared with J ω²."""
     model = scenario_from_dict(
         {
             "schema_version": 1, "family": "joint", "title": "A propeller", "purpose": "Balance.",
