@@ -162,7 +162,7 @@ class Explanation:
         return tuple(found)
 
     def mechanism(self, right: Case) -> object:
-        """What tells the mechanism with these edits from others; of linear terms the explanation itself."""
+        """Return a key that is equal for explanations by the same mechanism; linear terms describe none."""
         case = right
         for one, x in _split(self.combination, self.amounts):
             if one.change is None:

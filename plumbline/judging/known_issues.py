@@ -3,11 +3,12 @@
 An entry of known_issues.yaml records a finding: engine, cause or needs, version range, evidence and reason,
 and the rows that it covers, with their largest ratio of error and tolerance.  Rows of states and steps are
 matched by the cause that the diagnosis names, or, where a mechanism is recorded, as far as the run can check
-it.  Rows of motions follow from those: where states of the same mechanism are compared and none shows the
-finding, their entry does not cover them.  All are matched by what the mechanism has: so many bodies, a kind
-of joint.  A scenario's name is for what nothing else explains.  What exceeds the entry is a new disagreement.
-Of a missing term the effect is computed; the entry covers that, and nothing that is left above the tolerance.
-An entry that matches cells of the run but none of their verdicts is stale and fails the run.
+it.  Rows of the surface and of motions follow from those: where states of the same mechanism are compared
+and none shows the finding, their entry does not cover them.  All are matched by what the mechanism has: so
+many bodies, a kind of joint.  A scenario's name is for what nothing else explains.  What exceeds the entry
+is a new disagreement.  Of a missing term the effect is computed; the entry covers that, and nothing that is
+left above the tolerance.  An entry that matches cells of the run but none of their verdicts is stale and
+fails the run.
 """
 
 from __future__ import annotations

@@ -41,8 +41,8 @@ def upgrade_document(document: Record) -> Record:
     Returns:
         The document with the present names.  In version 1 the ratio of a row was in its ``extra``, or
         followed from its value and tolerance; before version 3 causes were sentences only, before 4 nothing
-        was grouped by cause, before 5 chains had fields of their own, and before 6 no field
-        said that a gap is declared or a motion proved, only the first words of a text.
+        was grouped by cause, before 5 chains had fields of their own, and before 6 only the
+        first words of a text told whether a gap is declared and a motion proved.
 
     """
     if document["schema_version"] == 1:

@@ -538,11 +538,14 @@ def test_an_entry_of_what_no_cause_explains_is_matched_by_needs(tmp_path):
         ([], True),  # as far as the run compares states
     ],
 )
-def test_a_row_of_a_motion_follows_from_the_states_that_show_the_finding(tmp_path, states, is_known):
-    rows = [{"level": "state", "max_ratio": 30}, {"level": "trajectory", "max_ratio": 30}]
+@pytest.mark.parametrize(
+    ("level", "quantity"), [("trajectory", "position_limit"), ("surface", "mass_matrix_by_spelling")]
+)
+def test_a_row_follows_from_the_states_that_show_the_finding(tmp_path, level, quantity, states, is_known):
+    rows = [{"level": "state", "max_ratio": 30}, {"level": level, "max_ratio": 30}]
     changes = {"scenario": "*", "verdict": "disagrees", "cause": CAUSE, "rows": rows}
-    motion = ratio_row(10.0, "trajectory", "position_limit")
-    found, *_ = judged_by([motion, *states], loaded(tmp_path, changes), whole=True).rows
+    following = ratio_row(10.0, level, quantity)
+    found, *_ = judged_by([following, *states], loaded(tmp_path, changes), whole=True).rows
     assert (found.known_issue == "a") is is_known, found.reason
     assert is_known or "records what states show" in found.reason
 

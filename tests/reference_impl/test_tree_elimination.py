@@ -10,7 +10,7 @@ from plumbline.model.kinematics import quaternion_rate
 from plumbline.model.random_mechanisms import ELEMENTS, random_tree
 from plumbline.model.sampling import random_states
 from plumbline.scenario.loader import find_scenario_file, load_scenario
-from plumbline.truth.rounding_bound import state_rounding_bound
+from plumbline.truth.rounding_bound import EPS, state_rounding_bound
 from reference_impl.direct import DirectSystem
 from reference_impl.euler_parameters import L, dot
 from reference_impl.fast.chain_elimination import StructuredSystem, component_first
@@ -131,14 +131,15 @@ def test_chains_from_any_point_move_as_trees_do(joints):
     moved = chain.changed(point=point)
     parts, own = off_manifold(moved, 1, 1e-3), eliminated_system([moved])
     assert isinstance(own, StructuredSystem)
+    # both are some hundred roundings; they differ by 5e-15 of the accelerations and 4e-16 in projections
     np.testing.assert_allclose(
-        accelerations(own, parts), accelerations(TreeSystem([moved]), parts), rtol=1e-9
+        accelerations(own, parts), accelerations(TreeSystem([moved]), parts), rtol=256 * EPS
     )
     r, p, v, pdot = off_manifold(moved, 1, 0.0)
     on = component_first(r, p), component_first(v, pdot)
     assert np.max(np.abs(own.constraints(*on)[0])) < 1e-14
     off = on[0] + 1e-3, on[1]
-    np.testing.assert_allclose(own.project(*off), TreeSystem([moved]).project(*off), atol=1e-9)
+    np.testing.assert_allclose(own.project(*off), TreeSystem([moved]).project(*off), rtol=0, atol=64 * EPS)
 
 
 def test_chains_keep_their_own_form():

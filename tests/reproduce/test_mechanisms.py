@@ -18,6 +18,7 @@ from plumbline.reproduce.measure import ConvergenceMeasure, Disagreement, StateM
 from plumbline.reproduce.render import render_script
 from plumbline.reproduce.shrink import ReproductionCase
 from plumbline.reproduce.write import make_script
+from plumbline.truth.rounding_bound import EPS
 from tests.helpers.catalogue import catalogue_scenarios
 from tests.helpers.reproduction import (
     DRIFTS,
@@ -190,7 +191,10 @@ def test_a_script_measures_drifts_as_the_harness_does(scenario):
     analysis = RefinementAnalysis(
         RowContext("", "", "", "", ""), case.model, truth, measure.integrator, runs, 1.0
     )
-    for quantity in {"joint_gap", "gap_rate", "norm_drift"} & {*evidence.drifts}:
+    compared = {"joint_gap", "gap_rate", "norm_drift"}
+    assert compared <= {*evidence.drifts}
+    for quantity in compared:
         harness = getattr(analysis.invariant_drifts[-1], quantity)[-1]
         own = names[quantity](*names["runs"][-1])
-        np.testing.assert_allclose(own, harness, rtol=1e-6, atol=1e-13)
+        # differences of positions and velocities of about 1 m and 1 m/s, rounded some times
+        np.testing.assert_allclose(own, harness, rtol=0, atol=64 * EPS)
