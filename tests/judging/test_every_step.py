@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from functools import cache
 from unittest.mock import patch
@@ -21,6 +20,7 @@ from plumbline.truth import step_formulas
 from plumbline.truth.step_comparison import RUN_QUANTITIES
 from tests.helpers.catalogue import catalogue_scenarios
 from tests.helpers.nightly_tests import SLOW, some_fast
+from tests.helpers.pinocchio_by_crba import steps_by_crba
 from tests.helpers.planted_runs import RUN_MISTAKES
 from tests.helpers.planting import planted
 
@@ -198,8 +198,6 @@ def test_no_false_alarm_on_random_mechanisms(seed):
         for integrator in [i for i in adapter.integrators if i.method is not None]:
             found = alarms(adapter, integrator, model, state)
             if found and engine == "pinocchio":
-                own = sys.modules[type(adapter).__module__]
-                chain = own.PinocchioChain
-                with patch.object(own, "PinocchioChain", lambda model, _: chain(model, "crba")):  # noqa: B023
+                with steps_by_crba(adapter):
                     found = alarms(adapter, integrator, model, state)
             assert not found, (seed, engine, integrator.name, found)
