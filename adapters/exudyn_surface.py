@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from importlib import import_module
 from typing import Any, NamedTuple
 
@@ -15,6 +16,7 @@ import exudyn
 import numpy as np
 
 from adapters.exudyn_common import Output, items
+from plumbline.engines.missing_names import add_parts
 from plumbline.model.datatypes import Array, Call, Model
 from plumbline.model.kinematics import rotation_matrix
 from plumbline.model.probe_frames import PROBE_ATTITUDE, probe_points
@@ -219,9 +221,7 @@ class Probes:
         ]  # fmt: skip
         for quantity, name, call, values in read:
             found[quantity][*call, f"OutputVariableType.{name}"] = OUTPUTS[name].read(np.array(values))
-        for name, quantity in OF_COORDINATES.items():
-            values = [mbs.GetNodeOutput(node, getattr(Output, name))[:3] for node in self.nodes]
-            found[quantity]["MainSystem.GetNodeOutput", f"OutputVariableType.{name}"] = np.array(values)
+        add_parts(found, *(partial(self._add_coordinates, found, *one) for one in OF_COORDINATES.items()))
         for kind, markers in self.markers_of_centres.items():
             for name in ("Position", "Velocity"):
                 values = [mbs.GetMarkerOutput(marker, getattr(Output, name)) for marker in markers]
@@ -234,3 +234,7 @@ class Probes:
             own = np.array([total[getattr(data, f"Get{kind}LTGODE2")(item)][:3] for item in numbers])
             found["body_position"][f"SystemData.Get{kind}LTGODE2",] = own
         return found
+
+    def _add_coordinates(self, found: dict[str, dict[Call, Array]], name: str, quantity: str) -> None:
+        values = [self.mbs.GetNodeOutput(node, getattr(Output, name))[:3] for node in self.nodes]
+        found[quantity]["MainSystem.GetNodeOutput", f"OutputVariableType.{name}"] = np.array(values)

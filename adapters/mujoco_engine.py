@@ -51,9 +51,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
-from operator import attrgetter
 from types import MappingProxyType
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal
 
 import mujoco
 import numpy as np
@@ -71,7 +70,6 @@ from adapters.mujoco_variants import (
 )
 from adapters.pose_functions import add_pose_answers
 from plumbline.engines.metamorphic_hooks import MetamorphicHooks
-from plumbline.engines.variants import Variant
 from plumbline.model import kinematics
 from plumbline.model.datatypes import (
     ROD,
@@ -118,6 +116,7 @@ SEQUENCES = (1.0, 1.3, 1.7, 1.15, 1.5)  # of them: factors of the largest; three
 LARGEST_RUN_REGULARISATION, RUN_REGULARISATIONS = 2.7e-4, 3
 RUN_SOLREF = -(STABILISATION**2), -2 * STABILISATION  # of welds
 RUN_ITERATIONS = 3  # of Newton's method on welds, a linear problem: the second and third remove rounding
+NO_SAME_FRAME = 0  # mjSAMEFRAME_NONE; the first versions have no enumeration
 MAX_ORDER_ERROR = 0.1
 MIN_SOFTNESS = 1e-9  # a smaller relative effect of R is rounding
 MAX_NOISE = 1e-11  # relative, of differences that grow as R falls: more is too much to extrapolate
@@ -129,15 +128,6 @@ def _euler(implicit_forces: Literal["joint dampers", "applied", "all"]) -> Joint
     return JointSpaceMethod(
         "semi-implicit Euler", "joint rotations", ROD_AXIAL_INERTIA / 3, implicit_forces=implicit_forces
     )
-
-
-def _has(name: str) -> bool:
-    """Whether this version has a name, as "mj_step" or "mjtDisableBit.mjDSBL_SPRING"."""
-    try:
-        attrgetter(name)(mujoco)
-    except AttributeError:
-        return False
-    return True
 
 
 class Mujoco(MetamorphicHooks):
@@ -239,12 +229,6 @@ class Mujoco(MetamorphicHooks):
         settings = {"softness": SOFTNESS, "ratio": RATIO, "iterations": RUN_ITERATIONS, "solref": RUN_SOLREF}
         numbers = {"text": tree.text, "numbers": tree.numbers, "constants": constants}
         return settings | numbers | {"dense": self.option == DENSE, "fields": fields}
-
-    def with_variant(self, variant: Variant) -> Self:
-        """Copy the adapter; an older version of the engine lacks some names of variants."""
-        if missing := [name for name in variant.names if not _has(name)]:
-            raise Unsupported(f"this version of MuJoCo has no {', '.join(missing)}")
-        return super().with_variant(variant)
 
     def is_soft(self, model: Model) -> bool:
         """Whether constraints hold it: loops, options of joints, pitches."""
@@ -406,7 +390,7 @@ class _MujocoChain:
         d = mujoco.MjData(m)
         mujoco.mj_setConst(m, d)
         # The compiler takes axes of inertia that are turned by less than 1e-6 rad as those of the body.
-        m.body_sameframe[~given] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+        m.body_sameframe[~given] = NO_SAME_FRAME
         ties = constraints.ties
         m.tendon_length0[m.ntendon - len(ties) :] = [tie.length for tie in ties]
         # MuJoCo's own are of the reference pose, where free bodies are in one place

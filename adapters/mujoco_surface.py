@@ -14,6 +14,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from plumbline.engines.missing_names import add_parts
 from plumbline.model.datatypes import Array, Call, Float, Model
 from plumbline.model.kinematics import rotation_matrix
 from plumbline.model.probe_frames import PROBE_ATTITUDE, probe_points
@@ -114,10 +115,13 @@ def surface_answer(
     """
     found: Found = defaultdict(dict)
     sites = [m.site(f"probe {k}").id for k in range(len(links))]
-    _add_sensors(found, m, d, len(links), elastic)
-    _add_frames(found, m, d, links, sites)
-    _add_momenta(found, m, d, links)
-    _add_torques(found, m, d, rates)
+    add_parts(
+        found,
+        lambda: _add_sensors(found, m, d, len(links), elastic),
+        lambda: _add_frames(found, m, d, links, sites),
+        lambda: _add_momenta(found, m, d, links),
+        lambda: _add_torques(found, m, d, rates),
+    )
     return found
 
 

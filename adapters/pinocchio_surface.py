@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 
+from plumbline.engines.missing_names import add_parts
 from plumbline.model.datatypes import Array, Call, Float, Model
 from plumbline.model.kinematics import rotation_matrix
 from plumbline.model.probe_frames import PROBE_ATTITUDE, probe_points
@@ -90,12 +91,19 @@ def surface_answer(
 
     """
     found: Found = defaultdict(dict)
-    _add_frames(found, pin_model, frames, motion)
-    _add_data(found, pin_model, frames, motion)
-    _add_regressors(found, pin_model, frames, bodies, motion)
-    _add_centres(found, pin_model, frames, motion, rates is None)
+    add_parts(
+        found,
+        lambda: _add_frames(found, pin_model, frames, motion),
+        lambda: _add_data(found, pin_model, frames, motion),
+        lambda: _add_regressors(found, pin_model, frames, bodies, motion),
+        lambda: _add_centres(found, pin_model, frames, motion, rates is None),
+    )
     if rates is not None:
-        _add_torques(found, pin_model, motion, rates)
+        add_parts(
+            found,
+            lambda: _add_torques(found, pin_model, motion, rates),
+            lambda: _add_batch(found, pin_model, motion, rates),
+        )
     return found
 
 
@@ -416,7 +424,7 @@ def _add_torques(found: Found, m: pin.Model, motion: tuple[Array, Array, Array],
     parameters = np.concatenate([inertia.toDynamicParameters() for inertia in m.inertias[1:]])
     rest = pin.rnea(m, data, q, zero, a)  # without the terms of velocities
     coriolis = _product(pin.computeCoriolisMatrix(m, data, q, v), v) + rest
-    derived, pool, columns = m.createData(), pin.ModelPool(m, 1), (x[:, None] for x in motion)
+    derived = m.createData()
     _, of_v, of_a = pin.computeRNEADerivatives(m, derived, q, v, a)
     by_regressor = _product(pin.computeJointTorqueRegressor(m, data, q, v, a), parameters)
     dynamics = {  # with the rotors
@@ -424,7 +432,6 @@ def _add_torques(found: Found, m: pin.Model, motion: tuple[Array, Array, Array],
         ("nonLinearEffects",): pin.nonLinearEffects(m, data, q, v) + M @ a,
         ("nle", "Data.nle"): pin.nle(m, data, q, v) + M @ a,
         ("computeAllTerms", "Data.nle"): terms.nle + M @ a,
-        ("rneaInParallel", "ModelPool"): np.ravel(pin.rneaInParallel(1, pool, *columns)),
         ("computeJointTorqueRegressor", "Data.jointTorqueRegressor"): by_regressor + rotors,
     }
     derivative = _rate(of_v, of_a, v / 2, a) + gravity["computeGeneralizedGravity", "Data.g"]
@@ -439,6 +446,13 @@ def _add_torques(found: Found, m: pin.Model, motion: tuple[Array, Array, Array],
     ):
         own = {call: value - rotors for call, value in values.items()}
         found[f"inverse_dynamics{by}"] |= _on_rates(own, rates)
+
+
+def _add_batch(found: Found, m: pin.Model, motion: tuple[Array, Array, Array], rates: Array) -> None:
+    """Add what batched calls return, which the wheels of some versions lack."""
+    tau = np.ravel(pin.rneaInParallel(1, pin.ModelPool(m, 1), *(x[:, None] for x in motion)))
+    own: dict[Call, Array] = {("rneaInParallel", "ModelPool"): tau - m.armature * motion[2]}
+    found["inverse_dynamics"] |= _on_rates(own, rates)
 
 
 def _on_rates(forces: dict[Call, Array], rates: Array) -> dict[Call, Array]:

@@ -27,11 +27,12 @@ quotes, are given as they stand.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 
+from plumbline.engines.missing_names import add_parts
 from plumbline.model.datatypes import Array, Call, Float, State
 from plumbline.model.kinematics import (
     angular_velocity,
@@ -266,26 +267,29 @@ def add_pose_answers(
 
     """
     for answer, state in zip(answers, states[:POSE_STATES], strict=False):
-        for (quantity, name), vectors in _pose_answers(table, call, state).items():
-            answer.setdefault(quantity, {})[name,] = np.concatenate([np.atleast_2d(one) for one in vectors])
+        turns = rotation_matrix(state.p)
+        bodies = [_Body(state, k, turns[k] @ state.omega[k]) for k in range(len(state.p))]
+        add_parts(answer, *(partial(_add_pose_answer, answer, one, call, bodies) for one in table.items()))
 
 
-def _pose_answers(
-    table: Mapping[str, str], call: Callable[[str, Sequence[Any], Sequence[str]], Sequence[Any]], state: State
-) -> dict[tuple[str, str], list[Array]]:
-    rows: dict[tuple[str, str], list[Array]] = {}
-    turns = rotation_matrix(state.p)
-    for k in range(len(state.p)):
-        body = _Body(state, k, turns[k] @ state.omega[k])
-        for name, text in table.items():
-            given, _, returned = text.partition(" -> ")
-            forms = returned.split()
-            arguments = [body.given(one) for one in given.split()]
-            results = call(name, arguments, forms)
-            if forms[0].startswith("@"):
-                rate = body.given(forms.pop(0)[1:])
-                results = [np.reshape(results[0], (-1, len(rate))) @ rate]
-            for form, value in zip(forms, results, strict=True):
-                for quantity, vector in body.read(form, np.asarray(value, float)).items():
-                    rows.setdefault((quantity, name), []).append(vector)
-    return rows
+def _add_pose_answer(
+    answer: dict[str, dict[Call, Array]],
+    function: tuple[str, str],
+    call: Callable[[str, Sequence[Any], Sequence[str]], Sequence[Any]],
+    bodies: Sequence[_Body],
+) -> None:
+    """Call a function, whose name and forms are given, on all bodies."""
+    rows: dict[str, list[Array]] = {}
+    name, text = function
+    given, _, returned = text.partition(" -> ")
+    for body in bodies:
+        forms = returned.split()
+        results = call(name, [body.given(one) for one in given.split()], forms)
+        if forms[0].startswith("@"):
+            rate = body.given(forms.pop(0)[1:])
+            results = [np.reshape(results[0], (-1, len(rate))) @ rate]
+        for form, value in zip(forms, results, strict=True):
+            for quantity, vector in body.read(form, np.asarray(value, float)).items():
+                rows.setdefault(quantity, []).append(np.atleast_2d(vector))
+    for quantity, vectors in rows.items():
+        answer.setdefault(quantity, {})[name,] = np.concatenate(vectors)

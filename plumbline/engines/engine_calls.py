@@ -16,7 +16,8 @@ from io import StringIO
 import numpy as np
 
 from plumbline.engines.adapter import Adapter, EngineInfo
-from plumbline.engines.environments import BASE_REQUIREMENTS, declared_attribute
+from plumbline.engines.environments import declared_attribute
+from plumbline.engines.missing_names import MISSING_NAMES, OWN_PACKAGES, missing_name
 from plumbline.engines.registry import load_adapter
 from plumbline.engines.variants import NoAnswer, VariantKind
 from plumbline.model.datatypes import (
@@ -34,9 +35,8 @@ from plumbline.model.datatypes import (
 )
 from plumbline.processes.exceptions import describe_exception
 
+BESIDES = ("surface", "variants")  # what an engine is asked for after the state quantities
 SURFACE_STATES = 8  # of a scenario, at which what engines report besides the state quantities is compared
-# What every environment has: where one of these is missing, the checkout or the environment is broken.
-_OWN_PACKAGES = {"plumbline", "adapters", "reference_impl", *BASE_REQUIREMENTS, ""}
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +128,7 @@ def describe_missing(name: str, error: ModuleNotFoundError | AttributeError, sub
 
     """
     if isinstance(error, ModuleNotFoundError):
-        if (error.name or "").partition(".")[0] in _OWN_PACKAGES:
+        if (error.name or "").partition(".")[0] in OWN_PACKAGES:
             raise error
         return EngineInfo(name, name, "", (), f"{name} is not installed here: {error}")
     package = declared_attribute(name, "package")
@@ -138,8 +138,13 @@ def describe_missing(name: str, error: ModuleNotFoundError | AttributeError, sub
     return EngineInfo(name, name, version, (), f"the {subject} cannot use version {version}: {error}")
 
 
-def evaluate_states(engine: str, model: Model, states: Sequence[State]) -> Evaluation:
+def evaluate_states(
+    engine: str, model: Model, states: Sequence[State], besides: Sequence[str] = BESIDES
+) -> Evaluation:
     """Evaluate the state quantities of one engine; what the engine raises becomes a reason.
+
+    Args:
+        besides: which of `BESIDES` to ask for, too.
 
     Returns:
         The quantities at each state, or the reason why there are none.
@@ -166,7 +171,7 @@ def evaluate_states(engine: str, model: Model, states: Sequence[State]) -> Evalu
         failure = describe_exception(error)
     surface, surface_failure = dict[str, dict[Call, Array]](), ""
     variants: dict[VariantKind, dict[Call, list[StateQuantities] | NoAnswer]] = {}
-    if quantities and not failure:
+    if quantities and not failure and "surface" in besides:
         try:
             surface = stack_answers(adapter.surface(model, states[:SURFACE_STATES]))
         except Unsupported:
@@ -174,10 +179,14 @@ def evaluate_states(engine: str, model: Model, states: Sequence[State]) -> Evalu
         except MemoryError:
             raise
         except Exception as error:  # as above
-            surface_failure = describe_exception(error)
+            if lacking := missing_name(error):
+                surface = {MISSING_NAMES: {(lacking,): np.zeros((1, 1, 1))}}
+            else:
+                surface_failure = describe_exception(error)
+    if quantities and not failure and "variants" in besides:
         variants = evaluate_variants(adapter, model, states[:SURFACE_STATES])
-    cpu_time, besides = time.process_time() - begin, (surface, surface_failure, variants)
-    return Evaluation(quantities, unsupported, failure, cpu_time, gap, declared, *besides)
+    cpu_time, more = time.process_time() - begin, (surface, surface_failure, variants)
+    return Evaluation(quantities, unsupported, failure, cpu_time, gap, declared, *more)
 
 
 def evaluate_variants(
@@ -201,7 +210,9 @@ def evaluate_variants(
         except MemoryError:
             raise
         except Exception as error:  # as above
-            by_names[variant.names] = NoAnswer(describe_exception(error), is_refusal=False)
+            name = missing_name(error)
+            message = describe_exception(error) if name is None else f"this version has no {name}"
+            by_names[variant.names] = NoAnswer(message, is_refusal=name is not None)
     return found
 
 

@@ -12,7 +12,9 @@ import numpy as np
 from plumbline.diagnosis.cause import Cause, Diagnosis
 from plumbline.engines import engine_calls, environments
 from plumbline.engines.adapter import EngineInfo
+from plumbline.engines.engine_calls import BESIDES
 from plumbline.engines.specifications import task_engine
+from plumbline.engines.surface import SURFACES
 from plumbline.execution.plan import (
     STATES_PER_RANDOM_SCENARIO,
     LevelSelection,
@@ -138,6 +140,7 @@ class ScenarioRun:
         self._pending = set(self._keys)  # without an outcome
         self._findings: dict[TaskKey, JudgingResult] = {}
         self._has_retried_truth = False
+        self._failures_besides = dict[TaskKey, list[str]]()  # how the workers of states ended
         self.left_to_the_night = 0  # number of tasks
         self._packed_truths: dict[TaskKind, Packed] = {}  # for judges and diagnoses in workers
 
@@ -260,6 +263,12 @@ class ScenarioRun:
         if outcome.failure and key.kind == TaskKind.MOTION_TRUTH and not self._has_retried_truth:
             self._has_retried_truth = True  # the worker may have crashed in compiled code
             return [self.truth_task(key, 0)]
+        has_besides = key.kind == TaskKind.STATE and environments.split_version(key.engine)[0] in SURFACES
+        failures = self._failures_besides.setdefault(key, []) if has_besides else []
+        if outcome.failure and has_besides and len(failures) < len(BESIDES):
+            # What is asked for last may have ended the worker; one that hung is asked for the states only.
+            failures += [outcome.failure] * (len(BESIDES) if outcome.is_overdue else 1)
+            return [self._cell_task(key)]
         self._pending.discard(key)
         following = []
         if key.kind == TaskKind.DIAGNOSIS:
@@ -411,7 +420,8 @@ class ScenarioRun:
         """The function that computes a cell, and its arguments after the engine."""
         s, plan = self.scenario, self._plan
         if key.kind == TaskKind.STATE:
-            return engine_calls.evaluate_states, (s.model, self._states)
+            asked = BESIDES[: max(0, len(BESIDES) - len(self._failures_besides.get(key, ())))]
+            return engine_calls.evaluate_states, (s.model, self._states, asked)
         if key.kind == TaskKind.RELATIONS:
             return relations.check_relations, (s.model, self._states)
         integrator = self._integrator(key)
@@ -467,6 +477,10 @@ class ScenarioRun:
             )
             return JudgingResult(rows=[row])
         found: JudgingResult = outcome.judge_result
+        for what, reason in zip(reversed(BESIDES), self._failures_besides.get(key, ()), strict=False):
+            quantity = "all" if what == "surface" else f"all_{what}"
+            row = self._context(key.engine).make_row("surface", "-", quantity, Verdict.FAILED, reason)
+            found.rows.append(row)
         is_refused = any(row.verdict == Verdict.UNSUPPORTED and row.quantity == "all" for row in found.rows)
         if key.kind == TaskKind.STATE and is_singular(self._singular_value) and not is_refused:
             found.rows.append(singular_pose_row(self._context(key.engine), self._singular_value))
@@ -515,7 +529,7 @@ class ScenarioRun:
         )
         kind = TaskKind.STEP if outcome.key.integrator else TaskKind.STATE
         cell = self._findings[replace(outcome.key, kind=kind)]
-        extra = {} if diagnosis.scatter is None else {"scatter": diagnosis.scatter}
+        extra: dict[str, float | str] = {} if diagnosis.scatter is None else {"scatter": diagnosis.scatter}
         causes = tuple(asdict(cause) for cause in diagnosis.causes)
         cell.rows = [
             replace(row, diagnosis=diagnosis.text or None, causes=causes, extra=row.extra | extra)

@@ -20,7 +20,7 @@ from typing import Any
 from packaging.version import InvalidVersion, Version
 
 from plumbline.diagnosis.cause import Cause, Condition, Occurrence, describe, join_words
-from plumbline.judging.rows import VERDICT_STYLES, Row, Verdict
+from plumbline.judging.rows import VERDICT_STYLES, WRONG_CALL, Row, Verdict
 
 CLASSES = {  # of quantities, in the order in which one follows from another
     "accelerations": ("acceleration", "angular_acceleration"),
@@ -172,7 +172,7 @@ def _plain_identity(row: Row) -> Identity:
         return "", row.verdict, row.quantity
     if row.verdict in (Verdict.UNSUPPORTED, Verdict.FAILED):
         return _engine(row), row.verdict, row.reason
-    return _engine(row), row.verdict, row.level, row.integrator, row.quantity
+    return _engine(row), row.verdict, row.level, row.integrator, str(row.extra.get(WRONG_CALL, row.quantity))
 
 
 @dataclass
@@ -236,7 +236,8 @@ def _title(identity: Identity, cause: Cause | None, row: Row) -> str:
     if cause is None:
         if row.verdict == Verdict.DISAGREES:
             at = "" if row.integrator == "-" else f" of {row.integrator}"
-            return f"{row.quantity.replace('_', ' ')}{at} at level {row.level}"
+            by = row.extra.get(WRONG_CALL)
+            return f"wrong by {by}" if by else f"{row.quantity.replace('_', ' ')}{at} at level {row.level}"
         at = "" if row.integrator == "-" else f", {row.integrator}"
         return f"{row.verdict}: {row.quantity.replace('_', ' ')} at level {row.level}{at}"
     kind, term, *rest = identity

@@ -214,7 +214,10 @@ class KnownIssue:
         ratio = math.inf if row.ratio is None else row.ratio
         if not ratio <= covered and covered < math.inf:
             return f"the entry {self.name} covers {covered:g} times the tolerance at most"
-        if self.mechanism == "missing term" and not (left := row.extra.get(UNEXPLAINED, math.inf)) <= 1:
+        if (
+            self.mechanism == "missing term"
+            and not (left := float(row.extra.get(UNEXPLAINED, math.inf))) <= 1
+        ):
             return (
                 f"the entry {self.name} records a missing term; it leaves {left:.3g} tolerances unexplained"
             )
@@ -239,7 +242,7 @@ def _scatter_of(row: Row) -> float | None:
         return None
     if row.level == "relations" and row.quantity in SCATTER_RELATIONS:
         return row.ratio
-    return row.ratio * row.extra["scatter"] if "scatter" in row.extra else None
+    return row.ratio * float(row.extra["scatter"]) if "scatter" in row.extra else None
 
 
 def _as_list(value: Any) -> Any:

@@ -72,6 +72,7 @@ VERDICT_STYLES = {
         "i", "are information", "implied by other rows, or not compared: not a check", 0, 0
     ),
 }
+WRONG_CALL = "wrong_call"  # in ``extra`` of a row: of the engine's calls that are off the first by name
 RUN_FAMILY = "run"  # of a row that is about the whole run, in place of a scenario's family
 RECORDED = "recorded"  # what terminal and report show for a disagreement or failure that is recorded
 SHOWN_STYLES: dict[str, VerdictStyle] = {
@@ -175,7 +176,7 @@ class Row:
     causes: tuple[dict[str, Any], ...] = ()  # the same as data: of each cause its fields
     user_rtol: float | None = None  # the user's own tolerance, shown beside the verdict
     cpu_time: float = 0.0  # s, of the work behind this row
-    extra: dict[str, float] = field(default_factory=dict)
+    extra: dict[str, float | str] = field(default_factory=dict)
 
     @property
     def key(self) -> str:

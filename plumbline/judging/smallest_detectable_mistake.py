@@ -366,7 +366,7 @@ def _motion_tolerance(row: Row, times: Array) -> _MotionTolerance | None:
         return None
     if quantity in INVARIANT_UNITS and row.value == 0:
         return None
-    tolerance = row.extra.get("limit_tolerance", row.tolerance)
+    tolerance = float(row.extra.get("limit_tolerance", row.tolerance))
     end = int(np.searchsorted(times, (row.compared_until or 0.0) * (1 + 1e-12), side="right")) - 1
     return _MotionTolerance(row, quantity, tolerance, end)
 

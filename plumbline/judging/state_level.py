@@ -13,7 +13,7 @@ import numpy as np
 from plumbline.engines.engine_calls import Evaluation
 from plumbline.engines.variants import NoAnswer, VariantKind
 from plumbline.judging.identity import state_fingerprints
-from plumbline.judging.rows import Columns, Deviation, JudgingResult, Row, RowContext, Verdict
+from plumbline.judging.rows import WRONG_CALL, Columns, Deviation, JudgingResult, Row, RowContext, Verdict
 from plumbline.judging.surface_rows import judge_surface
 from plumbline.model.datatypes import Array
 from plumbline.model.loops import MIN_SINGULAR_VALUE
@@ -110,6 +110,7 @@ def judge_variants(context: RowContext, truth: StateTruth, evaluation: Evaluatio
             wrong = [by for one, by in judged[:-1] if one.verdict == Verdict.DISAGREES]
             reason = f"by {names}: {row.reason}" + (f"; by {' and by '.join(wrong)} too" if wrong else "")
             extra = row.extra | {"calls": float(len(judged))}
+            extra |= {WRONG_CALL: min([names, *wrong])} if row.verdict == Verdict.DISAGREES else {}
             name = f"{quantity}_by_{kind}"
             rows.append(replace(row, level="surface", quantity=name, reason=reason, extra=extra))
         if missing:  # refusals are shown too: what was not compared is no agreement

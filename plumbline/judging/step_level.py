@@ -89,7 +89,7 @@ def decides_without_study(rows: Sequence[Row], coarsest: float) -> bool:
     decided = {row.quantity: row for row in rows if row.verdict in DECIDED}
     if not decided.keys() >= DECISIVE:
         return False
-    turn = coarsest * max(decided[name].extra.get("fastest_mode", 0.0) for name in DECISIVE)
+    turn = coarsest * max(float(decided[name].extra.get("fastest_mode", 0.0)) for name in DECISIVE)
     return turn > MAX_RESOLVED_TURN
 
 

@@ -8,7 +8,8 @@ from __future__ import annotations
 import numpy as np
 
 from plumbline.engines.engine_calls import Evaluation
-from plumbline.judging.rows import Row, RowContext, Verdict
+from plumbline.engines.missing_names import MISSING_NAMES
+from plumbline.judging.rows import WRONG_CALL, Row, RowContext, Verdict
 from plumbline.model.datatypes import Array
 from plumbline.truth.ground_truth import StateTruth
 from plumbline.truth.rounding_bound import MAX_RELATIVE_BOUND
@@ -25,23 +26,30 @@ def judge_surface(context: RowContext, truth: StateTruth, evaluation: Evaluation
         evaluation: with the engine's answers at the same states, or why there are none.
 
     Returns:
-        One row per quantity, with the number of calls in ``extra``; one row where the engine failed.
+        One row per quantity, with the number of calls in ``extra``; one row where the engine failed, or lacks
+        names.
 
     """
     if evaluation.surface_failure and truth.surface:
         return [context.make_row("surface", "-", "all", Verdict.FAILED, evaluation.surface_failure)]
-    return [
+    rows = [
         _row(context, name, truth.surface[name], evaluation)
         for name in SURFACE_QUANTITIES
         if name in truth.surface and name in evaluation.surface
     ]
+    if missing := evaluation.surface.get(MISSING_NAMES):  # what was not compared is no agreement
+        names = ", ".join(name for call in missing for name in call)
+        reason = f"version {context.version} has no {names}: what they report is not compared"
+        rows.append(context.make_row("surface", "-", "all", Verdict.INFORMATION, reason))
+    return rows
 
 
 def _row(context: RowContext, quantity: str, true: SurfaceTruth, evaluation: Evaluation) -> Row:
     unit, name = SURFACE_QUANTITIES[quantity][0], quantity.replace("_", " ")
     found = [(*_worst(value, true), ", ".join(call)) for call, value in evaluation.surface[quantity].items()]
     ratio, error, tolerance, state, call = max(found)
-    others = sorted(one[-1] for one in found if one[0] > 1 and one[-1] != call)
+    wrong = sorted(one[-1] for one in found if one[0] > 1)
+    others = [one for one in wrong if one != call]
     # single entries may have no scale
     scale, loose = np.max(true.scale, axis=1), np.max(true.tolerance, axis=1)
     looseness = np.where(scale > 0, loose / np.where(scale > 0, scale, 1.0), 0.0)
@@ -65,7 +73,8 @@ def _row(context: RowContext, quantity: str, true: SurfaceTruth, evaluation: Eva
         derivation="a formula on the certified motion; errors of its inputs are propagated to first order, "
         f"its terms are rounded once each; at most {loosest:.1g} of the scale at {count} states",
         cpu_time=evaluation.cpu_time,
-        extra={"states": float(count), "state": float(state), "calls": float(len(found))},
+        extra={"states": float(count), "state": float(state), "calls": float(len(found))}
+        | ({WRONG_CALL: wrong[0]} if wrong else {}),
     )  # fmt: skip
 
 

@@ -225,3 +225,33 @@ def test_every_study_runs_at_night_and_on_the_plainest_scenario(engines):
         truth = next(x for x in bench.tasks() if x.key.kind == TaskKind.MOTION_TRUTH)
         following = [x.key.integrator for x in bench.on_outcome(outcome_of(truth))]
         assert following == ["Euler", "implicit", "implicitfast", "RK4"]
+
+
+def test_a_worker_that_ends_in_what_is_asked_besides_costs_that_only(engines):
+    bench = make_scenario_run(engines, "state")
+    (truth,) = bench.tasks()
+    of_reference, of_mujoco = bench.on_outcome(outcome_of(truth))
+    assert bench.on_outcome(Outcome(of_reference.key, failure="crashed")) == []  # nothing is asked besides
+    (again,) = bench.on_outcome(Outcome(of_mujoco.key, failure="crashed"))
+    (at_last,) = bench.on_outcome(Outcome(of_mujoco.key, failure="crashed again"))
+    assert [task.arguments[-1] for task in (of_mujoco, again, at_last)] == [
+        ("surface", "variants"), ("surface",), (),
+    ]  # fmt: skip
+    assert not bench.is_done
+    assert bench.on_outcome(outcome_of(at_last)) == [] and bench.is_done
+    rows = [row for row in bench.findings().rows if row.engine == "mujoco"]
+    assert {(r.quantity, r.verdict, r.reason) for r in rows if r.level == "surface"} == {
+        ("all_variants", "failed", "crashed"), ("all", "failed", "crashed again"),
+    }  # fmt: skip
+    assert sum(row.level == "state" and row.verdict == "agrees" for row in rows) == 7
+
+
+def test_an_engine_that_hangs_is_asked_for_the_states_alone_at_once(engines):
+    bench = make_scenario_run(engines, "state")
+    (truth,) = bench.tasks()
+    _, of_mujoco = bench.on_outcome(outcome_of(truth))
+    (at_last,) = bench.on_outcome(Outcome(of_mujoco.key, failure="hung", is_overdue=True))
+    assert at_last.arguments[-1] == ()
+    bench.on_outcome(Outcome(of_mujoco.key, failure="hung", is_overdue=True))
+    (row,) = (row for row in bench.findings().rows if row.engine == "mujoco")
+    assert (row.level, row.quantity, row.verdict, row.reason) == ("state", "all", "failed", "hung")

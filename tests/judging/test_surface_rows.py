@@ -3,12 +3,16 @@
 from dataclasses import replace
 
 import numpy as np
+import pinocchio
 import pytest
 
+from adapters import mujoco_surface
 from plumbline.engines.engine_calls import Evaluation, evaluate_states, evaluate_variants, stack_answers
+from plumbline.engines.missing_names import add_parts
 from plumbline.engines.registry import load_adapter
 from plumbline.engines.surface import SURFACES
 from plumbline.engines.variants import NoAnswer
+from plumbline.judging.findings import find_findings
 from plumbline.judging.rows import RowContext, Verdict
 from plumbline.judging.state_level import judge_variants
 from plumbline.judging.surface_rows import judge_surface
@@ -144,3 +148,45 @@ def test_a_wrong_call_is_named(tree):
     (row,) = judge_surface(WHO, truth, evaluation)
     assert row.verdict == Verdict.DISAGREES
     assert "by mjtSensor.mjSENS_GYRO, mj_sensorVel is off by" in row.reason and "too" not in row.reason
+
+
+def test_calls_are_what_findings_are_about_whatever_quantities_they_get_wrong(tree):
+    model, _, truth = tree
+    right = truth.quantities[:2]
+    wrong = [replace(one, acceleration=one.acceleration * 2, kinetic_energy=one.kinetic_energy * 2)
+             for one in right]  # fmt: skip
+    variants = {"option": {("a",): right, ("b", "c"): wrong}}
+    rows = judge_variants(WHO, truth, Evaluation([], None, None, 0.0, variants=variants))
+    masses = dict.fromkeys((("e",), ("d",)), 2 * truth.surface["total_mass"].value)
+    rows += judge_surface(WHO, truth, Evaluation([], None, None, 0.0, surface={"total_mass": masses}))
+    found = find_findings(rows, {"s": model.n})
+    assert {f.title: set(f.quantities) for f in found} == {
+        "wrong by b, c": {"acceleration_by_option", "kinetic_energy_by_option"},
+        "wrong by d": {"total_mass"},
+    }
+
+
+def test_names_that_a_version_lacks_are_listed_and_the_rest_is_compared(tree, monkeypatch):
+    model, states, truth = tree
+    monkeypatch.delattr(pinocchio, "ModelPool")
+    monkeypatch.delattr(pinocchio.rpy, "rotate")
+    monkeypatch.delattr(pinocchio, "JointModelSphericalZYX")
+    evaluation = evaluate_states("pinocchio", model, states)
+    rows = judge_surface(WHO, truth, evaluation)
+    (told,) = (row for row in rows if row.quantity == "all")
+    assert told.verdict == Verdict.INFORMATION
+    assert told.reason.startswith("version 0 has no ModelPool, rotate:")
+    (told,) = (row for row in judge_variants(WHO, truth, evaluation) if row.quantity == "all_by_spelling")
+    assert told.verdict == Verdict.INFORMATION and told.reason.endswith(
+        "this version has no JointModelSphericalZYX"
+    )
+    assert {row.quantity for row in rows} > {"inverse_dynamics", "momentum", "frame_axes"}
+
+
+def test_a_name_that_this_project_lacks_is_a_failure(tree, monkeypatch):
+    model, states, _ = tree
+    monkeypatch.delattr(mujoco_surface, "SENSOR_STAGES")
+    found = evaluate_states("mujoco", model, states, ["surface"])
+    assert found.surface_failure == "NameError: name 'SENSOR_STAGES' is not defined" and not found.variants
+    with pytest.raises(AttributeError):
+        add_parts({}, lambda: np.a_name_of_a_package_that_every_environment_has)
