@@ -60,6 +60,7 @@ from numpy.typing import NDArray
 
 from adapters.mujoco_surface import POSE_FUNCTIONS, add_probes, pose_function, surface_answer
 from adapters.mujoco_variants import (
+    COLUMN_NAMES,
     HINGE_ANGLES,
     HINGE_RATES,
     HINGE_TURN,
@@ -189,6 +190,7 @@ class Mujoco(MetamorphicHooks):
     )
     welding_unsupported_reason = ""
     variants = VARIANTS
+    column_names = COLUMN_NAMES
 
     def version(self) -> str:
         """Return the version of the loaded library."""
@@ -379,8 +381,8 @@ class _MujocoChain:
         m.opt.gravity = model.gravity
         m.opt.disableflags = mujoco.mjtDisableBit.mjDSBL_CONTACT | _autoreset_flag()
         # After compiling: the compiler refuses massless bodies, and cannot adjust what it does not see.
-        m.body_mass[:] = self.mass
         given = np.full(m.nbody, True) if not change.has_own_inertia else np.array(self.mass) == 0
+        m.body_mass[given] = np.array(self.mass)[given]
         m.body_inertia[given] = np.array(self.inertia)[given]
         self.m = m
         self.effort = np.zeros(m.nv)

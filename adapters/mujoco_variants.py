@@ -15,8 +15,11 @@ from pathlib import Path
 from typing import Any
 
 import mujoco
+import mujoco.rollout
 import numpy as np
 
+from adapters import mujoco_actuation as actuation
+from adapters import mujoco_shapes as shapes
 from adapters.pose_functions import xyz_angles
 from plumbline.engines.variants import Variant, VariantKind
 from plumbline.model.datatypes import Array, Call, Float, Model
@@ -68,6 +71,12 @@ NEEDLESS = tuple(  # flags of what no free mechanism without elements has
     )
 )  # fmt: skip
 BIAS = "mj_rne"
+MOTORS = ("mjtDyn.mjDYN_NONE", "mjtBias.mjBIAS_NONE", "mjtObj.mjOBJ_ACTUATOR")
+SHAPES = (
+    "mjtInertiaFromGeom",
+    "MjsGeom", "MjsMesh", "mjtGeom", "mjtMeshInertia", "mjtGeomInertia", "mjtGeomInertia.mjINERTIA_VOLUME",
+    "mjtGeomInertia.mjINERTIA_SHELL",
+)  # fmt: skip
 LAST_STAGES = ("mj_fwdActuation", "mj_fwdAcceleration", "mj_fwdConstraint")
 STAGES = ("mj_fwdPosition", "mj_energyPos", "mj_fwdVelocity", "mj_energyVel", *LAST_STAGES)
 PARTS = (  # the functions that the stages of positions and velocities call
@@ -77,7 +86,7 @@ PARTS = (  # the functions that the stages of positions and velocities call
 )  # fmt: skip
 OTHER_PARTS = (
     "mj_fwdKinematics",
-    *(x for x in PARTS if x not in ("mj_kinematics", "mj_comPos", "mj_tendon")),
+    *("mj_crb" if x == "mj_makeM" else x for x in PARTS[3:]),
 )
 
 
@@ -251,6 +260,97 @@ def _forward_by_callback(name: str) -> Callable[[Any, Any], None]:
     return forward
 
 
+def _forward_by_rollout(m: Any, d: Any) -> None:
+    """The same by a batch of one step, under the loads as controls."""
+    full, loads = mujoco.mjtState.mjSTATE_FULLPHYSICS, mujoco.mjtState.mjSTATE_QFRC_APPLIED
+    loads = int(loads) | int(mujoco.mjtState.mjSTATE_XFRC_APPLIED)
+    flags, size = m.opt.disableflags, mujoco.mj_stateSize(m, full)
+    state, control = np.empty(size), np.empty(mujoco.mj_stateSize(m, loads))
+    mujoco.mj_getState(m, d, state, full)
+    mujoco.mj_getState(m, d, control, loads)
+    m.opt.integrator, m.opt.timestep = mujoco.mjtIntegrator.mjINT_EULER, 1.0
+    m.opt.disableflags = flags | int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
+    other = mujoco.MjData(m)
+    after, _ = mujoco.rollout.rollout(m, other, state[None], control[None, None], control_spec=loads)
+    mujoco.mj_setState(m, other, np.ravel(after), full)
+    m.opt.disableflags = flags
+    mujoco.mj_forward(m, d)
+    d.qacc[:] = other.qvel - d.qvel
+
+
+def _forward_with_checks(m: Any, d: Any) -> None:
+    """Normalise quaternions that are too long, and check all numbers."""
+    for j, kind in enumerate(m.jnt_type):
+        at = m.jnt_qposadr[j] + 3 * (kind == mujoco.mjtJoint.mjJNT_FREE)
+        if kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL):
+            d.qpos[at : at + 4] *= 1.5
+    mujoco.mj_normalizeQuat(m, d.qpos)
+    mujoco.mj_checkPos(m, d)
+    mujoco.mj_checkVel(m, d)
+    mujoco.mj_forward(m, d)
+    mujoco.mj_checkAcc(m, d)
+
+
+def _default_options(m: Any, d: Any) -> tuple[Any, Any]:
+    """Set all options anew."""
+    flags, gravity = m.opt.disableflags, m.opt.gravity.copy()
+    mujoco.mj_defaultOption(m.opt)
+    m.opt.disableflags, m.opt.gravity = flags, gravity
+    return m, d
+
+
+def _sparse_rows(d: Any, name: str, width: int) -> Array:
+    """A sparse matrix of constraints as a dense one; old versions hold it so."""
+    values, counts = getattr(d, name), getattr(d, f"{name}_rownnz")
+    if values.size == len(counts) * width and not np.any(counts):
+        return np.reshape(values, (-1, width))
+    dense = np.zeros((len(counts), width))
+    for row, at, count in zip(dense, getattr(d, f"{name}_rowadr"), counts, strict=True):
+        row[getattr(d, f"{name}_colind")[at : at + count]] = values[at : at + count]
+    return dense
+
+
+def _forward_by_constraint_matrix(m: Any, d: Any) -> None:
+    """Solve for the forces of constraints by their matrix, that of dual solvers."""
+    mujoco.mj_forward(m, d)
+    count = len(d.efc_b)
+    d.efc_force[:] = -np.linalg.solve(_sparse_rows(d, "efc_AR", count), d.efc_b)
+    mujoco.mj_mulJacTVec(m, d, d.qfrc_constraint, d.efc_force)
+    mujoco.mj_solveM(m, d, d.qacc[None], (d.qfrc_smooth + d.qfrc_constraint)[None])
+
+
+def _forward_by_constraint_rows(m: Any, d: Any) -> None:
+    """Solve for them by their Jacobian, softness and reference."""
+    mujoco.mj_forward(m, d)
+    rows = _sparse_rows(d, "efc_J", m.nv)
+    through, product = np.zeros_like(rows), np.zeros(len(rows))
+    mujoco.mj_solveM(m, d, through, rows)
+    mujoco.mj_mulJacVec(m, d, product, d.qacc_smooth)
+    force = np.linalg.solve(rows @ through.T + np.diag(d.efc_R), d.efc_aref - product)
+    mujoco.mj_constraintUpdate(m, d, -d.efc_R * force, None, 0)
+    mujoco.mj_solveM(m, d, d.qacc[None], (d.qfrc_smooth + d.qfrc_constraint)[None])
+
+
+def _forward_by_islands(m: Any, d: Any) -> None:
+    """Read accelerations and forces of constraints from the arrays of islands."""
+    mujoco.mj_forward(m, d)
+    d.qacc[:], d.efc_force[d.map_iefc2efc] = np.nan, d.iefc_force
+    rest = d.map_idof2dof[d.nidof :]
+    d.qacc[d.map_idof2dof[: d.nidof]], d.qacc[rest] = d.iacc, d.qacc_smooth[rest]
+
+
+def _set_options(**values: str | int) -> Callable[[Any, Any], tuple[Any, Any]]:
+    def remake(m: Any, d: Any) -> tuple[Any, Any]:
+        m.opt.iterations, m.opt.tolerance = 3, 0.0
+        for name, value in values.items():
+            enumeration, _, entry = str(value).partition(".")
+            given = int(getattr(getattr(mujoco, enumeration), entry))
+            setattr(m.opt, name, given | (m.opt.enableflags if name == "enableflags" else 0))
+        return m, d
+
+    return remake
+
+
 def _flags(m: Any, d: Any) -> tuple[Any, Any]:
     """Disable what the mechanism has none of."""
     for flag in NEEDLESS:
@@ -328,6 +428,28 @@ def _free(kind: VariantKind, names: Call, **change: Any) -> Variant:
     return Variant(kind, names, Change(**change), _is_free)
 
 
+def _has_elements(*names: str) -> Callable[[Model], bool]:
+    """Whether a mechanism without constraints has one of these elements of joints."""
+    return lambda model: _is_free(model) and any(np.any(getattr(model, name)) for name in names)
+
+
+def _of_shapes(by: str, describe: Callable[[Any], Any], suits: Callable[[Model], bool]) -> Variant:
+    """Describe bodies of geoms."""
+    names = f"mjtInertiaFromGeom.mjINERTIAFROMGEOM_{by}", *SHAPES
+    change = Change(has_own_inertia=True, describe=describe)
+    return Variant("spelling", names, change, lambda model: _has_inertia(model) and suits(model))
+
+
+def _actuated(ways: Mapping[str, Mapping[str, str]], read: str = "") -> Variant:
+    """Describe efforts that actuators exert."""
+    names = *actuation.names_of(ways), *((f"mjtSensor.mjSENS_{read}", *MOTORS) if read else ("mjtDyn",))
+    place = "MjData.ctrl" if read else "MjData.act"
+    change = Change(
+        describe=actuation.with_actuators(ways), forward=actuation.forward_by_actuators(ways, read)
+    )
+    return Variant("spelling", (*names, place, "mjtTrn.mjTRN_JOINT"), change, _has_elements("effort"))
+
+
 VARIANTS = (
     _free("option", STAGES, forward=_forward_by(*STAGES)),
     Variant("option", PARTS, Change(forward=_forward_by(*PARTS)), lambda _: True),
@@ -335,7 +457,7 @@ VARIANTS = (
     _free("option", ("mj_step1",), forward=_forward_by("mj_step1", *LAST_STAGES)),
     _free(
         "option",
-        ("mj_getState", "mj_setState", "mj_stateSize", "mj_resetData"),
+        ("mj_getState", "mj_setState", "mj_stateSize", "mj_resetData", "mjtState"),
         forward=_forward_after_set_state,
     ),
     Variant("option", OTHER_PARTS, Change(forward=_forward_by(*OTHER_PARTS)), lambda _: True),
@@ -348,6 +470,11 @@ VARIANTS = (
     ),
     _free("option", ("mj_differentiatePos", "mj_integratePos"), forward=_forward_from_reference),
     _free("option", ("mj_Euler",), forward=_forward_by_step("mj_forward", "mj_Euler")),
+    _free(
+        "option",
+        ("mj_step", "mjtIntegrator", "mjtIntegrator.mjINT_EULER", "MjOption.integrator", "MjOption.timestep"),
+        forward=_forward_by_step("mj_step"),
+    ),
     _free("option", ("mj_step2",), forward=_forward_by_step("mj_step1", "mj_step2")),
     _free("option", ("set_mjcb_passive",), forward=_forward_by_callback("passive")),
     _free("option", ("set_mjcb_control",), forward=_forward_by_callback("control")),
@@ -359,6 +486,41 @@ VARIANTS = (
     _free("option", ("MjModel",), remake=lambda m, d: pickle.loads(pickle.dumps((m, d)))),
     _free("option", ("MjModel", "MjData"), remake=lambda m, d: (copy(m), copy(d))),
     _free("option", ("mj_saveModel",), remake=_binary),
+    _free("option", ("rollout.rollout",), forward=_forward_by_rollout),
+    Variant(
+        "option",
+        ("mj_normalizeQuat", "mj_checkPos", "mj_checkVel", "mj_checkAcc"),
+        Change(forward=_forward_with_checks),
+        _is_free,
+    ),
+    _free("option", ("mj_defaultOption",), remake=_default_options),
+    Variant(
+        "option",
+        ("mj_mulJacTVec", "MjData.efc_AR", "MjData.efc_b"),
+        Change(
+            remake=_set_options(jacobian="mjtJacobian.mjJAC_SPARSE", solver="mjtSolver.mjSOL_PGS"),
+            forward=_forward_by_constraint_matrix,
+        ),
+        is_constrained,
+    ),
+    Variant(
+        "option",
+        (
+            "mj_mulJacVec",
+            "mj_constraintUpdate",
+            "MjData.efc_J",
+            "MjData.efc_R",
+            "MjData.efc_aref",
+        ),
+        Change(remake=_set_options(jacobian="mjtJacobian.mjJAC_SPARSE"), forward=_forward_by_constraint_rows),
+        is_constrained,
+    ),
+    Variant(
+        "option",
+        ("mj_island", "MjData.iacc", "MjData.iefc_force"),
+        Change(remake=_set_options(jacobian="mjtJacobian.mjJAC_SPARSE"), forward=_forward_by_islands),
+        lambda model: model.has_loops,
+    ),
     # Of Newton's method, on a linear problem: the second and third remove rounding, more can add some.
     _options(3, jacobian="mjtJacobian.mjJAC_SPARSE"),
     _options(
@@ -370,6 +532,58 @@ VARIANTS = (
     # flyball-governor; it stops where an iteration changes little.
     _options(400_000, 1e-34, _has_few_constraints, solver="mjtSolver.mjSOL_PGS"),
     _options(jacobian="mjtJacobian.mjJAC_DENSE", disableflags="mjtDisableBit.mjDSBL_ISLAND"),
+    _actuated(actuation.STATELESS, "ACTUATORFRC"),
+    _actuated(actuation.WITH_STATE),
+    Variant(
+        "spelling",
+        ("mjtGain.mjGAIN_FIXED", "mjtBias.mjBIAS_AFFINE", "mjtSensor.mjSENS_JOINTACTFRC"),
+        Change(
+            describe=actuation.with_actuators(actuation.SERVO),
+            forward=actuation.forward_by_actuators(actuation.SERVO, "JOINTACTFRC"),
+        ),
+        _has_elements("stiffness", "damping"),
+    ),
+    Variant(
+        "spelling",
+        (*actuation.CALLBACKS, *actuation.names_of(actuation.BY_CALLBACK)),
+        Change(
+            describe=actuation.with_actuators(actuation.BY_CALLBACK), forward=actuation.forward_by_callbacks
+        ),
+        _has_elements("effort"),
+    ),
+    Variant(
+        "spelling",
+        (
+            "mjtWrap.mjWRAP_JOINT",
+            "mjtTendon",
+            "mjtObj.mjOBJ_TENDON",
+            "mjtSensor.mjSENS_TENDONACTFRC",
+            "mjtTrn.mjTRN_TENDON",
+        ),
+        Change(
+            describe=actuation.with_fixed_tendons,
+            remake=actuation.elements_on_tendons,
+            forward=actuation.forward_by_tendons,
+        ),
+        lambda model: (
+            _has_elements("effort", "stiffness", "damping", "armature")(model)
+            and any(kind.motions for kind in model.kinds)
+        ),
+    ),
+    _free(
+        "option",
+        ("MjOption.disableactuator", "mjtLimited"),
+        describe=actuation.with_far_limits,
+        remake=actuation.without_group,
+        forward=actuation.forward_with_group_off,
+    ),
+    _free(
+        "spelling",
+        ("MjData.qfrc_gravcomp",),
+        describe=actuation.with_gravcomp,
+        forward=actuation.forward_without_gravity,
+    ),
+    _free("option", ("mjtDisableBit.mjDSBL_GRAVITY",), forward=actuation.forward_without_gravity),
     _free("spelling", ("MjSpec",), describe=lambda spec: spec.copy()),
     _free("spelling", ("MjsFrame",), describe=_in_frames),
     _free(
@@ -385,7 +599,65 @@ VARIANTS = (
     _free(
         "spelling", ("mjtOrientation.mjORIENTATION_XYAXES",), describe=_oriented("XYAXES", "xyaxes", _xy_axes)
     ),
-    Variant("spelling", ("MjsBody",), Change(has_own_inertia=True), _has_inertia),
+    _free("spelling", ("mjtOrientation.mjORIENTATION_ZAXIS",), describe=shapes.in_z_frames),
+    _free("spelling", ("MjsDefault",), describe=shapes.attached),
+    Variant(
+        "spelling",
+        ("MjsBody", "mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE"),
+        Change(has_own_inertia=True, describe=shapes.without_shapes),
+        _has_inertia,
+    ),
+    _of_shapes("AUTO", shapes.of_shapes, lambda model: bool(np.any(model.rods))),
+    _of_shapes("TRUE", shapes.of_shapes_only, lambda model: not np.any(model.rods)),
+    Variant(
+        "spelling",
+        ("mjtEq.mjEQ_CONNECT",),
+        Change(describe=shapes.welds_as_points),
+        lambda model: model.has_loops,
+    ),
     Variant("spelling", ("mjtJoint.mjJNT_HINGE",), Change(ball_joints=HINGES), _has_free_balls),
     Variant("spelling", ("mjtJoint.mjJNT_SLIDE",), Change(free_joints=(*SLIDES, *BALL)), _has_free_bodies),
 )
+
+
+def _has_kind(*kinds: str) -> Callable[[Model], bool]:
+    return lambda model: not set(kinds).isdisjoint(model.kind)
+
+
+COLUMN_NAMES: tuple[tuple[Call, Callable[[Model], bool]], ...] = (
+    (
+        (
+            "mj_forward", "mj_setConst", "mj_rnePostConstraint", "MjOption", "MjsCompiler", "MjsJoint",
+            "mjtDisableBit", "mjtEnableBit", "mjtJoint", "mjtObj", "mjtObj.mjOBJ_BODY", "MjData.qpos",
+            "MjData.qvel", "MjData.xmat", "MjData.cfrc_int", "MjData.xfrc_applied", "MjData.qfrc_applied",
+            "MjOption.gravity", "MjOption.disableflags", "MjOption.enableflags",
+            "mjtEnableBit.mjENBL_ENERGY", "mjtOrientation.mjORIENTATION_QUAT", "mjtOrientation",
+        ),
+        lambda model: True,
+    ),
+    (("mj_fullM", "MjData.M"), _is_free),
+    (("mjtJoint.mjJNT_BALL",), _has_kind("ball", "rod")),
+    (("mjtJoint.mjJNT_FREE",), _has_kind("free")),
+    (
+        ("MjsEquality", "MjsSite", "mjtConstraint", "mjtConstraint.mjCNSTR_EQUALITY", "mjtEq",
+         "mjtEq.mjEQ_WELD", "mjtSolver", "mjtSolver.mjSOL_NEWTON", "mjtJacobian",
+         "mjtJacobian.mjJAC_AUTO", "mjtObj.mjOBJ_SITE", "MjOption.iterations", "MjOption.solver",
+         "MjOption.tolerance", "MjOption.jacobian", "MjData.qacc", "MjData.qfrc_constraint",
+         "MjData.efc_force"),
+        lambda model: model.has_loops,
+    ),
+    (
+        ("mjtEq.mjEQ_JOINT", "mjtObj.mjOBJ_JOINT"),
+        lambda model: any(kind.has_pitch for kind in model.kinds),
+    ),
+    (
+        ("MjsSite", "MjsTendon", "MjsTendonPath", "MjsWrap", "mjtWrap", "mjtWrap.mjWRAP_SITE",
+         "mjtTendon"),
+        lambda model: len(model.spring_body) > 0,
+    ),
+    (
+        ("MjsActuator", "mjtBias", "mjtTrn", "mjtTrn.mjTRN_SITE", "mjtBias.mjBIAS_AFFINE", "mjtGain",
+         "MjData.actuator_force", "MjData.qfrc_actuator"),
+        lambda model: any(np.any(x) for x in (model.moment, model.drag_force, model.drag_moment)),
+    ),
+)  # fmt: skip

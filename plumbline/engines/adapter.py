@@ -29,6 +29,7 @@ from plumbline.engines.variants import Variant
 from plumbline.model.datatypes import (
     Array,
     BadInput,
+    Call,
     EngineFailure,
     Float,
     Integrator,
@@ -130,6 +131,8 @@ class Adapter(ABC):
     reproduction_template: ClassVar[str] = ""  # template of stand-alone scripts; without one there are none
     variants: ClassVar[Sequence[Variant]] = ()  # other ways to ask the engine
     variant: Variant | None = None  # the one in use
+    # Names of the engine that the column itself uses, each with the mechanisms on which it does.
+    column_names: ClassVar[Sequence[tuple[Call, Callable[[Model], bool]]]] = ()
 
     @abstractmethod
     def version(self) -> str:

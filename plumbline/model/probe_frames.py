@@ -27,3 +27,10 @@ def probe_points(model: Model) -> Float[Array, "bodies 3"]:
     gyration = np.sqrt(np.linalg.norm(model.inertia, axis=(1, 2)) / model.mass)
     size = np.where(arm > 0, arm / 2, gyration)
     return np.asarray(near + size[:, None] * _DIRECTION)
+
+
+def anchor_point(model: Model) -> Float[Array, "3"]:
+    """A point of the world [m] from which distances are taken; no chain reaches it."""
+    lengths = (np.linalg.norm(model.point, axis=-1), model.length[:, None])
+    reach = sum(float(np.sum(np.abs(x))) for x in lengths) + float(np.sum(np.abs(model.proximal)))
+    return np.asarray(2 * max(reach, float(np.max(np.abs(probe_points(model))))) * _DIRECTION)

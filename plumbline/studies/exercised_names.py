@@ -1,24 +1,28 @@
 """Which names of an engine's surface are exercised: a change of 1e-6 in what a name returns turns a row red.
 
-    python -m plumbline.studies.exercised_names > adapters/surface/exercised.json
+    python -m plumbline.studies.exercised_names [ENGINE ...] > adapters/surface/exercised.json
 
-computes it for all engines with a surface, on `MECHANISMS`; docs/surface.md is made from it.
+computes it for all engines with a surface, on `MECHANISMS`; the file's entries of other engines stay.
+docs/surface.md is made from it.
 """
 
 from __future__ import annotations
 
 import json
+import sys
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import replace
 
 from plumbline.engines.engine_calls import SURFACE_STATES, Evaluation, evaluate_states
-from plumbline.engines.surface import SURFACES, other_names
+from plumbline.engines.registry import load_adapter
+from plumbline.engines.surface import SURFACES, exercised_rows, other_names
 from plumbline.engines.variants import NoAnswer
 from plumbline.judging.rows import Row, RowContext, Verdict
-from plumbline.judging.state_level import judge_variants
+from plumbline.judging.state_level import judge_states, judge_variants
 from plumbline.judging.surface_rows import judge_surface
 from plumbline.measurements.state_relations import quantity_values
-from plumbline.model.datatypes import Call
+from plumbline.model.datatypes import Call, StateQuantities
 from plumbline.model.sampling import compared_states
 from plumbline.scenario.loader import load_scenarios
 from plumbline.truth.ground_truth import StateTruth, state_truth
@@ -32,12 +36,17 @@ MECHANISMS = (
 _CONTEXT = RowContext("", "", "", "the engine", "")
 
 
-def exercised_names(truth: StateTruth, evaluation: Evaluation) -> dict[str, set[str]]:
+def exercised_names(
+    truth: StateTruth,
+    evaluation: Evaluation,
+    column_names: Sequence[Call] = (),
+) -> dict[str, set[str]]:
     """Change what each call and each variant returned, one at a time, and see which rows turn red.
 
     Args:
         truth: with the truth of the surface.
         evaluation: of the engine at the same states.
+        column_names: of the adapter, that the state quantities themselves come from.
 
     Returns:
         By name of the engine the quantities of these rows.
@@ -55,16 +64,22 @@ def exercised_names(truth: StateTruth, evaluation: Evaluation) -> dict[str, set[
         for call, answers in variants.items():
             if isinstance(answers, NoAnswer):
                 continue
-            changed = [
-                replace(one, **{q: getattr(one, q) * (1 + CHANGE) for q in quantity_values(one)})
-                for one in answers
-            ]
             rows = [
                 judge_variants(_CONTEXT, truth, replace(evaluation, variants={kind: {call: x}}))
-                for x in (answers, changed)
+                for x in (answers, _changed(answers))
             ]
             _add_red_rows(found, call, *rows)
+    bare = replace(evaluation, surface={}, variants={})
+    for call in column_names:
+        both = (replace(bare, quantities=x) for x in (bare.quantities, _changed(bare.quantities)))
+        _add_red_rows(found, call, *(judge_states(_CONTEXT, truth, one).rows for one in both))
     return found
+
+
+def _changed(answers: Sequence[StateQuantities]) -> list[StateQuantities]:
+    return [
+        replace(one, **{q: getattr(one, q) * (1 + CHANGE) for q in quantity_values(one)}) for one in answers
+    ]
 
 
 def _add_red_rows(found: dict[str, set[str]], call: Call, before: list[Row], after: list[Row]) -> None:
@@ -80,20 +95,25 @@ def _add_red_rows(found: dict[str, set[str]], call: Call, before: list[Row], aft
 def main() -> None:
     """Print the names of all engines."""
     scenarios = load_scenarios(MECHANISMS)
-    found: dict[str, dict[str, set[str]]] = {engine: defaultdict(set) for engine in SURFACES}
+    engines = sys.argv[1:] or SURFACES
+    found: dict[str, dict[str, set[str]]] = {engine: defaultdict(set) for engine in engines}
     for s in scenarios:
         states = compared_states(s.model, s.state, s.seed, SURFACE_STATES)[:SURFACE_STATES]
         truth = state_truth(s.model, states)
         for engine, names in found.items():
             evaluation = evaluate_states(engine, s.model, states)
-            for name, quantities in exercised_names(truth, evaluation).items():
+            own = [call for call, suits in load_adapter(engine).column_names if suits(s.model)]
+            for name, quantities in exercised_names(truth, evaluation, own).items():
                 names[name] |= quantities
     for engine, names in found.items():
         for name, same in other_names(engine).items():
             for other in same if name in names else ():
                 names[other] |= names[name]
     written = {
-        engine: {name: sorted(names[name]) for name in sorted(names)} for engine, names in found.items()
+        engine: {name: sorted(found[engine][name]) for name in sorted(found[engine])}
+        if engine in found
+        else exercised_rows(engine)
+        for engine in SURFACES
     }
     print(json.dumps(written, indent=1))
 

@@ -24,7 +24,7 @@ from plumbline.model.kinematics import (
     rotation_matrix,
     velocity_jacobian,
 )
-from plumbline.model.probe_frames import PROBE_ATTITUDE, probe_points
+from plumbline.model.probe_frames import PROBE_ATTITUDE, anchor_point, probe_points
 from plumbline.truth.rounding_bound import EPS, ROUNDING_FACTOR, RoundingBound
 
 
@@ -191,6 +191,46 @@ def _frame_axes(motion: Motion) -> Rounded:
     return Rounded(columns, np.repeat(motion.of_turn, 3), ones)
 
 
+def _from_anchor(motion: Motion) -> Rounded:
+    place = np.broadcast_to(anchor_point(motion.model), (motion.model.n, 3))
+    return motion.point.minus(Rounded(place, motion.exact, np.linalg.norm(place, axis=-1)))
+
+
+def _frame_distance(motion: Motion) -> Rounded:
+    """From the anchor point, (N, 1)."""
+    away = _from_anchor(motion)
+    return away._replace(value=np.linalg.norm(away.value, axis=-1)[:, None])
+
+
+def _frame_distance_rate(motion: Motion) -> Rounded:
+    away, velocity = _from_anchor(motion), motion.point_velocity
+    length, speed = (np.linalg.norm(x.value, axis=-1) for x in (away, velocity))
+    rate = np.sum(away.value * velocity.value, axis=-1) / length
+    return Rounded(rate[:, None], velocity.error + away.tolerance * speed / length, velocity.size)
+
+
+def _first(motion: Motion, vectors: Rounded) -> Rounded:
+    """The vectors less the first body's."""
+    return vectors.minus(Rounded(*(np.broadcast_to(x[:1], x.shape) for x in vectors)))
+
+
+def _in_first(motion: Motion, vectors: Rounded) -> Rounded:
+    """Vectors in the axes of the first probe frame."""
+    turn = np.broadcast_to(motion.axes[:1].mT, motion.axes.shape)
+    return vectors.mapped(turn, np.ones(motion.model.n), np.broadcast_to(motion.of_turn[:1], motion.model.n))
+
+
+def _velocity_in_first(motion: Motion) -> Rounded:
+    """As an observer sees it who turns with the first probe frame."""
+    spin = Rounded(*(np.broadcast_to(x[:1], x.shape) for x in motion.w))
+    return _first(motion, motion.point_velocity).minus(spin.cross(_first(motion, motion.point)))
+
+
+def _axes_in_first(motion: Motion) -> Rounded:
+    columns = (motion.axes[:1].mT @ motion.axes).mT.reshape(-1, 3)
+    return Rounded(columns, np.repeat(motion.of_turn + motion.of_turn[0], 3), np.ones(len(columns)))
+
+
 def _weights(motion: Motion) -> Array:
     return np.ones((1, motion.model.n))
 
@@ -279,6 +319,13 @@ _FORMULAS: Mapping[str, tuple[str, Callable[[Motion], Rounded]]] = {
     "frame_velocity_at_origin": ("m/s", lambda m: _at_origin(m, m.point_velocity, m.w)),
     "frame_angular_velocity": ("rad/s", lambda m: m.w),
     "frame_angular_velocity_local": ("rad/s", lambda m: m.local(m.w)),
+    "frame_position_from_anchor": ("m", _from_anchor),
+    "frame_distance": ("m", _frame_distance),
+    "frame_distance_rate": ("m/s", _frame_distance_rate),
+    "frame_position_in_first": ("m", lambda m: _in_first(m, _first(m, m.point))),
+    "frame_axes_in_first": ("1", _axes_in_first),
+    "frame_velocity_in_first": ("m/s", lambda m: _in_first(m, _velocity_in_first(m))),
+    "frame_angular_velocity_in_first": ("rad/s", lambda m: _in_first(m, _first(m, m.w))),
     "frame_acceleration": ("m/s²", lambda m: m.point_acceleration),
     "frame_acceleration_local": ("m/s²", lambda m: m.local(m.point_acceleration)),
     "frame_proper_acceleration": ("m/s²", lambda m: m.point_acceleration.minus(m.gravity)),

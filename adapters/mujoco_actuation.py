@@ -1,0 +1,314 @@
+"""Springs, dampers, efforts and rotors of joints by MuJoCo's actuators and tendons, and shapes of bodies.
+
+Each takes over, for one evaluation, what the joints have: the forces are the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from plumbline.model.datatypes import Array, Float
+from plumbline.model.kinematics import rotation_matrix
+
+J = mujoco.mjtJoint
+DOFS = {J.mjJNT_FREE: 6, J.mjJNT_BALL: 3, J.mjJNT_HINGE: 1, J.mjJNT_SLIDE: 1}
+GEAR, COEFFICIENT = -2.0, 0.5  # of actuators; of joints in fixed tendons
+# By way of an effort what its actuators have besides a gear.
+STATELESS: Mapping[str, Mapping[str, str]] = {
+    "motor": {}, "affine": {"gaintype": "mjtGain.mjGAIN_AFFINE"},
+    "parent": {"trntype": "mjtTrn.mjTRN_JOINTINPARENT"},
+}  # fmt: skip
+WITH_STATE: Mapping[str, Mapping[str, str]] = {
+    "integrator": {"dyntype": "mjtDyn.mjDYN_INTEGRATOR"}, "filter": {"dyntype": "mjtDyn.mjDYN_FILTER"},
+    "exact": {"dyntype": "mjtDyn.mjDYN_FILTEREXACT"},
+}  # fmt: skip
+BY_CALLBACK: Mapping[str, Mapping[str, str]] = {
+    "user": {"gaintype": "mjtGain.mjGAIN_USER", "biastype": "mjtBias.mjBIAS_USER"},
+    "own state": {"dyntype": "mjtDyn.mjDYN_USER"},
+}
+CALLBACKS = ("set_mjcb_act_gain", "set_mjcb_act_bias", "set_mjcb_act_dyn")
+SERVO: Mapping[str, Mapping[str, str]] = {"servo": {"biastype": "mjtBias.mjBIAS_AFFINE"}, "motor": {}}
+FAR = 1e6  # of limits that are never reached [rad, m, N or N m]
+
+
+def _named_joints(spec: Any) -> list[Any]:
+    joints = [joint for body in spec.bodies for joint in body.joints]
+    for j, joint in enumerate(joints):
+        joint.name = joint.name or f"joint {j}"
+    return joints
+
+
+def with_actuators(ways: Mapping[str, Mapping[str, str]]) -> Callable[[Any], Any]:
+    """Add to every rate of every joint an actuator of each way, without a force so far."""
+
+    def describe(spec: Any) -> Any:
+        for joint in _named_joints(spec):
+            for way, members in ways.items():
+                for i in range(DOFS[joint.type]):
+                    actuator = spec.add_actuator()
+                    actuator.name, actuator.target = f"{way} of {joint.name} {i}", joint.name
+                    actuator.trntype, actuator.gear = mujoco.mjtTrn.mjTRN_JOINT, GEAR * np.eye(6)[i]
+                    actuator.gainprm[0], actuator.dynprm[0] = 1.0, 0.1
+                    for name, member in members.items():
+                        enumeration, _, entry = member.partition(".")
+                        setattr(actuator, name, getattr(getattr(mujoco, enumeration), entry))
+                    if actuator.dyntype == mujoco.mjtDyn.mjDYN_USER:
+                        actuator.actdim = 1
+        _add_sensors(spec)
+        return spec
+
+    return describe
+
+
+def _add_sensors(spec: Any) -> None:
+    """Add sensors of the forces of actuators, and of those at scalar joints and at tendons."""
+    scalar = [x for body in spec.bodies for x in body.joints if DOFS[x.type] == 1]
+    for kind, of, elements in (
+        ("JOINTACTFRC", "JOINT", scalar),
+        ("ACTUATORFRC", "ACTUATOR", spec.actuators),
+        ("TENDONACTFRC", "TENDON", spec.tendons),
+    ):
+        for i, one in enumerate(elements):
+            if not hasattr(mujoco.mjtSensor, f"mjSENS_{kind}"):
+                continue
+            one.name = one.name or f"{of} {i}"
+            sensor = spec.add_sensor()
+            sensor.name, sensor.type = f"{kind} {one.name}", getattr(mujoco.mjtSensor, f"mjSENS_{kind}")
+            sensor.objtype, sensor.objname = getattr(mujoco.mjtObj, f"mjOBJ_{of}"), one.name
+
+
+def _actuators(m: Any, way: str) -> Iterator[tuple[int, int, int]]:
+    """The actuators of a way, with joint and rate."""
+    for j in range(m.njnt):
+        for i in range(DOFS[J(m.jnt_type[j])]):
+            yield m.actuator(f"{way} of {m.joint(j).name} {i}").id, j, i
+
+
+def _set_efforts(m: Any, d: Any, ways: Mapping[str, Mapping[str, str]], effort: Array) -> None:
+    """Share the efforts of all joints equally among the ways."""
+    for way, members in ways.items():
+        share = effort / len(ways)
+        for a, j, i in _actuators(m, way):
+            at, rate = m.jnt_qposadr[j], m.jnt_dofadr[j] + i
+            wanted = share[rate]
+            turned = DOFS[J(m.jnt_type[j])] - 3  # where the attitude of a free joint starts
+            if way == "parent" and 0 <= turned <= i:
+                first = m.jnt_dofadr[j] + turned
+                q = d.qpos[at + turned : at + turned + 4]
+                wanted = (rotation_matrix(q / np.linalg.norm(q)) @ share[first : first + 3])[i - turned]
+            if way == "affine":
+                length = GEAR * d.qpos[at] if DOFS[J(m.jnt_type[j])] == 1 else 0.0
+                speed = GEAR * d.qvel[rate]
+                gain = 2.0, 0.5 / (1 + abs(length)), 0.5 / (1 + abs(speed))
+                m.actuator_gainprm[a, :3] = gain if length else (2.0, 0.0, 0.5 / (1 + abs(speed)))
+                wanted /= m.actuator_gainprm[a, :3] @ [1.0, length, speed]
+            if "dyntype" in members:
+                d.act[m.actuator_actadr[a]] = wanted / GEAR
+            else:
+                d.ctrl[_control(m, a)] = wanted / GEAR
+
+
+def _control(m: Any, a: int) -> int:
+    """The control of an actuator; in older versions they have the same number."""
+    return int(m.actuator_ctrladr[a]) if hasattr(m, "actuator_ctrladr") else a
+
+
+def forward_by_actuators(ways: Mapping[str, Mapping[str, str]], read: str = "") -> Callable[[Any, Any], None]:
+    """Let actuators exert the efforts, and servos be springs and dampers, for one evaluation.
+
+    Args:
+        read: sensors by whose forces the acceleration is found.
+
+    """
+
+    def forward(m: Any, d: Any) -> None:
+        effort, saved = d.qfrc_applied.copy(), (m.jnt_stiffness.copy(), m.dof_damping.copy())
+        d.qfrc_applied[:] = 0.0
+        if "servo" in ways:
+            _set_servos(m, d)
+        _set_efforts(m, d, {way: x for way, x in ways.items() if way != "servo"}, effort)
+        mujoco.mj_forward(m, d)
+        if read:
+            _accelerate_by_sensors(m, d, read)
+        m.jnt_stiffness[:], m.dof_damping[:] = saved
+        d.qfrc_applied[:] = effort
+        if "servo" in ways:
+            mujoco.mj_energyPos(m, d)  # servos have no energy
+
+    return forward
+
+
+def _set_servos(m: Any, d: Any) -> None:
+    for a, j, i in _actuators(m, "servo"):
+        rate = m.jnt_dofadr[j] + i
+        m.actuator_biasprm[a, 2] = -m.dof_damping[rate] / GEAR**2
+        if DOFS[J(m.jnt_type[j])] == 1:  # a ball's spring stays
+            stiffness = float(np.ravel(m.jnt_stiffness[j])[0]) / GEAR**2
+            m.actuator_gainprm[a, 0], m.actuator_biasprm[a, 1] = stiffness, -stiffness
+            d.ctrl[_control(m, a)] = GEAR * m.qpos_spring[m.jnt_qposadr[j]]
+            m.jnt_stiffness[j] = 0.0
+        else:
+            m.actuator_gainprm[a, 0] = 0.0
+    m.dof_damping[:] = 0.0
+
+
+def _accelerate_by_sensors(m: Any, d: Any, kind: str) -> None:
+    """Find the acceleration with the forces of actuators that sensors report."""
+    force = d.qfrc_actuator.copy()
+    if kind == "JOINTACTFRC":
+        for j in range(m.njnt):
+            if DOFS[J(m.jnt_type[j])] == 1:
+                force[m.jnt_dofadr[j]] = d.sensor(f"{kind} {m.joint(j).name}").data[0]
+    else:
+        moment = dense_moment(m, d)
+        exerted = np.array([d.sensor(f"{kind} {m.actuator(a).name}").data[0] for a in range(len(moment))])
+        force = exerted @ moment
+    total = d.qfrc_smooth - d.qfrc_actuator + force
+    mujoco.mj_solveM(m, d, d.qacc[None], total[None])
+
+
+def dense_moment(m: Any, d: Any) -> Float[Array, "nu nv"]:
+    """Moments of all actuators; older versions hold them so."""
+    if d.actuator_moment.ndim == 2:
+        return np.asarray(d.actuator_moment)
+    dense = np.zeros((len(d.moment_rownnz), m.nv))
+    for row, at, count in zip(dense, d.moment_rowadr, d.moment_rownnz, strict=True):
+        row[d.moment_colind[at : at + count]] = d.actuator_moment[at : at + count]
+    return dense
+
+
+def forward_by_callbacks(m: Any, d: Any) -> None:
+    """Exert the efforts by gains, biases and activations that callbacks return."""
+
+    def gain(_: Any, data: Any, a: int) -> float:
+        return 2.0
+
+    def bias(_: Any, data: Any, a: int) -> float:
+        return float(-data.ctrl[_control(m, a)])
+
+    for name, given in zip(CALLBACKS, (gain, bias, lambda *_: 0.5), strict=True):
+        getattr(mujoco, name)(given)
+    try:
+        forward_by_actuators(BY_CALLBACK)(m, d)
+    finally:
+        for name in CALLBACKS:
+            getattr(mujoco, name)(None)
+
+
+# -- tendons -----------------------------------------------------------------------------------------
+
+
+def with_fixed_tendons(spec: Any) -> Any:
+    """Add a tendon on every hinge and slide, with a motor."""
+    for joint in _named_joints(spec):
+        if DOFS[joint.type] == 1:
+            tendon = spec.add_tendon()
+            tendon.name = f"of {joint.name}"
+            tendon.wrap_joint(joint.name, COEFFICIENT)
+            actuator = spec.add_actuator()
+            actuator.name = actuator.target = tendon.name
+            actuator.trntype, actuator.gear = mujoco.mjtTrn.mjTRN_TENDON, GEAR * np.eye(6)[0]
+    _add_sensors(spec)
+    return spec
+
+
+def elements_on_tendons(m: Any, d: Any) -> tuple[Any, Any]:
+    """Move springs, dampers and rotors of hinges and slides to their tendons."""
+    for j, t in _tendons(m):
+        rate = m.jnt_dofadr[j]
+        m.tendon_stiffness[t] = np.asarray(m.jnt_stiffness)[j] / COEFFICIENT**2
+        m.tendon_damping[t], m.tendon_armature[t] = (
+            x[rate] / COEFFICIENT**2 for x in (m.dof_damping, m.dof_armature)
+        )
+        m.tendon_lengthspring[t] = COEFFICIENT * m.qpos_spring[m.jnt_qposadr[j]]
+        m.jnt_stiffness[j] = m.dof_damping[rate] = m.dof_armature[rate] = 0.0
+    return m, d
+
+
+def _tendons(m: Any) -> list[tuple[int, int]]:
+    """Pairs of hinge or slide and tendon."""
+    scalar = [j for j in range(m.njnt) if DOFS[J(m.jnt_type[j])] == 1]
+    return [(j, m.tendon(f"of {m.joint(j).name}").id) for j in scalar]
+
+
+def forward_by_tendons(m: Any, d: Any) -> None:
+    """Exert the efforts of hinges and slides by motors on their tendons, as their sensors report them.
+
+    These report the motors' forces without their gear: docs/surface/mujoco_tendon_actuator_force.py.
+    """
+    effort = d.qfrc_applied.copy()
+    for j, t in _tendons(m):
+        rate = m.jnt_dofadr[j]
+        a = m.actuator(m.tendon(t).name).id
+        d.ctrl[_control(m, a)] = effort[rate] / (GEAR * COEFFICIENT)
+        d.qfrc_applied[rate] = 0.0
+    mujoco.mj_forward(m, d)
+    total = d.qfrc_smooth.copy()
+    for j, t in _tendons(m):
+        rate, sensor = m.jnt_dofadr[j], d.sensor(f"TENDONACTFRC {m.tendon(t).name}")
+        total[rate] += COEFFICIENT * GEAR * sensor.data[0] - effort[rate]
+    mujoco.mj_solveM(m, d, d.qacc[None], total[None])
+    d.qfrc_applied[:] = effort
+
+
+# -- what has no effect ------------------------------------------------------------------------------
+
+
+def with_far_limits(spec: Any) -> Any:
+    """Limit joints, controls and forces where nothing reaches, and add motors that are switched off."""
+    for joint in _named_joints(spec):
+        if joint.type != J.mjJNT_FREE:
+            joint.limited, joint.range = mujoco.mjtLimited.mjLIMITED_TRUE, [-FAR, FAR]
+        if joint.type == J.mjJNT_BALL:
+            joint.range = [0.0, FAR]
+        if DOFS[joint.type] == 1:
+            joint.actfrclimited, joint.actfrcrange = mujoco.mjtLimited.mjLIMITED_TRUE, [-FAR, FAR]
+        actuator = spec.add_actuator()
+        actuator.name, actuator.target, actuator.group = f"off {joint.name}", joint.name, 3
+        actuator.trntype = mujoco.mjtTrn.mjTRN_JOINT
+    for actuator in spec.actuators:
+        actuator.forcelimited = actuator.ctrllimited = mujoco.mjtLimited.mjLIMITED_TRUE
+        actuator.forcerange = actuator.ctrlrange = [-FAR, FAR]
+    return spec
+
+
+def without_group(m: Any, d: Any) -> tuple[Any, Any]:
+    """Switch a group of actuators off."""
+    m.opt.disableactuator = 1 << 3
+    return m, d
+
+
+def forward_with_group_off(m: Any, d: Any) -> None:
+    """Give the actuators that are off something to exert."""
+    for a in range(m.nu):
+        if m.actuator(a).name.startswith("off "):
+            d.ctrl[a] = 1.0 + a
+    mujoco.mj_forward(m, d)
+
+
+def forward_without_gravity(m: Any, d: Any) -> None:
+    """Apply the weights as forces on the bodies, with gravity compensated or, without such bodies, off."""
+    loads, flags, is_compensated = d.xfrc_applied.copy(), m.opt.disableflags, np.any(m.body_gravcomp)
+    d.xfrc_applied[:, :3] += m.body_mass[:, None] * m.opt.gravity
+    if not is_compensated:
+        m.opt.disableflags = flags | int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
+    mujoco.mj_forward(m, d)
+    m.opt.disableflags = flags
+    d.xfrc_applied[:] = loads
+    mujoco.mj_energyPos(m, d)
+
+
+def with_gravcomp(spec: Any) -> Any:
+    """Mark all bodies, so that the compiler counts them."""
+    for body in list(spec.bodies)[1:]:
+        body.gravcomp = 1.0
+    return spec
+
+
+def names_of(ways: Mapping[str, Mapping[str, str]]) -> tuple[str, ...]:
+    """The members that ways have."""
+    return tuple(dict.fromkeys(member for members in ways.values() for member in members.values()))
