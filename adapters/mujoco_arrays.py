@@ -13,6 +13,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from plumbline.engines.missing_names import add_parts
 from plumbline.model.datatypes import Array, Call, Float
 from plumbline.model.kinematics import quaternion_exponential, quaternion_product, rotation_matrix
 from plumbline.model.probe_frames import PROBE_ATTITUDE
@@ -24,8 +25,18 @@ SCALAR = {mujoco.mjtJoint.mjJNT_HINGE: "HINGE", mujoco.mjtJoint.mjJNT_SLIDE: "SL
 
 def add_arrays(found: Found, m: Any, d: Any, links: Sequence[int], sites: Sequence[int]) -> None:
     """Add all after `mj_forward` and `mj_rnePostConstraint`; all answers are of the bodies ``links``."""
-    _add_attitudes(found, m, d, links, sites)
-    _add_joint_frames(found, m, d, links)
+    add_parts(
+        found,
+        lambda: _add_motions(found, m, d, links, sites),
+        lambda: _add_views(found, d, links, sites),
+        lambda: _add_wrenches(found, m, d, links, sites),
+        lambda: _add_joint_frames(found, m, d, links),
+        lambda: _add_inertias(found, m, d),
+        lambda: _add_attitudes(found, m, d, links, sites),
+    )
+
+
+def _add_motions(found: Found, m: Any, d: Any, links: Sequence[int], sites: Sequence[int]) -> None:
     point, root = d.site_xpos[sites], d.subtree_com[m.body_rootid[links]]
     velocity, dots = np.zeros((2, m.nbody, 6))
     for b in range(1, m.nbody):
@@ -44,9 +55,6 @@ def add_arrays(found: Found, m: Any, d: Any, links: Sequence[int], sites: Sequen
         found[quantity][f"MjData.{name}",] = at + np.cross(d.cvel[links, :3], speed)
         found["frame_angular_acceleration"][f"MjData.{name}",] = spin.copy()
     _add_spatial_transforms(found, d, links, sites, root)
-    _add_views(found, d, links, sites)
-    _add_inertias(found, m, d)
-    _add_wrenches(found, m, d, links, sites)
 
 
 def _add_spatial_transforms(
@@ -72,9 +80,8 @@ def _add_views(found: Found, d: Any, links: Sequence[int], sites: Sequence[int])
         ("ten", "frame_distance", "length", 1.5),
         ("actuator", "frame_distance", "length", 3.0),
     ):
-        if hasattr(d, kind):
-            views = [getattr(getattr(d, kind)(f"probe {k}"), read) for k in count]
-            found[quantity][f"MjData.{kind}",] = np.array([np.ravel(view) for view in views]) / size
+        views = [getattr(getattr(d, kind)(f"probe {k}"), read) for k in count]
+        found[quantity][f"MjData.{kind}",] = np.array([np.ravel(view) for view in views]) / size
     value = np.array([d.sensor(f"FRAMEPOS {k}").data.copy() for k in count])
     found["frame_position"]["MjData.sensor",] = value
 
@@ -89,17 +96,20 @@ def _axes(turn: Array) -> Array:
 
 
 def _add_attitudes(found: Found, m: Any, d: Any, links: Sequence[int], sites: Sequence[int]) -> None:
-    back, axes = rotation_matrix(m.body_iquat[links]).mT, found["frame_axes"]
-    axes["MjData.site_xquat",] = rotation_matrix(d.site_xquat[sites]).mT.reshape(-1, 3)
-    axes["MjData.xquat",] = _axes(rotation_matrix(d.xquat[links]))
-    axes["MjData.xmat",] = _axes(d.xmat[links].reshape(-1, 3, 3))
-    axes["MjData.xiquat",] = _axes(rotation_matrix(d.xiquat[links]) @ back)
-    axes["MjData.ximat",] = _axes(d.ximat[links].reshape(-1, 3, 3) @ back)
+    none, inertial = np.broadcast_to(np.eye(3), (len(links), 3, 3)), rotation_matrix(m.body_iquat[links])
+    probe = np.broadcast_to(PROBE, none.shape)
+    for name, own, ids in (
+        ("site_xquat", probe, sites), ("xquat", none, links), ("xmat", none, links),
+        ("xiquat", inertial, links), ("ximat", inertial, links),
+    ):  # fmt: skip
+        turn = getattr(d, name)[ids]
+        turn = rotation_matrix(turn) if name.endswith("quat") else turn.reshape(-1, 3, 3)
+        found["frame_axes"][f"MjData.{name}",] = _axes(turn @ own.mT)
     places, turns = np.zeros((len(links), 3)), np.zeros((len(links), 9))
-    none = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+    same = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
     for site, body, place, turn in zip(sites, links, places, turns, strict=True):
-        mujoco.mj_local2Global(d, place, turn, m.site_pos[site], m.site_quat[site], body, none)
-    axes["mj_local2Global", "mjtSameFrame"] = turns.reshape(-1, 3, 3).mT.reshape(-1, 3)
+        mujoco.mj_local2Global(d, place, turn, m.site_pos[site], m.site_quat[site], body, same)
+    found["frame_axes"]["mj_local2Global", "mjtSameFrame"] = turns.reshape(-1, 3, 3).mT.reshape(-1, 3)
     found["frame_position"]["mj_local2Global", "mjtSameFrame"] = places
 
 
@@ -195,20 +205,20 @@ def _add_inertias(found: Found, m: Any, d: Any) -> None:
     rotors = float(m.dof_armature @ v**2)
     total = sum(d.cvel[b] @ spatial_inertia(d.cinert[b]) @ d.cvel[b] for b in range(1, m.nbody))
     energy["MjData.cinert",] = np.array([[(total + rotors) / 2]])
-    total = rotors
+    total, d.crb[:] = rotors, 0.0
+    mujoco.mj_crb(m, d)
     for i in range(m.nv):
         momentum, j = spatial_inertia(d.crb[m.dof_bodyid[i]]) @ d.cdof[i] * v[i], i
         total += momentum @ d.cdof[i] * v[i]
         while (j := m.dof_parentid[j]) >= 0:
             total += 2 * momentum @ d.cdof[j] * v[j]
-    energy["MjData.crb",] = np.array([[total / 2]])
-    if hasattr(m, "M_rowadr"):
-        total = 0.0
-        for i, (at, count) in enumerate(zip(m.M_rowadr, m.M_rownnz, strict=True)):
-            of_row = slice(at, at + count - 1)
-            pivot = v[i] + d.qLD[of_row] @ v[m.M_colind[of_row]]
-            total += d.qLD[at + count - 1] * pivot**2
-        energy["MjData.qLD",] = np.array([[total / 2]])
+    energy["mj_crb", "MjData.crb"] = np.array([[total / 2]])
+    total = 0.0
+    for i, (at, count) in enumerate(zip(m.M_rowadr, m.M_rownnz, strict=True)):
+        of_row = slice(at, at + count - 1)
+        pivot = v[i] + d.qLD[of_row] @ v[m.M_colind[of_row]]
+        total += d.qLD[at + count - 1] * pivot**2
+    energy["MjData.qLD",] = np.array([[total / 2]])
 
 
 def _add_wrenches(found: Found, m: Any, d: Any, links: Sequence[int], sites: Sequence[int]) -> None:

@@ -253,8 +253,6 @@ def _add_frames(found: Found, m: Any, d: Any, links: Sequence[int], sites: Seque
         ("MjData.geom_xmat",): d.geom_xmat[geoms].reshape(-1, 3, 3).mT.reshape(-1, 3),
         ("MjData.cam_xmat",): d.cam_xmat[cameras].reshape(-1, 3, 3).mT.reshape(-1, 3),
     }
-    if hasattr(d, "geom_xquat"):
-        found["frame_axes"]["MjData.geom_xquat",] = rotation_matrix(d.geom_xquat[geoms]).mT.reshape(-1, 3)
     for kind, ids in (("SITE", sites), ("GEOM", geoms), ("CAMERA", cameras), ("XBODY", links)):
         for function, quantities in OBJECT_MOTIONS.items():
             for is_local, suffix in enumerate(("", "_local") if kind != "XBODY" else ("",)):
@@ -270,6 +268,7 @@ def _add_frames(found: Found, m: Any, d: Any, links: Sequence[int], sites: Seque
                         quantity = "body_velocity"
                     found[quantity + suffix][function, f"mjtObj.mjOBJ_{kind}"] = half.copy()
     _add_jacobians(found, m, d, links, sites)
+    found["frame_axes"]["MjData.geom_xquat",] = rotation_matrix(d.geom_xquat[geoms]).mT.reshape(-1, 3)
 
 
 def _add_relative(found: Found, m: Any, d: Any, count: int) -> None:

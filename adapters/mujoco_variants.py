@@ -86,7 +86,7 @@ PARTS = (  # the functions that the stages of positions and velocities call
 )  # fmt: skip
 OTHER_PARTS = (
     "mj_fwdKinematics",
-    *("mj_crb" if x == "mj_makeM" else x for x in PARTS[3:]),
+    *PARTS[3:],
 )
 
 
@@ -599,7 +599,11 @@ VARIANTS = (
     _free(
         "spelling", ("mjtOrientation.mjORIENTATION_XYAXES",), describe=_oriented("XYAXES", "xyaxes", _xy_axes)
     ),
-    _free("spelling", ("mjtOrientation.mjORIENTATION_ZAXIS",), describe=shapes.in_z_frames),
+    _free(
+        "spelling",
+        ("mjtOrientation.mjORIENTATION_ZAXIS",),
+        describe=shapes.in_z_frames,
+    ),
     _free("spelling", ("MjsDefault",), describe=shapes.attached),
     Variant(
         "spelling",
