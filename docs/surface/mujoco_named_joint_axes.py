@@ -1,6 +1,6 @@
 """MuJoCo before 4.0: cdof and cdof_dot of a joint by its name or number are not the joint's.
 
-In 3.2.0, 3.2.7, 3.3.2, 3.6.0, 3.12.0 and 3.13.0 `data.joint(j).cdof` starts at the j-th number of the array in
+In 3.2.0, 3.2.7, 3.3.2, 3.6.0, 3.12.0 and 3.13.0 `data.joint(j).cdof` starts at the j-th number of the array,
 place of the j-th row.  In 4.0.0 both ways give the same.
 """
 
