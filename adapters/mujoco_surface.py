@@ -15,8 +15,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from plumbline.engines.missing_names import add_parts
 from adapters.mujoco_arrays import add_arrays
+from plumbline.engines.missing_names import add_parts
 from plumbline.model.datatypes import Array, Call, Float, Model
 from plumbline.model.kinematics import quaternion_product, rotation_matrix
 from plumbline.model.probe_frames import PROBE_ATTITUDE, anchor_point, probe_points
