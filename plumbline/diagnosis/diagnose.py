@@ -148,9 +148,9 @@ class _Diagnosing:
             return beside
         return (
             found
-            or self._single_of_loops(BODIES_KEPT, wrong)
+            or self._single_of_another_kind(BODIES_KEPT, wrong)
             or self._two_or_more(beside)
-            or self._single_of_loops(ENDS_BY_TWISTS, wrong)  # says nothing of wrenches
+            or self._single_of_another_kind(ENDS_BY_TWISTS, wrong)  # says nothing of wrenches
             or self._forces()
             or self._partly(wrong)
             or (self._unexplained(wrong),)
@@ -212,9 +212,9 @@ class _Diagnosing:
         found = self._proved(view, found, mask)
         return self._named(found) if found else ()
 
-    def _single_of_loops(self, view: View, wrong: Sequence[str]) -> tuple[Cause, ...]:
-        """The same of engines that take a state of a mechanism with loops in another way."""
-        if not self.model.has_loops or not set(VECTORS[:2]) & set(wrong):
+    def _single_of_another_kind(self, view: View, wrong: Sequence[str]) -> tuple[Cause, ...]:
+        """The same of engines in maximal coordinates, or that take a state with loops in another way."""
+        if not (view.are_bodies_kept or self.model.has_loops) or not set(VECTORS[:2]) & set(wrong):
             return ()
         return self._single(view) or self._single(view, are_sums_apart=True)
 

@@ -186,9 +186,9 @@ class Search:
         self.difference = difference
         view, model = difference.view, difference.model
         case = difference.predictor.case
-        # other numbers act as in joint coordinates
+        # other numbers act as in joint coordinates, and without loops all do
         is_of_lengths = view.are_bodies_kept or view.end_rows == "twists"
-        every = () if of_terms_alone else number_edits(case)
+        every = () if of_terms_alone or (is_of_lengths and not model.has_loops) else number_edits(case)
         self.numbers = [one for one in every if not is_of_lengths or one.cause.unit in LENGTHS]
         self.fixed = list[Edit]()
         if not is_of_lengths:
@@ -212,12 +212,13 @@ class Search:
         """γ of rows of joints that an engine in maximal coordinates leaves out."""
         predictor = self.difference.predictor
         at = list(predictor.each_state(predictor.case))
-        for k in range(len(model.kind)):
-            if not model.free[k]:
-                answers = predictor.of_bodies(at, k)
-                change = {name: answers[name] - predictor.right[name] for name in VECTORS}
-                cause = Cause("term", "γ of the rows", f"joint {k + 1}", "missing")
-                yield Edit(cause, effect=self.difference.flat_vectors(change))
+        joints = [k for k in range(len(model.kind)) if not model.free[k]]
+        places = {f"joint {k + 1}": [k] for k in joints} | ({"all joints": joints} if joints[1:] else {})
+        for place, some in places.items():
+            answers = predictor.of_bodies(at, some)
+            change = {name: answers[name] - predictor.right[name] for name in VECTORS}
+            cause = Cause("term", "γ of the rows", place, "missing")
+            yield Edit(cause, effect=self.difference.flat_vectors(change))
 
     def _whole_numbers(self) -> list[tuple[Combination, Array]]:
         """The amounts of words of numbers that may vanish."""

@@ -244,7 +244,7 @@ class Predictor:
             found[name] = x[:, joints if name in WRENCHES else joints[: self.case.model.n]]
         return determinate(self.case.model, found, projectors)
 
-    def of_bodies(self, seen: Sequence[tuple[Model, State]], missing_gamma: int | None = None) -> Answers:
+    def of_bodies(self, seen: Sequence[tuple[Model, State]], missing_gamma: Sequence[int] = ()) -> Answers:
         """Predict quantities of bodies where they are, in maximal coordinates; (lanes times S, ...)."""
         each = [maximal_quantities(*one, missing_gamma) for one in seen]
         answers = {name: np.stack([one[name] for one in each]) for name in QUANTITIES}
@@ -274,17 +274,17 @@ def determinate(model: Model, answers: Answers, projectors: Sequence[Array | Non
     return answers | {"joint_reaction": wrench[..., :3], "joint_moment": wrench[..., 3:] * length}
 
 
-def maximal_quantities(model: Model, state: State, missing_gamma: int | None) -> Answers:
+def maximal_quantities(model: Model, state: State, missing_gamma: Sequence[int]) -> Answers:
     """Evaluate quantities in maximal coordinates, by the notes' rows.
 
     Args:
-        missing_gamma: a joint whose rows have no γ.
+        missing_gamma: joints whose rows have no γ.
 
     """
     at = state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
     system, rows = DirectSystem(model), constraint_rows(model, *at)
     change = np.zeros(len(system.joint))
-    change[: len(rows.gamma)] = np.where(rows.joint == missing_gamma, -rows.gamma, 0.0)
+    change[: len(rows.gamma)] = np.where(np.isin(rows.joint, missing_gamma), -rows.gamma, 0.0)
     found = system.solve(*at, change, joint_coordinates(model, state)[2])
     assert found.joint_moment is not None
     a = rotation_matrix(state.p)

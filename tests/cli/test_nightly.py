@@ -89,7 +89,7 @@ def test_a_random_scenario_is_a_file_like_any_other(tmp_path):
 
 
 def test_random_mechanisms_cover_every_joint_element_and_topology():
-    drawn = list(RandomScenarios(5, 0, mechanism_count=120))
+    drawn = list(RandomScenarios(5, 0, mechanism_count=224))
     assert [s.digest for s in drawn[:3]] == [random_mechanism(5, k).digest for k in range(3)]
     assert RandomScenarios(5, 2, 1, 3).named("random-mechanism-5-2").digest == drawn[2].digest
     trees, loops, mixed = drawn[::4], drawn[1::4], [*drawn[2::4], *drawn[3::4]]
@@ -165,7 +165,7 @@ def test_a_night_with_every_level_has_its_coverage(tmp_path):
     assert {row["engine"] for row in covered if row["smallest"]} <= {"", "mujoco"}
     assert all(row["smallest"] or row["proof"] for row in covered)
     assert 'id="coverage"' in (place / "report.html").read_text(encoding="utf-8")
-    levels = {"state", "step", "trajectory", "invariants", "relations"}
+    levels = {"state", "surface", "step", "trajectory", "invariants", "relations"}
     assert {r.level for r in result.rows if r.scenario == "rest"} == levels
 
 
@@ -238,7 +238,8 @@ def test_an_unfinished_night_goes_on_with_its_seed(tmp_path, own_cells):
         "cells are private"
     )
     kept = sorted(own_cells.parent.glob("nights/*/*.cell"))
-    assert len(kept) == 1 + 4, "the description of the engine and the finished cells"
+    # the description of the engine and the finished cells; the worker may have finished the next one
+    assert len(kept) in (1 + 4, 1 + 5)
     for path in kept:  # what is kept is used: no cell of it is written again
         path.chmod(0o400)
     result, _ = run_nightly(tmp_path, seed=None)
@@ -290,8 +291,9 @@ def test_random_motions_run_at_every_level(tmp_path):
     levels = {}
     for row in rows:
         levels.setdefault(row["scenario"], set()).add(row["level"])
-    every = {"state", "step", "trajectory", "invariants", "relations"}
-    assert levels == {"random-motion-4-0": every, "random-motion-4-1": every, "random-4-0": {"state", "step"}}
+    few = {"state", "surface", "step"}
+    every = {*few, "trajectory", "invariants", "relations"}
+    assert levels == {"random-motion-4-0": every, "random-motion-4-1": every, "random-4-0": few}
     assert result.metadata["random_batch"]["trajectories"] == 2
     assert result.metadata["exit_code"] == 0, result.metadata["sentence"]
     summary = (place / "summary.md").read_text()

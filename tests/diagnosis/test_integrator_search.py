@@ -59,7 +59,7 @@ def test_no_integrator_is_named_where_none_is_wrong(engine, joints):
             return replace(model, gravity=model.gravity * (1 + 1e-5))
 
         text = explanation(adapter, integrator, joints, change=heavier)
-        named = "behaves as if the z component of gravity were -9.8100981 m/s² instead of -9.81 m/s²"
+        named = "behaves as if the size of gravity were 1.00001 times as large"
         assert text.startswith(named) or (engine == "exudyn" and "behaves as if" not in text), text
 
 

@@ -315,7 +315,7 @@ STATE_DEFECTS = (
            ("velocity term of the far body of joint 2 were missing",), R,
            patch=added_gamma(distal_gamma)),
     Defect("gamma-dropped", "γ = 0 (missing J̇v)",
-           ("velocity term of all joints were missing",), R, patch=without_gamma(0, 1)),
+           ("γ of the rows of all joints were missing",), R, patch=without_gamma(0, 1)),
     Defect("gamma-rod-dropped", "γ of rods without ḋᵀḋ",
            ("velocity term of the joint's own motion of all joints were missing",), R, "rods",
            patch=added_gamma(rod_gamma)),

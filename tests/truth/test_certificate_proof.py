@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from plumbline.model.datatypes import EngineFailure
+from plumbline.model.kinematics import stretched_length
 from plumbline.scenario.loader import find_scenario_file, load_scenario
 from plumbline.truth import TruthUnavailable, certificate_proof, import_truth_tool
 from plumbline.truth.certificate_file import Certificate, parse_certificate
@@ -306,12 +307,12 @@ def check_present_truth(scenario, duration):
     _, enclosure = prove_motion(scenario.model, scenario.state, times)
     truth = trajectory_truth(scenario.model, scenario.state, times)
     assert enclosure.radius("r") <= 1e-18
+    rounding = 2.0**-53 * float(np.sum(stretched_length(scenario.model)))  # of positions that arms add up to
     for k, r in enumerate(enclosure.r):
         error = [[abs(ball - arb(float(x))) for ball, x in zip(*pair, strict=True)]
                  for pair in zip(r, truth.trajectory.r[k], strict=True)]  # fmt: skip
-        rounding = 2.0**-53 * float(np.max(np.abs(truth.trajectory.r[k])))
         largest = max(float(np.linalg.norm([float(x.upper()) for x in row])) for row in error)
-        assert largest <= truth.uncertainty["position"][k] + 2 * rounding
+        assert largest <= truth.uncertainty["position"][k] + 2 * rounding + enclosure.radius("r")
 
 
 @pytest.mark.full
