@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from inspect import signature
 from typing import Any, Generic, TypeVar
 
@@ -12,13 +12,38 @@ import exudyn
 import numpy as np
 
 from plumbline.engines.metamorphic_hooks import MetamorphicHooks
-from plumbline.model.datatypes import Array, EngineFailure, Float, Model
+from plumbline.model.datatypes import Array, Call, EngineFailure, Float, Model
 
 Sample = TypeVar("Sample")
 items: Any = exudyn.itemInterface  # its constructors are untyped
 Output: Any = exudyn.OutputVariableType
 
+
+class OtherItems:
+    """The module of items with some of them made in other ways, by name."""
+
+    def __init__(self, **ways: Callable[..., Any]) -> None:
+        self._ways = ways
+
+    def __getattr__(self, name: str) -> Any:
+        return self._ways.get(name) or getattr(exudyn.itemInterface, name)
+
+
+def add_item(mbs: Any, item: Any) -> Any:
+    """Add a load, connector or joint; an item made in another way may add itself."""
+    if callable(item):
+        return item(mbs)
+    return (mbs.AddLoad if "Load" in type(item).__name__ else mbs.AddObject)(item)
+
+
 NEWTON_TOLERANCE = 1e-12  # relative and absolute; at the engine's defaults extrapolation stops at 2e-9
+
+NO_TOLERANCE = 1e30
+NAMES_OF_RUNS = (  # of Exudyn, that all steps are by
+    "MainSystem.SetPostStepUserFunction", "TimeIntegrationSettings", "LinearSolverSettings",
+    "LinearSolverType", "TimeIntegrationSettings.adaptiveStep", "TimeIntegrationSettings.automaticStepSize",
+    "TimeIntegrationSettings.endTime", "TimeIntegrationSettings.numberOfSteps",
+)  # fmt: skip
 
 
 class ExudynAdapter(MetamorphicHooks):
@@ -30,6 +55,12 @@ class ExudynAdapter(MetamorphicHooks):
     def version(self) -> str:
         """Return the version of the Exudyn that is loaded."""
         return _version()
+
+
+def whole_column(names: Mapping[str, str]) -> Sequence[tuple[Call, Callable[[Model], bool]]]:
+    """Names by class or module, as `Adapter.column_names` has those of all mechanisms."""
+    every = [f"{owner}.{name}".removeprefix(".") for owner, own in names.items() for name in own.split()]
+    return [(tuple(every), lambda _: True)]
 
 
 def make_system() -> tuple[Any, Any]:
@@ -56,7 +87,9 @@ def make_settings() -> Any:
     return settings
 
 
-def add_loads(mbs: Any, model: Model, k: int, marker: Any, ground: Any, moment: Float[Array, "3"]) -> None:
+def add_loads(
+    mbs: Any, model: Model, k: int, marker: Any, ground: Any, moment: Float[Array, "3"], items: Any = items
+) -> None:
     """Apply the loads of a body at its centre of mass, evaluated wherever the integrator evaluates forces.
 
     Drag is a damper to the ground with isotropic damping: F = -c_t ṙ, and -c_r ω in the world is -c_r ω′ in
@@ -67,27 +100,30 @@ def add_loads(mbs: Any, model: Model, k: int, marker: Any, ground: Any, moment: 
 
     """
     if np.any(model.force[k]):
-        mbs.AddLoad(items.LoadForceVector(markerNumber=marker, loadVector=model.force[k].tolist()))
+        add_item(mbs, items.LoadForceVector(markerNumber=marker, loadVector=model.force[k].tolist()))
     if np.any(moment):
-        mbs.AddLoad(items.LoadTorqueVector(markerNumber=marker, loadVector=moment.tolist(), bodyFixed=True))
+        torque = items.LoadTorqueVector(markerNumber=marker, loadVector=moment.tolist(), bodyFixed=True)
+        add_item(mbs, torque)
     if model.drag_force[k] or model.drag_moment[k]:
         damping = np.diag(np.repeat([model.drag_force[k], model.drag_moment[k]], 3))
-        mbs.AddObject(
+        add_item(
+            mbs,
             items.ObjectConnectorRigidBodySpringDamper(
                 markerNumbers=[ground, marker], stiffness=np.zeros((6, 6)), damping=damping
-            )
+            ),
         )
 
 
-def add_point_spring(mbs: Any, model: Model, i: int, markers: list[Any]) -> None:
+def add_point_spring(mbs: Any, model: Model, i: int, markers: list[Any], items: Any = items) -> None:
     """Add a spring and damper between two points."""
-    mbs.AddObject(
+    add_item(
+        mbs,
         items.ObjectConnectorSpringDamper(
             markerNumbers=markers,
             referenceLength=float(model.spring_length[i]),
             stiffness=float(model.spring_stiffness[i]),
             damping=float(model.spring_damping[i]),
-        )
+        ),
     )
 
 
@@ -120,12 +156,18 @@ def _code(value: Any) -> str:
 
 
 @contextlib.contextmanager
-def initialized_solver(solver: Any, mbs: Any, settings: Any) -> Iterator[None]:
+def initialized_solver(
+    solver: Any,
+    mbs: Any,
+    settings: Any,
+    initialize: Callable[[Any, Any, Any], bool] = lambda solver, *rest: bool(solver.InitializeSolver(*rest)),
+) -> Iterator[None]:
     """Initialise a solver for a single evaluation, and finalise it at the end.
 
     Args:
         solver: one of Exudyn's main solvers, not initialised.
         mbs: the assembled system.
+        initialize: takes these and the settings.
 
     Yields:
         Nothing.
@@ -134,7 +176,7 @@ def initialized_solver(solver: Any, mbs: Any, settings: Any) -> Iterator[None]:
         EngineFailure: the solver could not be initialised.
 
     """
-    if not solver.InitializeSolver(mbs, settings):
+    if not initialize(solver, mbs, settings):
         raise EngineFailure(f"Exudyn could not initialise its solver: {solver.GetErrorString()}")
     try:
         yield
@@ -318,9 +360,15 @@ def set_linear_solver(settings: Any, name: str) -> None:
         settings.linearSolverType = kind
 
 
-def set_rk44(settings: Any) -> None:
-    """Choose RK44, without the accelerations at the end of a step, which nothing here reads."""
-    time, kind = settings.timeIntegration, exudyn.DynamicSolverType.RK44
+def set_explicit_method(settings: Any, name: str) -> None:
+    """Choose an explicit method, without the accelerations at the end of a step, which nothing here reads.
+
+    Args:
+        name: a member of ``exudyn.DynamicSolverType``.
+
+    """
+    time, kind = settings.timeIntegration, getattr(exudyn.DynamicSolverType, name)
+    time.absoluteTolerance = NO_TOLERANCE  # methods with an error estimate reject steps whatever is set
     if hasattr(time, "solverType"):
         time.solverType = kind
         time.explicit.computeEndOfStepAccelerations = False

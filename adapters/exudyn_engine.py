@@ -29,9 +29,11 @@ import numpy as np
 import scipy.linalg
 
 from adapters.exudyn_common import (
+    NAMES_OF_RUNS,
     NEWTON_TOLERANCE,
     ExudynAdapter,
     Output,
+    add_item,
     add_loads,
     add_point_spring,
     initialized_solver,
@@ -43,6 +45,7 @@ from adapters.exudyn_common import (
     run_solver,
     set_linear_solver,
     silence_engine,
+    whole_column,
     written_items,
 )
 from adapters.exudyn_surface import POSE_FUNCTIONS, Probes, pose_function
@@ -81,6 +84,14 @@ STEP_SETTINGS = {
     # numericalDifferentiation: relativeEpsilon × minimumCoordinateSize, of displacements that start at zero
     "difference_step": 1e-7 * 1e-2,
 }
+
+NAMES_OF_IMPLICIT = (
+    *NAMES_OF_RUNS, "MainSolverImplicitSecondOrder.SolveSystem", "TimeIntegrationSettings.newton",
+    "TimeIntegrationSettings.generalizedAlpha", "GeneralizedAlphaSettings", "NewtonSettings",
+    "GeneralizedAlphaSettings.computeInitialAccelerations", "NewtonSettings.absoluteTolerance",
+    "NewtonSettings.relativeTolerance", "NewtonSettings.maxIterations", "NewtonSettings.useModifiedNewton",
+    "LinearSolverType.EigenSparse",
+)  # fmt: skip
 
 
 class ExudynChain:
@@ -132,10 +143,16 @@ class ExudynChain:
             if last > first:
                 middle = [self._add_marker(piece, np.zeros(3)) for piece in (first, last)]
                 self.welds.append(mbs.AddObject(items.ObjectJointGeneric(markerNumbers=middle)))
-            add_loads(mbs, model, k, self._add_marker(first, np.zeros(3)), pivot, model.moment[k])
+            add_loads(
+                mbs, model, k, self._add_marker(first, np.zeros(3)), pivot, model.moment[k], change.items
+            )
         for i, (bodies, points) in enumerate(zip(model.spring_body, model.spring_point, strict=True)):
             add_point_spring(
-                mbs, model, i, [self._end_marker(*end) for end in zip(bodies, points, strict=True)]
+                mbs,
+                model,
+                i,
+                [self._end_marker(*end) for end in zip(bodies, points, strict=True)],
+                change.items,
             )
         for k in range(model.n, len(model.kind)):
             self._add_joint(k)
@@ -191,7 +208,7 @@ class ExudynChain:
             turns = rotation_matrix(model.turn[k])
             sign = -1 if what == "turn" and i and number == 1 else 1  # a universal joint's second axis
             if what == "slide":
-                connector = items.ObjectConnectorLinearSpringDamper(
+                connector = self.change.items.ObjectConnectorLinearSpringDamper(
                     markerNumbers=ends, axisMarker0=turns[0][:, number], offset=float(model.rest[k, i]),
                     force=float(-effort), **coefficients,
                 )  # fmt: skip
@@ -201,12 +218,12 @@ class ExudynChain:
                     items.NodeGenericData(initialCoordinates=[sign * self.x[k, i]], numberOfDataCoordinates=1)
                 )
                 local = np.roll(np.eye(3), -number - 1, axis=1) if sign > 0 else SECOND_AXIS
-                connector = items.ObjectConnectorTorsionalSpringDamper(
+                connector = self.change.items.ObjectConnectorTorsionalSpringDamper(
                     markerNumbers=ends[::sign], rotationMarker0=turns[::sign][0] @ local,
                     rotationMarker1=turns[::sign][1] @ local, offset=float(sign * model.rest[k, i]),
                     nodeNumber=last_angle, torque=float(-sign * effort), **coefficients,
                 )  # fmt: skip
-            self.connectors.append((k, self.mbs.AddObject(connector), what == "slide", sign * axis))
+            self.connectors.append((k, add_item(self.mbs, connector), what == "slide", sign * axis))
 
     def _end_marker(self, body: int, point: Array) -> Any:
         """Add a marker at a point of a body on which others hang, or of the world."""
@@ -280,6 +297,29 @@ class ExudynChain:
         return found
 
 
+# Names of Exudyn that all rows of the column are by, by class or module.
+COLUMN_NAMES = {
+    "":
+        "ConfigurationType MainSolverImplicitSecondOrder MainSystem OutputVariableType "
+        "SimulationSettings SystemContainer SystemData",
+    "MainSolverImplicitSecondOrder":
+        "ComputeJacobianAE ComputeMassMatrix ComputeODE2RHS FinalizeSolver GetSystemJacobian "
+        "GetSystemMassMatrix GetSystemResidual InitializeSolver SetSystemJacobian",
+    "MainSystem":
+        "AddLoad AddMarker AddNode AddObject Assemble GetObjectOutput systemData",
+    "OutputVariableType":
+        "KineticEnergy",
+    "SystemData":
+        "GetAECoordinates GetNodeLTGAE GetODE2Coordinates GetODE2Coordinates_t GetODE2Coordinates_tt "
+        "GetObjectLTGAE SetODE2Coordinates SetODE2Coordinates_t SetODE2Coordinates_tt",
+    "itemInterface":
+        "LoadForceVector LoadMassProportional LoadTorqueVector MarkerBodyMass MarkerBodyRigid "
+        "NodeGenericData NodeRigidBodyEP ObjectConnectorDistance ObjectConnectorLinearSpringDamper "
+        "ObjectConnectorRigidBodySpringDamper ObjectConnectorSpringDamper "
+        "ObjectConnectorTorsionalSpringDamper ObjectGround ObjectJointSpherical ObjectRigidBody",
+}  # fmt: skip
+
+
 class Exudyn(ExudynAdapter):
     """Maximal coordinates with Euler parameters: the closest peer of the notes' own form."""
 
@@ -297,6 +337,12 @@ class Exudyn(ExudynAdapter):
             solver_rtol=NEWTON_TOLERANCE,
             note="TrapezoidalIndex2: implicit trapezoidal rule, constraints on velocities",
             method=ConstrainedMethod(0.5, 0.5, 0.25, 0.5, "velocity", **STEP_SETTINGS),
+            names=(
+                "DynamicSolverType.TrapezoidalIndex2",
+                "GeneralizedAlphaSettings.useIndex2Constraints",
+                *NAMES_OF_IMPLICIT,
+                "GeneralizedAlphaSettings.useNewmark",
+            ),
         ),
         Integrator(
             "generalized-alpha",
@@ -306,9 +352,15 @@ class Exudyn(ExudynAdapter):
             solver_rtol=NEWTON_TOLERANCE,
             note="generalized-α with spectral radius 0.9, constraints on positions (index 3)",
             method=generalized_alpha(SPECTRAL_RADIUS, **STEP_SETTINGS),
+            names=(
+                "DynamicSolverType.GeneralizedAlpha",
+                "GeneralizedAlphaSettings.spectralRadius",
+                *NAMES_OF_IMPLICIT,
+            ),
         ),
     )
     variants = VARIANTS
+    column_names = whole_column(COLUMN_NAMES)
     usual_linear_solver = "EigenSparse"
     linear_solvers = ("EXUdense", "EigenDense")
     gaps: ClassVar[Mapping[str, str]] = {
@@ -554,15 +606,16 @@ def _system_matrices(chain: ExudynChain) -> tuple[Array, Array, Array]:
     """Return M (7N, 7N), f (7N,) and C (nc, 7N)."""
     settings = make_settings()
     settings.timeIntegration.generalizedAlpha.computeInitialAccelerations = False
-    solver: Any = exudyn.MainSolverImplicitSecondOrder()
-    with initialized_solver(solver, chain.mbs, settings):
+    solver: Any = chain.change.solver()
+    with initialized_solver(solver, chain.mbs, settings, chain.change.initialize):
         M, f = mass_matrix_and_force(solver, chain.mbs)
+        M = chain.change.mass_matrix(chain, M)
 
         def constraint_jacobian() -> Array:
             # ComputeJacobianAE adds to the Jacobian, which starts unset.
             solver.SetSystemJacobian(np.zeros_like(solver.GetSystemJacobian()))
             solver.ComputeJacobianAE(chain.mbs)
-            return np.array(solver.GetSystemJacobian())[len(M) :, : len(M)]
+            return chain.change.jacobian(chain, np.array(solver.GetSystemJacobian())[len(M) :, : len(M)])
 
         C = constraint_jacobian()
         chain.jacobian_rate = np.zeros_like(C)

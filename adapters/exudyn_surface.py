@@ -36,6 +36,21 @@ def _axes(values: Array) -> Array:
     return (values.reshape(-1, 3, 3) @ TURN).mT.reshape(-1, 3)
 
 
+def _axes_of_angles(values: Array) -> Array:
+    half = values[..., None] / 2
+    about = np.concatenate([np.cos(half), np.sin(half) * np.eye(3)], axis=-1)  # x, y and z
+    x, y, z = np.moveaxis(rotation_matrix(about), 1, 0)
+    return _axes(x @ y @ z)
+
+
+def _axes_of_poses(values: Array) -> Array:
+    return _axes(values.reshape(-1, 4, 4)[:, :3, :3])
+
+
+def _place_of_poses(values: Array) -> Array:
+    return values.reshape(-1, 4, 4)[:, :3, 3]
+
+
 def _table(module: str, text: str) -> dict[str, str]:
     lines = (line.partition(": ") for line in text.strip().splitlines())
     return {f"{module}.{name}": functions for name, _, functions in lines}
@@ -148,27 +163,43 @@ class _Output(NamedTuple):
     read: Callable[[Array], Array] = _as_given
 
 
-OUTPUTS = {
-    "Position": _Output("frame_position", "body_position", True),
-    "RotationMatrix": _Output("frame_axes", "frame_axes", True, _axes),
-    "Velocity": _Output("frame_velocity", "body_velocity", True),
-    "VelocityLocal": _Output("frame_velocity_local", read=_in_probe_axes),
-    "AngularVelocity": _Output("frame_angular_velocity", "frame_angular_velocity", True),
-    "AngularVelocityLocal": _Output(
-        "frame_angular_velocity_local", "frame_angular_velocity_local", True, _in_probe_axes
-    ),
-    "Acceleration": _Output("frame_acceleration", "body_acceleration"),
-    "AccelerationLocal": _Output("frame_acceleration_local", read=_in_probe_axes),
-    "AngularAcceleration": _Output("frame_angular_acceleration", "frame_angular_acceleration"),
-    "AngularAccelerationLocal": _Output("frame_angular_acceleration_local", read=_in_probe_axes),
-}
+def _weighted_sum(
+    mbs: Any, t: float, sensors: Sequence[Any], factors: Sequence[float], configuration: Any
+) -> list[float]:
+    values = [
+        factor * np.array(mbs.GetSensorValues(sensor, configuration))
+        for sensor, factor in zip(sensors, factors, strict=True)
+    ]
+    return [float(x) for x in np.sum(values, axis=0)]
+
+
+OUTPUTS = [
+    (name, output)
+    for name, output in (
+        ("Position", _Output("frame_position", "body_position", True)),
+        ("RotationMatrix", _Output("frame_axes", "frame_axes", True, _axes)),
+        ("Rotation", _Output("frame_axes", "frame_axes", True, _axes_of_angles)),
+        ("Velocity", _Output("frame_velocity", "body_velocity", True)),
+        ("VelocityLocal", _Output("frame_velocity_local", read=_in_probe_axes)),
+        ("AngularVelocity", _Output("frame_angular_velocity", "frame_angular_velocity", True)),
+        ("AngularVelocityLocal",
+         _Output("frame_angular_velocity_local", "frame_angular_velocity_local", True, _in_probe_axes)),
+        ("Acceleration", _Output("frame_acceleration", "body_acceleration")),
+        ("AccelerationLocal", _Output("frame_acceleration_local", read=_in_probe_axes)),
+        ("AngularAcceleration", _Output("frame_angular_acceleration", "frame_angular_acceleration")),
+        ("AngularAccelerationLocal", _Output("frame_angular_acceleration_local", read=_in_probe_axes)),
+        ("HomogeneousTransformation", _Output("frame_axes", "frame_axes", True, _axes_of_poses)),
+        ("HomogeneousTransformation", _Output("frame_position", "body_position", True, _place_of_poses)),
+    )
+    if hasattr(Output, name)  # not in older versions
+]  # fmt: skip
 OF_COORDINATES = {  # of nodes, whose first coordinates are those of the centre of mass
     "CoordinatesTotal": "body_position", "Coordinates_t": "body_velocity",
     "Coordinates_tt": "body_acceleration",
 }  # fmt: skip
-OF_BODIES = {name: output.quantity for name, output in OUTPUTS.items()}
-OF_NODES = {name: output.of_node for name, output in OUTPUTS.items() if output.of_node}
-OF_MARKERS = {name: output.quantity for name, output in OUTPUTS.items() if output.has_marker}
+OF_BODIES = [(name, output.quantity, output.read) for name, output in OUTPUTS]
+OF_NODES = [(name, output.of_node, output.read) for name, output in OUTPUTS if output.of_node]
+OF_MARKERS = [(name, output.quantity, output.read) for name, output in OUTPUTS if output.has_marker]
 
 
 class Probes:
@@ -188,17 +219,31 @@ class Probes:
             "MarkerNodeRigid": [mbs.AddMarker(items.MarkerNodeRigid(nodeNumber=x)) for x in nodes],
         }
         silent = {"writeToFile": False, "storeInternal": False}
-        self.sensors: dict[tuple[str, str, str], list[Any]] = defaultdict(list)  # by kind, output, quantity
+        # by kind, output, quantity and how it is read
+        self.sensors: dict[tuple[str, str, str, Callable[[Array], Array]], list[Any]] = defaultdict(list)
         for body, point, node, marker in zip(bodies, self.points, nodes, self.markers, strict=True):
-            places: Mapping[str, tuple[Mapping[str, str], Mapping[str, Any]]] = {
+            places: Mapping[str, tuple[list[Any], Mapping[str, Any]]] = {
                 "SensorBody": (OF_BODIES, {"bodyNumber": body, "localPosition": point}),
                 "SensorNode": (OF_NODES, {"nodeNumber": node}),
                 "SensorMarker": (OF_MARKERS, {"markerNumber": marker}),
             }
             for kind, (quantities, place) in places.items():
-                for name, quantity in quantities.items():
+                for name, quantity, read in quantities:
                     item = getattr(items, kind)(**place, outputVariableType=getattr(Output, name), **silent)
-                    self.sensors[kind, name, quantity].append(mbs.AddSensor(item))
+                    self.sensors[kind, name, quantity, read].append(mbs.AddSensor(item))
+
+        velocities = [key for key in self.sensors if key[:2] == ("SensorBody", "Velocity")]
+        self.sums = [
+            mbs.AddSensor(
+                items.SensorUserFunction(
+                    sensorNumbers=[sensor, sensor],
+                    factors=[0.5, 1.5],
+                    sensorUserFunction=_weighted_sum,
+                    **silent,
+                )
+            )
+            for sensor in (self.sensors[velocities[0]] if velocities else ())
+        ]
 
     def answer(self) -> dict[str, dict[Call, Array]]:
         """Read all at the current state."""
@@ -208,33 +253,56 @@ class Probes:
             ("GetNodeOutput", OF_NODES, [(node,) for node in self.nodes]),
             ("GetMarkerOutput", OF_MARKERS, [(marker,) for marker in self.markers]),
         )
-        read: list[tuple[str, str, Call, list[Any]]] = [
-            (quantity, name, (f"MainSystem.{function}",),
+        read: list[tuple[str, str, Call, Callable[[Array], Array], list[Any]]] = [
+            (quantity, name, (f"MainSystem.{function}",), of,
              [getattr(mbs, function)(item, getattr(Output, name), *point) for item, *point in given])
             for function, quantities, given in places
-            for name, quantity in quantities.items()
+            for name, quantity, of in quantities
         ]  # fmt: skip
         read += [
-            (quantity, name, ("MainSystem.GetSensorValues", f"itemInterface.{kind}"),
+            (quantity, name, ("MainSystem.GetSensorValues", f"itemInterface.{kind}"), of,
              [mbs.GetSensorValues(sensor) for sensor in sensors])
-            for (kind, name, quantity), sensors in self.sensors.items()
+            for (kind, name, quantity, of), sensors in self.sensors.items()
         ]  # fmt: skip
-        for quantity, name, call, values in read:
-            found[quantity][*call, f"OutputVariableType.{name}"] = OUTPUTS[name].read(np.array(values))
-        add_parts(found, *(partial(self._add_coordinates, found, *one) for one in OF_COORDINATES.items()))
+        for quantity, name, call, of, values in read:
+            found[quantity][*call, f"OutputVariableType.{name}"] = of(np.array(values))
+        add_parts(
+            found,
+            *(partial(self._add_coordinates, found, *one) for one in OF_COORDINATES.items()),
+            partial(self._add_sums, found),
+            partial(self._add_dictionary, found),
+            *(partial(self._add_configuration, found, one) for one in ("Initial", "Current", "StartOfStep")),
+        )
         for kind, markers in self.markers_of_centres.items():
-            for name in ("Position", "Velocity"):
+            for name, quantity in (("Position", "body_position"), ("Velocity", "body_velocity")):
                 values = [mbs.GetMarkerOutput(marker, getattr(Output, name)) for marker in markers]
-                found[OUTPUTS[name].of_node][f"itemInterface.{kind}",] = np.array(values)
+                found[quantity][f"itemInterface.{kind}",] = np.array(values)
         data = mbs.systemData
         # not GetODE2CoordinatesTotal, which corrupts memory (docs/surface/exudyn_coordinates_total.py)
         reference = exudyn.ConfigurationType.Reference
         total = np.array(data.GetODE2Coordinates(reference)) + data.GetODE2Coordinates()
         for kind, numbers in (("Node", self.nodes), ("Object", self.bodies)):
             own = np.array([total[getattr(data, f"Get{kind}LTGODE2")(item)][:3] for item in numbers])
-            found["body_position"][f"SystemData.Get{kind}LTGODE2",] = own
+            found["body_position"][f"SystemData.Get{kind}LTGODE2", "ConfigurationType.Reference"] = own
         return found
 
     def _add_coordinates(self, found: dict[str, dict[Call, Array]], name: str, quantity: str) -> None:
         values = [self.mbs.GetNodeOutput(node, getattr(Output, name))[:3] for node in self.nodes]
         found[quantity]["MainSystem.GetNodeOutput", f"OutputVariableType.{name}"] = np.array(values)
+
+    def _add_sums(self, found: dict[str, dict[Call, Array]]) -> None:
+        values = np.array([self.mbs.GetSensorValues(sensor) for sensor in self.sums])
+        call = ("itemInterface.SensorUserFunction", "itemInterface.SensorUserFunctionSensorUserFunction")
+        found["frame_velocity"][call] = values / 2
+
+    def _add_configuration(self, found: dict[str, dict[Call, Array]], name: str) -> None:
+        data, configuration = self.mbs.systemData, getattr(exudyn.ConfigurationType, name)
+        rates = np.array(data.GetODE2Coordinates_t(configuration))
+        own = np.array([rates[np.array(data.GetNodeLTGODE2(node))][:3] for node in self.nodes])
+        found["body_velocity"][f"ConfigurationType.{name}",] = own
+
+    def _add_dictionary(self, found: dict[str, dict[Call, Array]]) -> None:
+        data = self.mbs.systemData
+        rates = np.array(data.GetSystemStateDict()["ODE2Coords_t"])
+        own = np.array([rates[np.array(data.GetNodeLTGODE2(node))][:3] for node in self.nodes])
+        found["body_velocity"]["SystemData.GetSystemStateDict",] = own

@@ -35,6 +35,7 @@ import exudyn
 import numpy as np
 
 from adapters.exudyn_common import (
+    NAMES_OF_RUNS,
     ExudynAdapter,
     Output,
     add_loads,
@@ -45,11 +46,13 @@ from adapters.exudyn_common import (
     make_system,
     mass_matrix_and_force,
     run_solver,
+    set_explicit_method,
     set_linear_solver,
-    set_rk44,
     silence_engine,
+    whole_column,
     written_items,
 )
+from adapters.exudyn_tree_variants import VARIANTS, TreeChange
 from plumbline.model.datatypes import (
     Array,
     Float,
@@ -72,7 +75,11 @@ from plumbline.model.kinematics import (
     rotation_matrix,
     velocity_jacobian,
 )
-from plumbline.model.step_methods import classical_runge_kutta
+from plumbline.model.step_methods import (
+    JointSpaceMethod,
+    classical_runge_kutta,
+    runge_kutta,
+)
 
 SENSOR_OUTPUTS = (
     Output.Position,
@@ -272,13 +279,14 @@ class _Linkage:
 class _KinematicTree:
     """The assembled tree at one state, and the maps between its angles and bodies."""
 
-    def __init__(self, model: Model, state: State) -> None:
-        self.model, self.state = model, state
+    def __init__(self, model: Model, state: State, change: TreeChange = TreeChange()) -> None:  # noqa: B008
+        self.model, self.state, self.change = model, state, change
         self.linkage = _Linkage(model, state)
         self.revolute_groups = self.linkage.revolute_groups
         self.initial_angle_rates = self.linkage.W @ self.linkage.nu
         self.mbs, self.container = make_system()
-        self.tree = self._add_tree(self.linkage.links)
+        add_tree = change.add_tree or self._add_tree
+        self.node, self.tree = add_tree(self.mbs, self.linkage.links, model.gravity, self.initial_angle_rates)
         self._add_joint_elements()
         self.body_axes_of_links = np.array(self.linkage.body_axes)  # (N, 3, 3) B
         self.sensors: dict[Any, list[Any]] = {output: [] for output in SENSOR_OUTPUTS}
@@ -288,7 +296,7 @@ class _KinematicTree:
             self._add_loads_and_sensors(k, pivot)
         for i, (bodies, points) in enumerate(zip(model.spring_body, model.spring_point, strict=True)):
             ends = [self._point_marker(ground, int(b), at) for b, at in zip(bodies, points, strict=True)]
-            add_point_spring(self.mbs, model, i, ends)
+            add_point_spring(self.mbs, model, i, ends, change.items)
         self.mbs.Assemble()
 
     def _point_marker(self, ground: Any, body: int, point: Array) -> Any:
@@ -315,6 +323,9 @@ class _KinematicTree:
             force[link] = model.effort[joint, i] + k[link] * (model.rest[joint, i] - self.state.x[joint, i])
         if not (np.any(a) or np.any(c) or np.any(k) or np.any(force)):
             return
+        if self.change.add_elements is not None:
+            self.change.add_elements(self.mbs, self.node, a, c, k, force)
+            return
         self.mbs.AddObject(
             items.ObjectGenericODE2(
                 nodeNumbers=[self.node],
@@ -325,22 +336,22 @@ class _KinematicTree:
             )
         )
 
-    def _add_tree(self, links: list[_Link]) -> Any:
+    def _add_tree(self, mbs: Any, links: list[_Link], gravity: Array, rates: Array) -> tuple[Any, Any]:
         zeros = [0.0] * len(links)
         matrices: Any = exudyn.Matrix3DList
         vectors: Any = exudyn.Vector3DList
-        node = self.node = self.mbs.AddNode(
+        node = mbs.AddNode(
             items.NodeGenericODE2(
                 referenceCoordinates=zeros,
                 initialCoordinates=zeros,
-                initialCoordinates_t=self.initial_angle_rates.tolist(),
+                initialCoordinates_t=rates.tolist(),
                 numberOfODE2Coordinates=len(links),
             )
         )
-        return self.mbs.AddObject(
+        return node, mbs.AddObject(
             items.ObjectKinematicTree(
                 nodeNumber=node,
-                gravity=self.model.gravity.tolist(),
+                gravity=gravity.tolist(),
                 jointTypes=[link.joint for link in links],
                 linkParents=[link.parent for link in links],
                 jointTransformations=matrices([link.axes_in_parent for link in links]),
@@ -357,7 +368,7 @@ class _KinematicTree:
         place = {"objectNumber": self.tree, "linkNumber": link, "localPosition": centre}
         marker = self.mbs.AddMarker(items.MarkerKinematicTreeRigid(**place))
         moment = self.body_axes_of_links[k].T @ self.model.moment[k]
-        add_loads(self.mbs, self.model, k, marker, ground, moment)
+        add_loads(self.mbs, self.model, k, marker, ground, moment, self.change.items)
         for output, sensors in self.sensors.items():
             sensor = items.SensorKinematicTree(**place, outputVariableType=output, writeToFile=False)
             sensors.append(self.mbs.AddSensor(sensor))
@@ -421,6 +432,42 @@ def _perpendicular_unit(unit: Array) -> Array:
     return np.asarray(across / np.linalg.norm(across))
 
 
+_EULER = JointSpaceMethod("Runge-Kutta", "joint angles", stages=((),), weights=(1.0,))
+_MIDPOINT, _HEUN, _BOGACKI_SHAMPINE, _DORMAND_PRINCE, _BUTCHER = (
+    runge_kutta(name, "joint angles")
+    for name in (
+        "the explicit midpoint rule (order 2)", "Heun's method of order 3",
+        "Bogacki and Shampine's method of order 3", "Dormand and Prince's method of order 5",
+        "Butcher's method of order 6",
+    )
+)  # fmt: skip
+_VERLET = JointSpaceMethod("velocity Verlet", "joint angles", reuses_acceleration=True)
+
+
+def _alone(name: str) -> Any:
+    return {
+        "has_motions": False,
+        "names": (f"DynamicSolverType.{name}", "TimeIntegrationSettings.absoluteTolerance"),
+    }
+
+
+# Names of Exudyn that all rows of the column are by, by class or module.
+COLUMN_NAMES = {
+    "":
+        "JointType MainSolverExplicit Matrix3DList Vector3DList",
+    "JointType":
+        "PrismaticX PrismaticY PrismaticZ RevoluteX RevoluteY RevoluteZ",
+    "MainSolverExplicit":
+        "ComputeMassMatrix ComputeODE2RHS FinalizeSolver GetErrorString GetSystemMassMatrix "
+        "GetSystemResidual InitializeSolver",
+    "MainSystem":
+        "AddSensor GetObjectParameter",
+    "itemInterface":
+        "MarkerKinematicTreeRigid NodeGenericODE2 ObjectGenericODE2 ObjectKinematicTree "
+        "SensorKinematicTree",
+}  # fmt: skip
+
+
 class ExudynTree(ExudynAdapter):
     """Minimal coordinates: nothing to drift, and angles that can become singular."""
 
@@ -436,6 +483,34 @@ class ExudynTree(ExudynAdapter):
             (4, 5, 6, 7, 8),
             note="classical Runge-Kutta on joint angles",
             method=classical_runge_kutta("joint angles"),
+            names=(
+                "DynamicSolverType.RK44",
+                "MainSolverExplicit.SolveSystem",
+                "ExplicitIntegrationSettings",
+                "ExplicitIntegrationSettings.computeEndOfStepAccelerations",
+                *NAMES_OF_RUNS,
+                "TimeIntegrationSettings.explicit",
+                "TimeIntegrationSettings.solverType",
+                "DynamicSolverType",
+            ),
+        ),
+        Integrator(
+            "ExplicitEuler", "step", 1, note="explicit Euler", method=_EULER, **_alone("ExplicitEuler")
+        ),
+        Integrator(
+            "ExplicitMidpoint",
+            "step",
+            2,
+            note="midpoint rule",
+            method=_MIDPOINT,
+            **_alone("ExplicitMidpoint"),
+        ),
+        Integrator("RK33", "step", 3, note="Heun, order 3", method=_HEUN, **_alone("RK33")),
+        Integrator("ODE23", "step", 3, note="steps as given", method=_BOGACKI_SHAMPINE, **_alone("ODE23")),
+        Integrator("DOPRI5", "step", 5, note="steps as given", method=_DORMAND_PRINCE, **_alone("DOPRI5")),
+        Integrator("RK67", "step", 6, note="Butcher, order 6", method=_BUTCHER, **_alone("RK67")),
+        Integrator(
+            "VelocityVerlet", "step", 2, note="velocity Verlet", method=_VERLET, **_alone("VelocityVerlet")
         ),
     )
     unsupported: ClassVar[Mapping[str, str]] = {
@@ -450,6 +525,8 @@ class ExudynTree(ExudynAdapter):
     }
     builds_trees = builds_elements = True
     loops_unsupported_reason = "a kinematic tree of Exudyn has no joints that close loops"
+    variants = VARIANTS
+    column_names = whole_column(COLUMN_NAMES)
     usual_linear_solver = "EXUdense"
     linear_solvers = ("EigenSparse",)
     welding_unsupported_reason = (
@@ -458,7 +535,8 @@ class ExudynTree(ExudynAdapter):
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
         with silence_engine():
-            return [_evaluate_state(_KinematicTree(model, state)) for state in states]
+            change = self.variant.change if self.variant else TreeChange()
+            return [_evaluate_state(_KinematicTree(model, state, change)) for state in states]
 
     def written(self, model: Model, state: State, moves: bool = False) -> dict[str, Any]:
         """Return the items of the assembled system, and what the read-out needs, of one state."""
@@ -479,7 +557,7 @@ class ExudynTree(ExudynAdapter):
     ) -> Trajectory:
         with silence_engine():
             tree = _KinematicTree(model, state)
-            settings = _rk44_settings()
+            settings = _settings(integrator.name)
             set_linear_solver(settings, self.option or self.usual_linear_solver)
             solver = exudyn.MainSolverExplicit()
             samples = run_solver(
@@ -498,9 +576,9 @@ class ExudynTree(ExudynAdapter):
         return StepRun(run, angle_axes=np.array(axes).reshape(-1, 3))
 
 
-def _rk44_settings() -> Any:
+def _settings(method: str = "RK44") -> Any:
     settings = make_settings()
-    set_rk44(settings)
+    set_explicit_method(settings, method)
     return settings
 
 
@@ -510,9 +588,10 @@ def _evaluate_state(tree: _KinematicTree) -> StateQuantities:
     M q̈ = f,   T = ½ q̇ᵀ M q̇,   V = -Σ m g·r,   angular momentum Σ r × m v + A J ω′
     """
     solver: Any = exudyn.MainSolverExplicit()
-    with initialized_solver(solver, tree.mbs, _rk44_settings()):
+    with initialized_solver(solver, tree.mbs, _settings()):
         M, f = mass_matrix_and_force(solver, tree.mbs)
-    tree.mbs.systemData.SetODE2Coordinates_tt(np.linalg.solve(M, f))
+    M, a = tree.change.matrices(tree, (M, np.asarray(np.linalg.solve(M, f))))
+    tree.mbs.systemData.SetODE2Coordinates_tt(a)
     gravity = np.array(tree.mbs.GetObjectParameter(tree.tree, "gravity"))
     W, mass = tree.linkage.W, tree.model.mass  # links have the masses of several bodies where one is welded
     r, v, omega = (tree.read_sensors(output) for output in SENSOR_OUTPUTS[:3])

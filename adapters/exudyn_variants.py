@@ -6,7 +6,7 @@ exercises.  A node has coordinates of its own for the attitude, whose rates are 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +14,7 @@ import exudyn
 import numpy as np
 from exudyn import rigidBodyUtilities
 
-from adapters.exudyn_common import items, make_rigid_body
+from adapters.exudyn_common import OtherItems, items, make_rigid_body
 from adapters.pose_functions import Pose, rate_maps
 from plumbline.engines.variants import Variant
 from plumbline.model.datatypes import Array, Call, Float, JointKind, Model, Unsupported
@@ -75,7 +75,36 @@ def _no_rates_of_its_own(p: Float[Array, "4"]) -> Float[Array, "3 3"]:
     return np.eye(3)
 
 
-def _node(kind: str, parameters: Callable[[Array], Array], rates: Callable[[Array], Array]) -> Any:
+def _with_weight(mbs: Any, body: Any, gravity: Array) -> Any:
+    weight = mbs.AddMarker(items.MarkerBodyMass(bodyNumber=body))
+    mbs.AddLoad(items.LoadMassProportional(markerNumber=weight, loadVector=gravity.tolist()))
+    return body
+
+
+def _weight_by_function(mbs: Any, body: Any, gravity: Array) -> Any:
+    weight = mbs.AddMarker(items.MarkerBodyMass(bodyNumber=body))
+    given = {"loadVector": [0.0] * 3, "loadVectorUserFunction": lambda mbs, t, load: gravity.tolist()}
+    mbs.AddLoad(items.LoadMassProportional(markerNumber=weight, **given))
+    return body
+
+
+def _add_by_short_names(mbs: Any, piece: Piece) -> tuple[Any, Any]:
+    reference = [*piece.place, *piece.turn]
+    velocities = [*piece.velocity, *(euler_parameter_rates(piece.turn) @ piece.spin)]
+    node = mbs.AddNode(items.RigidEP(referenceCoordinates=reference, initialVelocities=velocities))
+    inertia = utilities.InertiaTensor2Inertia6D(piece.part.inertia)
+    body = mbs.AddObject(items.RigidBody(nodeNumber=node, mass=piece.part.mass, inertia=inertia))
+    weight = mbs.AddMarker(items.MarkerBodyMass(bodyNumber=body))
+    mbs.AddLoad(items.Gravity(markerNumber=weight, loadVector=piece.gravity.tolist()))
+    return node, body
+
+
+def _node(
+    kind: str,
+    parameters: Callable[[Array], Array],
+    rates: Callable[[Array], Array],
+    with_weight: Callable[[Any, Any, Array], Any] = _with_weight,
+) -> Any:
     """How a body on a node of this kind is added."""
 
     def add(mbs: Any, piece: Piece) -> tuple[Any, Any]:
@@ -84,15 +113,9 @@ def _node(kind: str, parameters: Callable[[Array], Array], rates: Callable[[Arra
         item = getattr(items, kind)(referenceCoordinates=reference, initialVelocities=velocities)
         node = mbs.AddNode(item)
         body = mbs.AddObject(make_rigid_body(node, piece.part.mass, piece.part.inertia))
-        return node, _with_weight(mbs, body, piece.gravity)
+        return node, with_weight(mbs, body, piece.gravity)
 
     return add
-
-
-def _with_weight(mbs: Any, body: Any, gravity: Array) -> Any:
-    weight = mbs.AddMarker(items.MarkerBodyMass(bodyNumber=body))
-    mbs.AddLoad(items.LoadMassProportional(markerNumber=weight, loadVector=gravity.tolist()))
-    return body
 
 
 def _by_helper(add: Callable[..., Any], place: str, velocity: str, turn: str, spin: str) -> Any:
@@ -176,6 +199,24 @@ def _item(kind: str, turn: Array) -> Callable[[Any, Joint], Any]:
     return add
 
 
+def _short(kind: str) -> Callable[[Any, Joint], Any]:
+    """A ball joint or a rod by the short name of its item."""
+
+    def add(mbs: Any, joint: Joint) -> Any:
+        own = {"distance": joint.length} if joint.kind.holds_distance else {"constrainedAxes": joint.rows}
+        return mbs.AddObject(getattr(items, kind)(markerNumbers=list(joint.markers), **own))
+
+    return add
+
+
+def _by_utility(function: Callable[..., Any]) -> Callable[[Any, Joint], Any]:
+    def add(mbs: Any, joint: Joint) -> Any:
+        made = function(mbs, *joint.bodies, point=joint.place, axis=joint.axes[:, 2])
+        return made[0] if isinstance(made, list | tuple) else made
+
+    return add
+
+
 def _ball_of_generic(mbs: Any, joint: Joint) -> Any:
     rows = [*joint.rows, 0, 0, 0]
     return mbs.AddObject(items.ObjectJointGeneric(markerNumbers=list(joint.markers), constrainedAxes=rows))
@@ -230,6 +271,11 @@ class Change:
     joints: Callable[[Any, Joint], Any] = _usual_joint
     are_meant: Callable[[JointKind], bool] = lambda _: True  # the joints that ``joints`` adds
     assemble: Callable[[Any], None] = _assemble
+    items: Any = items  # of loads and spring-dampers
+    solver: Callable[[], Any] = exudyn.MainSolverImplicitSecondOrder
+    initialize: Callable[[Any, Any, Any], bool] = lambda solver, *rest: bool(solver.InitializeSolver(*rest))
+    mass_matrix: Callable[[Any, Array], Array] = lambda _, M: M  # of the chain, and the solver's
+    jacobian: Callable[[Any, Array], Array] = lambda _, C: C
 
     def add_joint(self, mbs: Any, joint: Joint) -> Any:
         """Describe a joint to the engine in this way, or in the usual one."""
@@ -253,6 +299,260 @@ def _of_joints(
         return _is_open(model) and any(map(are_meant, model.kinds))
 
     return Variant("spelling", names, Change(joints=add, are_meant=are_meant), suits)
+
+
+def _renamed(kind: str) -> Callable[..., Any]:
+    return lambda **given: getattr(items, kind)(**given)
+
+
+SHORT_NAMES = {
+    "LoadForceVector": "Force", "LoadTorqueVector": "Torque",
+    "ObjectConnectorSpringDamper": "SpringDamper", "ObjectConnectorLinearSpringDamper": "LinearSpringDamper",
+    "ObjectConnectorTorsionalSpringDamper": "TorsionalSpringDamper",
+    "ObjectConnectorRigidBodySpringDamper": "RigidBodySpringDamper",
+}  # fmt: skip
+
+
+def _created_between(function: str, **more: Any) -> Callable[..., Any]:
+    """A connector by a function of the system, between the bodies and at the points of its markers."""
+
+    def make(markerNumbers: Any, **given: Any) -> Callable[[Any], Any]:
+        def add(mbs: Any) -> Any:
+            ends = [mbs.GetMarker(marker) for marker in markerNumbers]
+            points = {f"localPosition{i}": end["localPosition"] for i, end in enumerate(ends)}
+            create = getattr(mbs, function)
+            return create(bodyNumbers=[end["bodyNumber"] for end in ends], **points, **given, **more)
+
+        return add
+
+    return make
+
+
+def _created_along(mbs: Any, function: str, markers: Any, axis: Array, start: float, **law: Any) -> Any:
+    """The same along an axis of the first body, with coordinates that are zero at the start."""
+    ends = [mbs.GetMarker(marker) for marker in markers]
+    name = "bodyNumbers" if function == "CreateTorsionalSpringDamper" else "itemNumbers"
+    place = {"position": ends[0]["localPosition"], "axis": axis, "useGlobalFrame": False}
+    law["offset"] -= start
+    return getattr(mbs, function)(**{name: [end["bodyNumber"] for end in ends]}, **place, **law)
+
+
+def _torsional_by_function(**given: Any) -> Callable[[Any], Any]:
+    def add(mbs: Any) -> Any:
+        axis = np.asarray(given["rotationMarker0"])[:, 2]
+        angle = mbs.GetNodeParameter(given["nodeNumber"], "initialCoordinates")[0]
+        law = {name: given[name] for name in ("stiffness", "damping", "offset", "torque")}
+        function = "CreateTorsionalSpringDamper"
+        return _created_along(mbs, function, given["markerNumbers"], axis, angle, **law)
+
+    return add
+
+
+def _linear_by_function(**given: Any) -> Callable[[Any], Any]:
+    def add(mbs: Any) -> Any:
+        axis, markers = np.asarray(given["axisMarker0"]), given["markerNumbers"]
+        (here, turn), (there, _) = (_place_of(mbs, mbs.GetMarker(marker)) for marker in markers)
+        law = {name: given[name] for name in ("stiffness", "damping", "offset", "force")}
+        shift = float((turn @ axis) @ (there - here))
+        return _created_along(mbs, "CreateLinearSpringDamper", markers, axis, shift, **law)
+
+    return add
+
+
+def _place_of(mbs: Any, marker: Any) -> tuple[Array, Array]:
+    """The point of a marker in the world, and the axes of its body."""
+    body, local = mbs.GetObject(marker["bodyNumber"]), np.array(marker["localPosition"])
+    if "nodeNumber" not in body:
+        return local, np.eye(3)
+    reference = np.array(mbs.GetNode(body["nodeNumber"])["referenceCoordinates"])
+    turn = rotation_matrix(reference[3:])
+    return reference[:3] + turn @ local, turn
+
+
+def _created_load(function: str) -> Callable[..., Any]:
+    def make(markerNumber: Any, **given: Any) -> Callable[[Any], Any]:
+        def add(mbs: Any) -> Any:
+            marker = mbs.GetMarker(markerNumber)
+            place = {"bodyNumber": marker["bodyNumber"], "localPosition": marker["localPosition"]}
+            return getattr(mbs, function)(**place, **given)
+
+        return add
+
+    return make
+
+
+def _load_by_function(kind: str) -> Callable[..., Any]:
+    def make(loadVector: Any, **given: Any) -> Any:
+        return getattr(items, kind)(
+            loadVector=[0.0] * 3, loadVectorUserFunction=lambda mbs, t, load: loadVector, **given
+        )
+
+    return make
+
+
+def _law_by_function(kind: str, argument: str) -> Callable[..., Any]:
+    """A connector whose law k (x − offset) + d v + constant a function computes from x and v."""
+
+    def make(stiffness: Any, damping: Any, **given: Any) -> Any:
+        rest = given.get("offset", 0.0)
+        constant = next((given[name] for name in ("force", "torque") if name in given), 0.0)
+
+        def law(mbs: Any, t: float, item: int, x: float, rate: float, *numbers: Any) -> float:
+            return float(stiffness * (x - rest) + damping * rate + constant)
+
+        return getattr(items, kind)(stiffness=stiffness, damping=damping, **given, **{argument: law})
+
+    return make
+
+
+def _six_by_function(damping: Array, **given: Any) -> Any:
+    def law(
+        mbs: Any, t: float, item: int, shift: Any, turn: Any, velocity: Any, spin: Any, *numbers: Any
+    ) -> list[float]:
+        return [float(x) for x in damping @ np.append(velocity, spin)]
+
+    return items.ObjectConnectorRigidBodySpringDamper(
+        damping=damping, springForceTorqueUserFunction=law, **given
+    )
+
+
+def _drag_by_two(way: Callable[..., Any]) -> Callable[..., Any]:
+    """Drag by a connector of displacements and one of rotations."""
+
+    def make(damping: Array, markerNumbers: Any, **given: Any) -> Callable[[Any], Any]:
+        def add(mbs: Any) -> Any:
+            turning = np.diag(np.append(np.zeros(3), np.diag(damping)[3:]))
+            mbs.AddObject(
+                items.ObjectConnectorRigidBodySpringDamper(
+                    damping=turning, markerNumbers=markerNumbers, **given
+                )
+            )
+            item = way(
+                markerNumbers=markerNumbers, stiffness=[0.0] * 3, damping=np.diag(damping)[:3].tolist()
+            )
+            return item(mbs) if callable(item) else mbs.AddObject(item)
+
+        return add
+
+    return make
+
+
+def _cartesian_by_function(damping: list[float], **given: Any) -> Any:
+    def law(mbs: Any, t: float, item: int, x: Any, rate: Any, *numbers: Any) -> list[float]:
+        return [float(d * one) for d, one in zip(damping, rate, strict=True)]
+
+    kind = items.ObjectConnectorCartesianSpringDamper
+    return kind(damping=damping, springForceUserFunction=law, **given)
+
+
+def _has_drag(model: Model) -> bool:
+    return bool(np.any(model.drag_force)) and bool(np.any(model.drag_moment))
+
+
+def _has_elements_that(what: str) -> Callable[[Model], bool]:
+    """Whether a joint with one motion of this kind has a spring, damper or effort."""
+
+    def has(model: Model) -> bool:
+        return any(
+            one == what and bool(model.stiffness[k, i] or model.damping[k, i] or model.effort[k, i])
+            for k, kind in enumerate(model.kinds)
+            if not kind.has_attitude
+            for i, (one, _) in enumerate(kind.motions)
+        )
+
+    return has
+
+
+HAS: Mapping[str, Callable[[Model], bool]] = {
+    "LoadForceVector": lambda model: bool(np.any(model.force)),
+    "LoadTorqueVector": lambda model: bool(np.any(model.moment)),
+    "ObjectConnectorRigidBodySpringDamper": _has_drag,
+    "ObjectConnectorSpringDamper": lambda model: len(model.spring_body) > 0,
+    "ObjectConnectorLinearSpringDamper": _has_elements_that("slide"),
+    "ObjectConnectorTorsionalSpringDamper": _has_elements_that("turn"),
+}
+WAYS: tuple[tuple[str, Call, Callable[..., Any]], ...] = (
+    *((kind, (f"itemInterface.{short}",), _renamed(short)) for kind, short in SHORT_NAMES.items()),
+    *(
+        (f"Load{name}Vector", (f"itemInterface.Load{name}VectorLoadVectorUserFunction",),
+         _load_by_function(f"Load{name}Vector"))
+        for name in ("Force", "Torque")
+    ),
+    *(
+        (f"Load{name}Vector", (f"MainSystem.Create{name}",), _created_load(f"Create{name}"))
+        for name in ("Force", "Torque")
+    ),
+    *(
+        (f"ObjectConnector{name}SpringDamper",
+         (f"itemInterface.ObjectConnector{name}SpringDamperSpring{what}UserFunction",),
+         _law_by_function(f"ObjectConnector{name}SpringDamper", f"spring{what}UserFunction"))
+        for name, what in (("", "Force"), ("Linear", "Force"), ("Torsional", "Torque"))
+    ),
+    ("ObjectConnectorSpringDamper", ("MainSystem.CreateSpringDamper",),
+     _created_between("CreateSpringDamper")),
+    ("ObjectConnectorTorsionalSpringDamper", ("MainSystem.CreateTorsionalSpringDamper",),
+     _torsional_by_function),
+    ("ObjectConnectorLinearSpringDamper", ("MainSystem.CreateLinearSpringDamper",),
+     _linear_by_function),
+    ("ObjectConnectorRigidBodySpringDamper", ("MainSystem.CreateRigidBodySpringDamper",),
+     _created_between("CreateRigidBodySpringDamper", useIntrinsicFormulation=False)),
+    ("ObjectConnectorRigidBodySpringDamper",
+     ("itemInterface.ObjectConnectorRigidBodySpringDamperSpringForceTorqueUserFunction",), _six_by_function),
+    ("ObjectConnectorRigidBodySpringDamper",
+     ("itemInterface.ObjectConnectorCartesianSpringDamper", "itemInterface.CartesianSpringDamper"),
+     _drag_by_two(_renamed("CartesianSpringDamper"))),
+    ("ObjectConnectorRigidBodySpringDamper",
+     ("itemInterface.ObjectConnectorCartesianSpringDamperSpringForceUserFunction",),
+     _drag_by_two(_cartesian_by_function)),
+    ("ObjectConnectorRigidBodySpringDamper", ("MainSystem.CreateCartesianSpringDamper",),
+     _drag_by_two(_created_between("CreateCartesianSpringDamper"))),
+)  # fmt: skip
+
+
+def _of_item(kind: str, names: Call, way: Callable[..., Any]) -> Variant:
+    """A way to make items of this kind, where a mechanism has some."""
+
+    def suits(model: Model) -> bool:
+        return _is_open(model) and HAS[kind](model)
+
+    return Variant("spelling", names, Change(items=OtherItems(**{kind: way})), suits)
+
+
+def _initialize_by_parts(solver: Any, mbs: Any, settings: Any) -> bool:
+    """Initialise, and call the parts of it again: without the whole before them they are refused later."""
+    if not solver.InitializeSolver(mbs, settings) or not solver.InitializeSolverPreChecks(mbs, settings):
+        return False
+    for part in INITIALISATION:
+        getattr(solver, part)(mbs, settings)
+    return True
+
+
+INITIALISATION = (
+    "InitializeSolverData", "PreInitializeSolverSpecific", "InitializeSolverOutput",
+    "InitializeSolverInitialConditions", "PostInitializeSolverSpecific",
+)  # fmt: skip
+
+
+def _mass_matrix_of_items(chain: Any, M: Array) -> Array:
+    data, found, what = chain.mbs.systemData, np.zeros_like(M), exudyn.ComputeItemType.MassMatrix
+    for body in chain.piece_bodies:
+        own = data.GetObjectLTGODE2(body)
+        found[np.ix_(own, own)] += chain.mbs.ComputeItem(body, what)
+    return found
+
+
+def _jacobian_of_items(chain: Any, C: Array) -> Array:
+    data, found = chain.mbs.systemData, C.copy()
+    for joint in (one for one in (*chain.joints, *chain.welds) if one is not None):
+        rows, columns = list(data.GetObjectLTGAE(joint)), list(data.GetObjectLTGODE2(joint))
+        found[rows] = 0
+        found[np.ix_(rows, columns)] = chain.mbs.ComputeItem(joint, exudyn.ComputeItemType.ConstraintJacobian)
+    return found
+
+
+def _mass_matrix_of_linearised(chain: Any, _: Array) -> Array:
+    M, *_others = chain.mbs.ComputeLinearizedSystem(autoAssemble=False)
+    return np.asarray(M)
 
 
 def _is_ball(kind: JointKind) -> bool:
@@ -316,6 +616,52 @@ VARIANTS = (
         ("SystemData.GetSystemState", "SystemData.SetSystemState"),
         Change(assemble=_assemble_and_set_state),
         _is_open,
+    ),
+    *(_of_item(*way) for way in WAYS),
+    Variant(
+        "option",
+        tuple(
+            f"MainSolverImplicitSecondOrder.{part}"
+            for part in ("InitializeSolverPreChecks", *INITIALISATION)
+        ),
+        Change(initialize=_initialize_by_parts),
+        _is_open,
+    ),
+    Variant("option", ("MainSolverStatic",), Change(solver=lambda: exudyn.MainSolverStatic()), _is_open),
+    Variant(
+        "option",
+        ("MainSystem.ComputeItem", "ComputeItemType"),
+        Change(mass_matrix=_mass_matrix_of_items, jacobian=_jacobian_of_items),
+        _has_no_axes,
+    ),
+    Variant(
+        "option",
+        ("MainSystem.ComputeLinearizedSystem", "ComputeLinearizedSystem"),
+        Change(mass_matrix=_mass_matrix_of_linearised),
+        _has_no_axes,
+    ),
+    Variant(
+        "spelling",
+        ("itemInterface.RigidEP", "itemInterface.RigidBody", "itemInterface.Gravity",
+         "rigidBodyUtilities.InertiaTensor2Inertia6D"),
+        Change(_add_by_short_names),
+        _is_open,
+    ),
+    Variant(
+        "spelling",
+        ("itemInterface.LoadMassProportionalLoadVectorUserFunction",),
+        Change(_node("NodeRigidBodyEP", np.array, euler_parameter_rates, _weight_by_function)),
+        _is_open,
+    ),
+    _of_joints(("itemInterface.SphericalJoint",), _short("SphericalJoint"), _is_ball),
+    _of_joints(
+        ("itemInterface.DistanceConstraint",), _short("DistanceConstraint"), lambda kind: kind.holds_distance
+    ),
+    _of_joints(
+        ("rigidBodyUtilities.AddRevoluteJoint",), _by_utility(utilities.AddRevoluteJoint), TURNS
+    ),
+    _of_joints(
+        ("rigidBodyUtilities.AddPrismaticJoint",), _by_utility(utilities.AddPrismaticJoint), SLIDES
     ),
     _of_joints(("itemInterface.ObjectJointRevoluteZ",), _item("ObjectJointRevoluteZ", np.eye(3)), TURNS),
     _of_joints(("itemInterface.ObjectJointPrismaticX",), _item("ObjectJointPrismaticX", TURN_TO_X), SLIDES),

@@ -27,6 +27,7 @@ from plumbline.engines.registry import load_adapter
 from plumbline.model.datatypes import Array, Model, State, StepRun
 from plumbline.model.kinematics import angular_velocity, quaternion_rate, rotation_matrix, stack_states
 from plumbline.model.step_methods import (
+    TABLEAUS,
     ConstrainedMethod,
     JointSpaceMethod,
     StepMethod,
@@ -375,23 +376,6 @@ def _fit(alternative: Alternative, steps: Evidence) -> tuple[float, float]:
 # -- joint coordinates -------------------------------------------------------------------------------
 
 CLASSICAL = classical_runge_kutta("joint rotations")
-R = 5.0**0.5
-TABLEAUS: dict[str, tuple[tuple[tuple[float, ...], ...], tuple[float, ...]]] = {
-    "the explicit midpoint rule (order 2)": (((), (0.5,)), (0.0, 1.0)),
-    "Heun's method of order 2": (((), (1.0,)), (0.5, 0.5)),
-    "Kutta's method of order 3": (((), (0.5,), (-1.0, 2.0)), (1 / 6, 2 / 3, 1 / 6)),
-    "Heun's method of order 3": (((), (1 / 3,), (0.0, 2 / 3)), (0.25, 0.0, 0.75)),
-    "the classical Runge–Kutta method": (CLASSICAL.stages, CLASSICAL.weights),
-    "the classical Runge–Kutta method with its third stage by the first slope":
-        (((), (0.5,), (0.5, 0.0), (0.0, 0.0, 1.0)), CLASSICAL.weights),
-    "Kutta's 3/8 rule": (((), (1 / 3,), (-1 / 3, 1.0), (1.0, -1.0, 1.0)), (1 / 8, 3 / 8, 3 / 8, 1 / 8)),
-    "Butcher's method of order 6": (  # J. Austral. Math. Soc. 4 (1964) 179-194
-        ((), (0.5 - R / 10,), (-R / 10, 0.5 + R / 5), (7 * R / 20 - 0.75, R / 4 - 0.25, 1.5 - 7 * R / 10),
-         (1 / 12 - R / 60, 0.0, 1 / 6, 7 * R / 60 + 0.25),
-         (1 / 12 + R / 60, 0.0, 0.75 - 5 * R / 12, 1 / 6, 3 * R / 10 - 0.5),
-         (1 / 6, 0.0, 25 * R / 12 - 55 / 12, -7 * R / 12 - 25 / 12, 5 - 2 * R, 2.5 + R / 2)),
-        (1 / 12, 0.0, 0.0, 0.0, 5 / 12, 5 / 12, 1 / 12)),
-}  # fmt: skip
 
 
 def _joint_space_alternatives(declared: JointSpaceMethod, model: Model) -> Iterator[Alternative]:

@@ -38,8 +38,10 @@ Wrong so far, each with a script or an entry of the known issues, are
   makes ([script](surface/pinocchio_append_model.py)), and the order of the entries of kinematic Hessians in
   Python ([script](surface/pinocchio_kinematic_hessians.py));
 - Exudyn's tangent operators of SE(3), `TExpSE3` and `TExpSE3Inv`
-  ([script](surface/exudyn_tangent_operators.py)), and `GetODE2CoordinatesTotal`, which corrupts memory
-  ([script](surface/exudyn_coordinates_total.py)).
+  ([script](surface/exudyn_tangent_operators.py)), `GetODE2CoordinatesTotal`, which corrupts memory
+  ([script](surface/exudyn_coordinates_total.py)), the masses that slides of `KinematicTree33` carry
+  ([script](surface/exudyn_kinematic_tree_33.py)), and the steps of `ODE23` and `DOPRI5`, which depend on the
+  sign of coordinates ([script](surface/exudyn_step_control.py)).
 
 Written by `python -m plumbline.engines.surface_page > docs/surface.md`.
 """

@@ -1,7 +1,8 @@
 """Variants: other ways in which an engine is asked about the same mechanism at the same states.
 
 A variant is an option of the engine (a solver, another sequence of calls, data that are copied or used
-again) or a spelling of the mechanism (other joints, frames, forms of an inertia).  An adapter lists its own
+again), a spelling of the mechanism (other joints, frames, forms of an inertia), or the engine's tree that
+computes with vectors where its others have spatial ones, which is wrong by itself.  An adapter lists its own
 in one table; its build hook reads what each changes.
 """
 
@@ -13,7 +14,7 @@ from typing import Any, Literal
 
 from plumbline.model.datatypes import Call, Model
 
-VariantKind = Literal["option", "spelling"]
+VariantKind = Literal["option", "spelling", "vectors"]
 
 
 @dataclass(frozen=True)

@@ -83,6 +83,10 @@ class Plan:
                 found.setdefault(s.family, s)
         return {family: s.name for family, s in found.items()}
 
+    def has_other_steps(self, scenario: Scenario) -> bool:
+        """Whether steps of integrators without motions are compared: of all scenarios, or of the plainest."""
+        return self.has_all_studies or scenario.name in self.studied.values()
+
 
 def _plainness(scenario: Scenario) -> tuple[bool, int, int, str]:
     model, state = scenario.model, scenario.state
@@ -161,12 +165,14 @@ def task_keys(
     engines: Mapping[str, EngineInfo],
     level: LevelSelection | Literal["random"],
     has_long_runs: bool = False,
+    has_other_steps: bool = True,
 ) -> Iterator[TaskKey]:
     """List the tasks of a scenario that are known beforehand.
 
     Args:
         engines: descriptions of the engines; those that are missing get no task.
         level: which levels to compare at; "random" is state and step level.
+        has_other_steps: whether steps of integrators without motions are compared.
 
     Yields:
         The truths, then the cells engine by engine.
@@ -181,8 +187,13 @@ def task_keys(
         keys = [TaskKey(TaskKind.STATE, scenario, name)] * has_states
         if level in ("step", "random", "all"):
             declared = (one for one in info.integrators if one.method is not None)
-            keys += [TaskKey(TaskKind.STEP, scenario, name, one.name) for one in declared]
+            keys += [
+                TaskKey(TaskKind.STEP, scenario, name, one.name)
+                for one in declared
+                if one.has_motions or has_other_steps
+            ]
         keys += [TaskKey(TaskKind.RELATIONS, scenario, name)] * (level == "all")
         runs = [TaskKind.TRAJECTORY] * has_runs + [TaskKind.LONG_RUN] * (has_runs and has_long_runs)
-        keys += [TaskKey(kind, scenario, name, one.name) for kind in runs for one in info.integrators]
+        moving = [one for one in info.integrators if one.has_motions]
+        keys += [TaskKey(kind, scenario, name, one.name) for kind in runs for one in moving]
         yield from keys

@@ -231,14 +231,18 @@ class _Run:
         self.identity = IdentityCheck(self.engines)
         self.observer.on_start(self.engines)
         has_long_runs = plan.long_run_seconds > 0
+
+        def count(level: Any, has_long: bool, has_other: bool) -> int:
+            return sum(1 for _ in task_keys("", self.engines, level, has_long, has_other))
+
         total = sum(
-            sum(1 for _ in task_keys("", self.engines, scenario_level(s, plan.level), has_long_runs))
+            count(scenario_level(s, plan.level), has_long_runs, plan.has_other_steps(s))
             for s in plan.scenarios
         )
         runs = min(plan.random_trajectory_count, len(plan.random_scenarios))
-        total += runs * sum(1 for _ in task_keys("", self.engines, plan.level))
+        total += runs * count(plan.level, False, False)
         others = len(plan.random_scenarios) - runs
-        total += others * sum(1 for _ in task_keys("", self.engines, plan.random_level))
+        total += others * count(plan.random_level, False, False)
         scheduler = Scheduler(executor, cache)
         for done, outcome in enumerate(scheduler.run(self._tasks()), start=1):
             self.cpu_times.add_outcome(outcome, outcome.key.cpu_time_kind)

@@ -134,7 +134,8 @@ class ScenarioRun:
         self._states = self._compared_states(count)  # argument of many tasks
         if scenario.model.has_loops and not self._states.load():
             self._left_out |= dict.fromkeys((TaskKind.STATE_TRUTH, *_LEVELS), NO_REGULAR_POSE)
-        every = list(task_keys(scenario.name, engines, levels, has_long_runs))
+        has_other_steps = not is_random and plan.has_other_steps(scenario)
+        every = list(task_keys(scenario.name, engines, levels, has_long_runs, has_other_steps))
         self._keys = [key for key in every if key.kind not in self._left_out]
         self._gaps = dict.fromkeys((key.engine, key.kind) for key in every if key.kind in _LEVELS)
         self._pending = set(self._keys)  # without an outcome

@@ -41,6 +41,10 @@ def run_step_study(
     sizes = _remembered_step_sizes(
         isinstance(integrator.method, ConstrainedMethod), Pickled.of((model, states))
     )
+    if not integrator.has_motions:
+        count = len(states) if model.n <= MAX_STEP_BODIES else 1
+        counts = step_counts(integrator.method)
+        return run_steps(engine, integrator.name, model, states[:count], sizes[:count], counts)
     h, counts = RUN_STEP_SHARE * sizes[0][0], run_counts(model.n)
     run = run_steps(engine, integrator.name, model, states[:1], [[h]], counts)
     for finer in RUN_REFINEMENTS:  # a motion may become faster than it is at the start

@@ -178,3 +178,5 @@ class Integrator:
     alias_of: str | None = None  # equals that integrator without drag: not independent evidence
     note: str = ""  # a sentence on what it is
     method: StepMethod | None = None  # the formula of one step; None: the level "step" does not apply
+    has_motions: bool = True  # False: compared by single steps alone
+    names: Call = ()  # of the engine, that the steps are by

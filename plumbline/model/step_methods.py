@@ -5,6 +5,7 @@ docs/integrators.md states each formula with its source; `plumbline.truth.step_f
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -106,6 +107,42 @@ def classical_runge_kutta(
         stages=((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)),
         weights=(1 / 6, 1 / 3, 1 / 3, 1 / 6),
     )
+
+
+# Explicit Runge-Kutta methods: the tableau's rows below the diagonal, and weights.
+_CLASSICAL, _R = (1 / 6, 1 / 3, 1 / 3, 1 / 6), 5.0**0.5
+TABLEAUS: Mapping[str, tuple[tuple[tuple[float, ...], ...], tuple[float, ...]]] = {
+    "the explicit midpoint rule (order 2)": (((), (0.5,)), (0.0, 1.0)),
+    "Heun's method of order 2": (((), (1.0,)), (0.5, 0.5)),
+    "Kutta's method of order 3": (((), (0.5,), (-1.0, 2.0)), (1 / 6, 2 / 3, 1 / 6)),
+    # Z. Math. Phys. 45 (1900) 23-38
+    "Heun's method of order 3": (((), (1 / 3,), (0.0, 2 / 3)), (0.25, 0.0, 0.75)),
+    # Appl. Math. Lett. 2 (1989) 321-325; the fourth stage is for the estimate of errors alone
+    "Bogacki and Shampine's method of order 3": (
+        ((), (0.5,), (0.0, 0.75)), (2 / 9, 1 / 3, 4 / 9)),
+    "the classical Runge–Kutta method": (((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)), _CLASSICAL),
+    "the classical Runge–Kutta method with its third stage by the first slope":
+        (((), (0.5,), (0.5, 0.0), (0.0, 0.0, 1.0)), _CLASSICAL),
+    "Kutta's 3/8 rule": (((), (1 / 3,), (-1 / 3, 1.0), (1.0, -1.0, 1.0)), (1 / 8, 3 / 8, 3 / 8, 1 / 8)),
+    "Dormand and Prince's method of order 5": (  # J. Comput. Appl. Math. 6 (1980) 19-26; likewise the seventh
+        ((), (1 / 5,), (3 / 40, 9 / 40), (44 / 45, -56 / 15, 32 / 9),
+         (19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729),
+         (9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656)),
+        (35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84)),
+    "Butcher's method of order 6": (  # J. Austral. Math. Soc. 4 (1964) 179-194
+        ((), (0.5 - _R / 10,), (-_R / 10, 0.5 + _R / 5),
+         (7 * _R / 20 - 0.75, _R / 4 - 0.25, 1.5 - 7 * _R / 10),
+         (1 / 12 - _R / 60, 0.0, 1 / 6, 7 * _R / 60 + 0.25),
+         (1 / 12 + _R / 60, 0.0, 0.75 - 5 * _R / 12, 1 / 6, 3 * _R / 10 - 0.5),
+         (1 / 6, 0.0, 25 * _R / 12 - 55 / 12, -7 * _R / 12 - 25 / 12, 5 - 2 * _R, 2.5 + _R / 2)),
+        (1 / 12, 0.0, 0.0, 0.0, 5 / 12, 5 / 12, 1 / 12)),
+}  # fmt: skip
+
+
+def runge_kutta(name: str, coordinates: Literal["joint rotations", "joint angles"]) -> JointSpaceMethod:
+    """Return a method of `TABLEAUS`."""
+    stages, weights = TABLEAUS[name]
+    return JointSpaceMethod("Runge-Kutta", coordinates, stages=stages, weights=weights)
 
 
 def generalized_alpha(

@@ -3,7 +3,7 @@
     python -m plumbline.studies.exercised_names [ENGINE ...] > adapters/surface/exercised.json
 
 computes it for all engines with a surface, on `MECHANISMS`; the file's entries of other engines stay.
-docs/surface.md is made from it.
+docs/surface.md is made from it.  All columns of an engine are asked, by single steps too.
 """
 
 from __future__ import annotations
@@ -14,15 +14,17 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
 
-from plumbline.engines.engine_calls import SURFACE_STATES, Evaluation, evaluate_states
+from plumbline.engines.engine_calls import SURFACE_STATES, Evaluation, StepAttempt, evaluate_states
 from plumbline.engines.registry import load_adapter
 from plumbline.engines.surface import SURFACES, exercised_rows, other_names
 from plumbline.engines.variants import NoAnswer
 from plumbline.judging.rows import Row, RowContext, Verdict
 from plumbline.judging.state_level import judge_states, judge_variants
+from plumbline.judging.step_level import judge_steps
 from plumbline.judging.surface_rows import judge_surface
+from plumbline.measurements.single_steps import MAX_STEP_BODIES, run_step_study
 from plumbline.measurements.state_relations import quantity_values
-from plumbline.model.datatypes import Call, StateQuantities
+from plumbline.model.datatypes import Call, Model, State, StateQuantities
 from plumbline.model.sampling import compared_states
 from plumbline.scenario.loader import load_scenarios
 from plumbline.truth.ground_truth import StateTruth, state_truth
@@ -32,6 +34,12 @@ MECHANISMS = (
     "rest", "double-rod-then-ball", "furuta", "sprung-slider-on-arm", "free-body-with-rotors",
     "tree-of-seven", "universal-pendulum", "planar-top", "slider-crank",
     "cart-pole", "nesc-tumbling-brick", "helical-screw",
+    "double-loaded-balls",
+    "spring-pendulum",
+    "sprung-without-rotors",
+    "sprung-hinge",
+    "light-cart-pole",
+    "acrobot",
 )  # fmt: skip
 _CONTEXT = RowContext("", "", "", "the engine", "")
 
@@ -82,6 +90,33 @@ def _changed(answers: Sequence[StateQuantities]) -> list[StateQuantities]:
     ]
 
 
+def names_of_steps(column: str, model: Model, states: Sequence[State]) -> dict[str, set[str]]:
+    """Change the velocities after single steps, and see which rows turn red.
+
+    Returns:
+        By name of an engine's integrators (`Integrator.names`) the quantities of these rows.
+
+    """
+    found = defaultdict[str, set[str]](set)
+    for integrator in load_adapter(column).integrators if model.n <= MAX_STEP_BODIES else ():
+        if not integrator.names or integrator.method is None:
+            continue
+        answer = replace(run_step_study(column, integrator, model, states), run=None)
+        changed = replace(answer, attempts=[_changed_step(one) for one in answer.attempts])
+        rows = [judge_steps(_CONTEXT, integrator, model, states, x).rows for x in (answer, changed)]
+        if len(rows[0]) == len(rows[1]):
+            _add_red_rows(found, integrator.names, *rows)
+    return found
+
+
+def _changed_step(attempt: StepAttempt) -> StepAttempt:
+    if attempt.run is None:
+        return attempt
+    run = attempt.run.trajectory
+    changed = replace(run, v=run.v * (1 + CHANGE), pdot=run.pdot * (1 + CHANGE))
+    return replace(attempt, run=replace(attempt.run, trajectory=changed))
+
+
 def _add_red_rows(found: dict[str, set[str]], call: Call, before: list[Row], after: list[Row]) -> None:
     red = {
         row.quantity
@@ -101,10 +136,13 @@ def main() -> None:
         states = compared_states(s.model, s.state, s.seed, SURFACE_STATES)[:SURFACE_STATES]
         truth = state_truth(s.model, states)
         for engine, names in found.items():
-            evaluation = evaluate_states(engine, s.model, states)
-            own = [call for call, suits in load_adapter(engine).column_names if suits(s.model)]
-            for name, quantities in exercised_names(truth, evaluation, own).items():
-                names[name] |= quantities
+            for column in filter(None, (engine, load_adapter(engine).other_formulation)):
+                evaluation = evaluate_states(column, s.model, states)
+                own = [call for call, suits in load_adapter(column).column_names if suits(s.model)]
+                of_steps = names_of_steps(column, s.model, states[:1])
+                for seen in (exercised_names(truth, evaluation, own), of_steps):
+                    for name, quantities in seen.items():
+                        names[name] |= quantities
     for engine, names in found.items():
         for name, same in other_names(engine).items():
             for other in same if name in names else ():

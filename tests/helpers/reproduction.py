@@ -76,7 +76,7 @@ def motion_measure(engine: str, integrator: str, level: str, joints: str, loaded
 
 
 def step_integrators(engine: str) -> list[str]:
-    return [i.name for i in load_adapter(engine).integrators if i.kind == "step"]
+    return [i.name for i in load_adapter(engine).integrators if i.kind == "step" and i.has_motions]
 
 
 def step_methods(engine: str) -> list[str]:

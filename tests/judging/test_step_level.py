@@ -11,6 +11,7 @@ import pytest
 
 from plumbline.engines.engine_calls import StepAttempt, StepEvaluation, run_steps
 from plumbline.engines.registry import load_adapter
+from plumbline.execution.plan import Plan, TaskKind, task_keys
 from plumbline.judging.rows import RowContext, Verdict
 from plumbline.judging.step_level import judge_steps
 from plumbline.measurements.single_steps import STEP_STATES, step_sizes
@@ -19,9 +20,9 @@ from plumbline.model.kinematics import complete_state
 from plumbline.model.loops import STABILISATION
 from plumbline.model.random_mechanisms import random_loop_mechanism, random_tree
 from plumbline.model.sampling import compared_states, random_states
-from plumbline.model.step_methods import ConstrainedMethod, JointSpaceMethod, classical_runge_kutta
+from plumbline.model.step_methods import TABLEAUS, ConstrainedMethod, JointSpaceMethod, classical_runge_kutta
 from plumbline.scenario.generator import RandomScenarios, random_scenario
-from plumbline.scenario.loader import find_scenario_file, load_scenario
+from plumbline.scenario.loader import find_scenario_file, load_scenario, load_scenarios
 from plumbline.truth import step_comparison, step_formulas
 from plumbline.truth.certified_state import certify_state
 from plumbline.truth.step_charts import StepCharts
@@ -492,3 +493,35 @@ def test_steps_of_loops_are_small_enough_to_close_gaps():
     sizes = step_sizes(False, model, slow_states)
     assert all(h[1] <= 0.5 / STABILISATION and h[0] < h[1] for h in sizes)
     assert all(np.log2(h) % 1 for pair in sizes for h in pair), "powers of two"
+
+
+@pytest.mark.parametrize("name", [name for name in TABLEAUS if "first slope" not in name])
+def test_tableaus_have_the_order_in_their_names(name):
+    stages, weights = TABLEAUS[name]
+    order = int(name.split("order ")[1].rstrip(")")) if "order" in name else 4
+
+    def end(count):
+        y, h = np.array([1.0, 0.5], np.longdouble), np.longdouble(1) / count
+        for _ in range(count):
+            k = list[np.ndarray]()
+            for row in stages:
+                x, v = y + h * sum((np.longdouble(a) * b for a, b in zip(row, k, strict=True)), 0 * y)
+                k.append(np.array([v, -np.sin(x) - x * v * v]))
+            y = y + h * sum(np.longdouble(w) * b for w, b in zip(weights, k, strict=True))
+        return y
+
+    differences = [np.linalg.norm((end(n) - end(2 * n)).astype(float)) for n in (16, 32)]
+    assert abs(np.log2(differences[0] / differences[1]) - order) < 0.4
+
+
+def test_integrators_without_motions_get_steps_of_the_plainest_scenarios_and_no_other_task():
+    scenarios = load_scenarios(["planar-top", "furuta"])
+    alone = {i.name for i in load_adapter("exudyn-tree").integrators if not i.has_motions}
+    engines = {"exudyn-tree": load_adapter("exudyn-tree").describe()}
+    assert {key.kind for key in task_keys("s", engines, "all") if key.integrator in alone} == {TaskKind.STEP}
+    assert not [k for k in task_keys("s", engines, "all", has_other_steps=False) if k.integrator in alone]
+    plan = Plan(scenarios, ["exudyn-tree"], has_all_studies=False)
+    assert [plan.has_other_steps(s) for s in scenarios] == [
+        s.name in plan.studied.values() for s in scenarios
+    ]
+    assert replace(plan, has_all_studies=True).has_other_steps(scenarios[0])

@@ -1,0 +1,354 @@
+"""Other ways to describe and evaluate a kinematic tree of Exudyn: functions in Python, robots, loads.
+
+A `TreeChange` is what the column of minimal coordinates does otherwise; `VARIANTS` lists them with the names
+that each exercises.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import exudyn
+import numpy as np
+from exudyn import kinematicTree, rigidBodyUtilities, robotics
+
+from adapters.exudyn_common import OtherItems, items, make_settings, set_explicit_method, set_linear_solver
+from adapters.exudyn_variants import HAS, MANY_BODIES, WAYS
+from plumbline.engines.variants import Variant
+from plumbline.model.datatypes import Array, Call, EngineFailure, Float, Model
+
+utilities: Any = rigidBodyUtilities  # as below, functions are untyped
+trees: Any = kinematicTree
+robots: Any = robotics
+LONG_STEP = 1.0  # s: of one step of Euler's method, in which v₁ = v₀ + h a to rounding
+
+
+def pose_of(link: Any) -> Float[Array, "4 4"]:
+    """The joint of a link in the link before, at its start."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = link.axes_in_parent, link.offset
+    return pose
+
+
+def short_type(link: Any) -> str:
+    """The kind of its joint as functions in Python have it: Rz, Px, …."""
+    name = str(link.joint).rpartition(".")[2]
+    return name[0] + name[-1].lower()
+
+
+def robot_of(links: Sequence[Any], gravity: Array) -> Any:
+    """Make a robot of links."""
+    robot = robots.Robot(gravity=gravity.tolist(), referenceConfiguration=[0.0] * len(links))
+    for link in links:
+        robot.AddLink(
+            robots.RobotLink(
+                link.mass, link.centre, link.inertia, preHT=pose_of(link), jointType=short_type(link),
+                parent=link.parent,
+            )
+        )  # fmt: skip
+    return robot
+
+
+def _add_by_tree_links(mbs: Any, links: Sequence[Any], gravity: Array, rates: Array) -> tuple[Any, Any]:
+    made = []
+    for link in links:
+        inertia = utilities.RigidBodyInertia()
+        inertia.SetWithCOMinertia(link.mass, link.inertia, link.centre)
+        made.append(
+            utilities.TreeLink(inertia, jointType=link.joint, jointHT=pose_of(link), parent=link.parent)
+        )
+    tree = mbs.CreateKinematicTree(
+        listOfTreeLinks=made, initialCoordinates_t=rates.tolist(), gravity=gravity.tolist()
+    )
+    return mbs.GetObject(tree)["nodeNumber"], tree
+
+
+def _add_robot(mbs: Any, links: Sequence[Any], gravity: Array, rates: Array) -> tuple[Any, Any]:
+    made = robot_of(links, gravity).CreateKinematicTree(mbs)
+    node = made["nodeGeneric"]
+    mbs.SetNodeParameter(node, "initialCoordinates_t", rates.tolist())
+    return node, made["objectKinematicTree"]
+
+
+Matrices = tuple[Array, Array]  # M and M⁻¹ f
+
+
+def _by_plucker_matrices(tree: Any, _: Matrices) -> Matrices:
+    links = tree.linkage.links
+    inertias = [trees.MassCOMinertia2T66(link.mass, link.centre, link.inertia) for link in links]
+    poses = [utilities.HT2T66Inverse(pose_of(link)) for link in links]
+    own = trees.KinematicTree66(
+        [short_type(link) for link in links], poses, inertias, [link.parent for link in links],
+        tree.model.gravity.tolist(),
+    )  # fmt: skip
+    return _of_python(own, tree)
+
+
+def _by_vectors(tree: Any, _: Matrices) -> Matrices:
+    links = tree.linkage.links
+    about_joints = [
+        x.inertia + x.mass * (x.centre @ x.centre * np.eye(3) - np.outer(x.centre, x.centre)) for x in links
+    ]
+    own = trees.KinematicTree33(
+        [short_type(x) for x in links], [x.axes_in_parent for x in links], [x.offset for x in links],
+        about_joints, [x.centre for x in links], [x.mass for x in links], [x.parent for x in links],
+        tree.model.gravity.tolist(),
+    )  # fmt: skip
+    return _of_python(own, tree)
+
+
+def _by_robot(tree: Any, _: Matrices) -> Matrices:
+    return _of_python(robot_of(tree.linkage.links, tree.model.gravity).GetKinematicTree66(), tree)
+
+
+def _of_python(own: Any, tree: Any) -> Matrices:
+    M, bias = own.ComputeMassMatrixAndForceTerms(np.zeros(own.Size()), tree.initial_angle_rates)
+    return np.array(M), -np.linalg.solve(M, bias)
+
+
+def _by_step(run: Callable[[Any, Any], bool]) -> Callable[[Any, Matrices], Matrices]:
+    """F = M a with the a of one long step of Euler's method."""
+
+    def evaluate(tree: Any, matrices: Matrices) -> Matrices:
+        settings, before = make_settings(), tree.initial_angle_rates
+        set_explicit_method(settings, "ExplicitEuler")
+        set_linear_solver(settings, "EigenSparse")  # EXUdense loses digits (docs/integrators.md)
+        settings.timeIntegration.numberOfSteps = 1
+        settings.timeIntegration.endTime = LONG_STEP
+        data = tree.mbs.systemData
+        if not run(tree.mbs, settings):
+            raise EngineFailure("Exudyn's step of Euler's method failed")
+        after = np.array(data.GetODE2Coordinates_t())
+        data.SetODE2Coordinates(0 * after)
+        data.SetODE2Coordinates_t(before)
+        return matrices[0], (after - before) / LONG_STEP
+
+    return evaluate
+
+
+def _run_by_function(mbs: Any, settings: Any) -> bool:
+    return bool(exudyn.SolveDynamic(mbs, settings, solverType=exudyn.DynamicSolverType.ExplicitEuler))
+
+
+def _run_by_system(mbs: Any, settings: Any) -> bool:
+    return bool(mbs.SolveDynamic(settings, solverType=exudyn.DynamicSolverType.ExplicitEuler))
+
+
+def _run_by_parts(part: str) -> Callable[[Any, Any], bool]:
+    """Take the step by this part of a solver, and by what is before and after it."""
+
+    def run(mbs: Any, settings: Any) -> bool:
+        solver: Any = exudyn.MainSolverExplicit()
+        if not solver.InitializeSolver(mbs, settings):
+            return False
+        solver.it.currentStepSize, solver.it.currentStepIndex = LONG_STEP, 1
+        solver.UpdateCurrentTime(mbs, settings)
+        solver.InitializeStep(mbs, settings)
+        done = getattr(solver, part)(mbs, settings)
+        solver.FinishStep(mbs, settings)
+        solver.FinalizeSolver(mbs, settings)
+        return bool(done)
+
+    return run
+
+
+def _run_by_steps(mbs: Any, settings: Any) -> bool:
+    solver: Any = exudyn.MainSolverExplicit()
+    done = solver.InitializeSolver(mbs, settings) and solver.SolveSteps(mbs, settings)
+    solver.FinalizeSolver(mbs, settings)
+    return bool(done)
+
+
+def _coordinate_marker(mbs: Any, node: Any, link: int) -> Any:
+    return mbs.AddMarker(items.MarkerNodeCoordinate(nodeNumber=node, coordinate=link))
+
+
+def _grounded(connect: Callable[..., Any]) -> Callable[..., None]:
+    """Springs, dampers and efforts of coordinates, one by one, against a grounded node."""
+
+    def add(mbs: Any, node: Any, a: Array, c: Array, k: Array, force: Array) -> None:
+        ground = mbs.AddNode(items.NodePointGround())
+        fixed = mbs.AddMarker(items.MarkerNodeCoordinate(nodeNumber=ground, coordinate=0))
+        for link in np.flatnonzero((c != 0) | (k != 0)):
+            marker = _coordinate_marker(mbs, node, int(link))
+            mbs.AddObject(connect([fixed, marker], float(k[link]), float(c[link])))
+        _add_rest(mbs, node, a, force)
+
+    return add
+
+
+def _add_rest(mbs: Any, node: Any, a: Array, force: Array) -> None:
+    for link in np.flatnonzero(force):
+        marker = _coordinate_marker(mbs, node, int(link))
+        mbs.AddLoad(items.LoadCoordinate(markerNumber=marker, load=float(force[link])))
+    if np.any(a):
+        mbs.AddObject(items.ObjectGenericODE2(nodeNumbers=[node], massMatrix=np.diag(a)))
+
+
+def _spring(kind: str) -> Callable[..., Any]:
+    def connect(markers: Any, stiffness: float, damping: float) -> Any:
+        return getattr(items, kind)(markerNumbers=markers, stiffness=stiffness, damping=damping)
+
+    return connect
+
+
+def _spring_by_function(kind: str) -> Callable[..., Any]:
+    def connect(markers: Any, stiffness: float, damping: float) -> Any:
+        def law(mbs: Any, t: float, item: int, x: float, rate: float, *numbers: Any) -> float:
+            return float(stiffness * x + damping * rate)
+
+        return getattr(items, kind)(markerNumbers=markers, springForceUserFunction=law)
+
+    return connect
+
+
+def _generic_by_functions(mbs: Any, node: Any, a: Array, c: Array, k: Array, force: Array) -> None:
+    def of_forces(mbs: Any, t: float, item: int, q: Any, rates: Any) -> list[float]:
+        return [float(x) for x in force - k * np.array(q) - c * np.array(rates)]
+
+    def of_masses(mbs: Any, t: float, item: int, q: Any, rates: Any) -> Any:
+        return np.diag(a)
+
+    mbs.AddObject(
+        items.ObjectGenericODE2(
+            nodeNumbers=[node], forceUserFunction=of_forces, massMatrixUserFunction=of_masses
+        )
+    )
+
+
+def _load_by_function(mbs: Any, node: Any, a: Array, c: Array, k: Array, force: Array) -> None:
+    for link in range(len(a)):
+        marker = _coordinate_marker(mbs, node, link)
+
+        def law(mbs: Any, t: float, load: float, link: int = link) -> float:
+            q, rates = (mbs.systemData.GetODE2Coordinates(), mbs.systemData.GetODE2Coordinates_t())
+            return float(force[link] - k[link] * q[link] - c[link] * rates[link])
+
+        mbs.AddLoad(items.LoadCoordinate(markerNumber=marker, load=0.0, loadUserFunction=law))
+    _add_rest(mbs, node, a, 0 * force)
+
+
+@dataclass(frozen=True)
+class TreeChange:
+    """What is done otherwise; as it stands nothing."""
+
+    add_tree: Callable[..., tuple[Any, Any]] | None = None  # of a system, links, gravity and rates
+    add_elements: Callable[..., None] | None = None  # of a system, node, rotors, dampers, springs and forces
+    matrices: Callable[[Any, Matrices], Matrices] = lambda _, matrices: matrices
+    items: Any = items
+
+
+def _is_small(model: Model) -> bool:
+    return not model.has_loops and model.n <= MANY_BODIES
+
+
+def _is_plain(model: Model) -> bool:
+    """Whether nothing but gravity acts on a small mechanism."""
+    acts = model.has_elements or model.has_loads or model.has_drag or len(model.spring_body)
+    return _is_small(model) and not acts
+
+
+def _is_serial(model: Model) -> bool:
+    return _is_plain(model) and np.array_equal(model.body[:, 0], np.arange(model.n) - 1)
+
+
+def _has_elements(model: Model) -> bool:
+    return _is_small(model) and bool(np.any(model.stiffness) or np.any(model.damping))
+
+
+def _has_effort(model: Model) -> bool:
+    return _is_small(model) and bool(np.any(model.effort))
+
+
+def _of_items(kind: str, names: Call, way: Callable[..., Any]) -> Variant:
+    def suits(model: Model) -> bool:
+        return _is_small(model) and HAS[kind](model)
+
+    return Variant("spelling", names, TreeChange(items=OtherItems(**{kind: way})), suits)
+
+
+def _solver(*parts: str) -> Call:
+    return tuple(f"MainSolverExplicit.{part}" for part in parts)
+
+
+VARIANTS = (
+    Variant(
+        "spelling",
+        ("MainSystem.CreateKinematicTree", "rigidBodyUtilities.TreeLink"),
+        TreeChange(_add_by_tree_links),
+        _is_small,
+    ),
+    Variant("spelling", ("robotics.Robot", "robotics.RobotLink"), TreeChange(_add_robot), _is_small),
+    Variant(
+        "option",
+        (
+            "kinematicTree.KinematicTree66", "kinematicTree.CRM", "kinematicTree.CRF",
+            "kinematicTree.JointTransformMotionSubspace66", "kinematicTree.MassCOMinertia2T66",
+        ),
+        TreeChange(matrices=_by_plucker_matrices),
+        _is_plain,
+    ),
+    Variant(
+        "vectors",
+        ("kinematicTree.KinematicTree33", "kinematicTree.JointTransformMotionSubspace"),
+        TreeChange(matrices=_by_vectors),
+        _is_plain,
+    ),
+    Variant("option", ("kinematicTree.Inertia2T66",), TreeChange(matrices=_by_robot), _is_serial),
+    Variant("option", ("SolveDynamic",), TreeChange(matrices=_by_step(_run_by_function)), _is_small),
+    Variant("option", ("MainSystem.SolveDynamic",), TreeChange(matrices=_by_step(_run_by_system)), _is_small),
+    Variant(
+        "option",
+        ("DynamicSolverType.ExplicitEuler",
+         *_solver("UpdateCurrentTime", "InitializeStep", "Newton", "FinishStep")),
+        TreeChange(matrices=_by_step(_run_by_parts("Newton"))),
+        _is_small,
+    ),
+    Variant(
+        "option",
+        _solver("DiscontinuousIteration"),
+        TreeChange(matrices=_by_step(_run_by_parts("DiscontinuousIteration"))),
+        _is_small,
+    ),
+    Variant("option", _solver("SolveSteps"), TreeChange(matrices=_by_step(_run_by_steps)), _is_small),
+    *(
+        Variant(
+            "spelling",
+            (f"itemInterface.{name}", f"itemInterface.ObjectConnector{name}"),
+            TreeChange(add_elements=_grounded(_spring(name))),
+            _has_elements,
+        )
+        for name in ("CoordinateSpringDamper", "CoordinateSpringDamperExt")
+    ),
+    *(
+        Variant(
+            "spelling",
+            (f"itemInterface.ObjectConnector{name}SpringForceUserFunction",),
+            TreeChange(add_elements=_grounded(_spring_by_function(name))),
+            _has_elements,
+        )
+        for name in ("CoordinateSpringDamper", "CoordinateSpringDamperExt")
+    ),
+    Variant(
+        "spelling",
+        ("itemInterface.ObjectGenericODE2ForceUserFunction",
+         "itemInterface.ObjectGenericODE2MassMatrixUserFunction"),
+        TreeChange(add_elements=_generic_by_functions),
+        _has_elements,
+    ),
+    Variant(
+        "spelling",
+        ("itemInterface.LoadCoordinateLoadUserFunction", "itemInterface.MarkerNodeCoordinate"),
+        TreeChange(add_elements=_load_by_function),
+        _has_elements,
+    ),
+    Variant(
+        "spelling",
+        ("itemInterface.LoadCoordinate", "itemInterface.NodePointGround"),
+        TreeChange(add_elements=_grounded(_spring("ObjectConnectorCoordinateSpringDamper"))),
+        _has_effort,
+    ),
+    *(_of_items(*way) for way in WAYS if "Function" in way[1][0] and "Vector" in way[1][0]),
+)  # fmt: skip
