@@ -1,8 +1,8 @@
 """Exudyn: KinematicTree33 gives a slide the mass of the last link, not of all links that it carries.
 
-The kinetic energy of two slides along x, which carry 2 kg and 3 kg, by the mass matrix of the class, by that of
-KinematicTree66 and by the speeds of the two bodies.  `ComputeMassMatrixAndForceTerms` of the first has `m` in its
-last loop, which is what the loop before left there, for the composite mass `ICm[i]`.
+The kinetic energy of two slides along x, which carry 2 kg and 3 kg, by the mass matrix of the class, by that
+of KinematicTree66 and by the speeds of the two bodies.  `ComputeMassMatrixAndForceTerms` of the first has `m`
+in its last loop, which is what a loop before left there, for the composite mass `ICm[i]`.
 """
 
 import numpy as np

@@ -1,12 +1,14 @@
-"""Exudyn: explicit methods with an estimate of errors reject steps by the sign of coordinates, and where told not to.
+"""Exudyn: explicit methods with an estimate of errors reject steps by the sign of coordinates.
 
 A mass on a spring, and its mirror image, which takes another number of steps: the error is divided by
-atol + rtol max(x₀, x₁) without the absolute values that Hairer, Nørsett and Wanner (Solving Ordinary Differential
-Equations I, II.4) have.  And with ``automaticStepSize = False`` steps are rejected too, and the run ends.
+atol + rtol max(x₀, x₁) without the absolute values that Hairer, Nørsett and Wanner (Solving Ordinary
+Differential Equations I, II.4) have.  And with ``automaticStepSize = False`` steps are rejected too, and the
+run ends.
 """
 
 import exudyn as exu
-from exudyn import itemInterface as items
+
+items = exu.itemInterface
 
 
 def steps(sign, automatic=True, method="ODE23", rtol=1e-6):
