@@ -30,6 +30,8 @@ BY_CALLBACK: Mapping[str, Mapping[str, str]] = {
     "user": {"gaintype": "mjtGain.mjGAIN_USER", "biastype": "mjtBias.mjBIAS_USER"},
     "own state": {"dyntype": "mjtDyn.mjDYN_USER"},
 }
+PID: Mapping[str, Mapping[str, str]] = {"pid": {"gaintype": "mjtGain.mjGAIN_PID"}}
+PID_GAINS = np.array([3.0, 2.0, 4.0])  # of position, velocity and integral
 CALLBACKS = ("set_mjcb_act_gain", "set_mjcb_act_bias", "set_mjcb_act_dyn")
 SERVO: Mapping[str, Mapping[str, str]] = {"servo": {"biastype": "mjtBias.mjBIAS_AFFINE"}, "motor": {}}
 FAR = 1e6  # of limits that are never reached [rad, m, N or N m]
@@ -56,6 +58,12 @@ def with_actuators(ways: Mapping[str, Mapping[str, str]]) -> Callable[[Any], Any
                     for name, member in members.items():
                         enumeration, _, entry = member.partition(".")
                         setattr(actuator, name, getattr(getattr(mujoco, enumeration), entry))
+                    if way == "pid":
+                        inputs = mujoco.mjtCtrlInput
+                        spec_of_input = inputs.mjINPUT_POS, inputs.mjINPUT_VEL, inputs.mjINPUT_FF
+                        kp, kv, ki = PID_GAINS
+                        total = sum(int(one) for one in spec_of_input)
+                        actuator.set_to_pid(kp=kp, kv=kv, ki=ki, ctrlspec=total)
                     if actuator.dyntype == mujoco.mjtDyn.mjDYN_USER:
                         actuator.actdim = 1
         _add_sensors(spec)
@@ -106,10 +114,26 @@ def _set_efforts(m: Any, d: Any, ways: Mapping[str, Mapping[str, str]], effort: 
                 gain = 2.0, 0.5 / (1 + abs(length)), 0.5 / (1 + abs(speed))
                 m.actuator_gainprm[a, :3] = gain if length else (2.0, 0.0, 0.5 / (1 + abs(speed)))
                 wanted /= m.actuator_gainprm[a, :3] @ [1.0, length, speed]
-            if "dyntype" in members:
+            if way == "pid":
+                _set_pid(m, d, a, wanted / GEAR, (j, rate))
+            elif "dyntype" in members:
                 d.act[m.actuator_actadr[a]] = wanted / GEAR
             else:
                 d.ctrl[_control(m, a)] = wanted / GEAR
+
+
+def _set_pid(m: Any, d: Any, a: int, force: float, place: tuple[int, int]) -> None:
+    """Let a quarter of a force come from each of position, velocity, feedforward and integral."""
+    j, rate = place
+    at = m.actuator_ctrladr[a]
+    if DOFS[J(m.jnt_type[j])] > 1:  # whose lengths are another matter
+        m.actuator_biasprm[a] = m.actuator_gainprm[a] = 0.0
+        d.ctrl[at : at + 3] = 0.0, 0.0, force
+        return
+    length, speed = GEAR * d.qpos[m.jnt_qposadr[j]], GEAR * d.qvel[rate]
+    kp, kv, ki = PID_GAINS
+    d.ctrl[at : at + 3] = length + force / 4 / kp, speed + force / 4 / kv, force / 4
+    d.act[m.actuator_actadr[a]] = force / 4 / ki
 
 
 def _control(m: Any, a: int) -> int:

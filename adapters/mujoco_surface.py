@@ -16,6 +16,7 @@ import mujoco
 import numpy as np
 
 from adapters.mujoco_arrays import add_arrays
+from adapters.pose_functions import Pose, rate_maps
 from plumbline.engines.missing_names import add_parts
 from plumbline.model.datatypes import Array, Call, Float, Model
 from plumbline.model.kinematics import quaternion_product, rotation_matrix
@@ -24,6 +25,7 @@ from plumbline.model.probe_frames import PROBE_ATTITUDE, anchor_point, probe_poi
 SITE, BODY = "site", "body"
 ANCHOR = "anchor"  # site of the world, with the attitude of probe frames
 SENSOR_CLASSES = ("MjsSensor", "mjtSensor")
+TENDON_CLASSES = ("MjsTendon", "MjsTendonPath", "MjsWrap", "mjtWrap")
 WRAPS = ("mjtWrap.mjWRAP_SITE", "mjtWrap.mjWRAP_PULLEY")
 # By sensor that refers to the first probe frame its quantity.
 RELATIVE_SENSORS = {
@@ -93,7 +95,7 @@ POSE_FUNCTIONS = {
     "mju_quat2Vel": "Q.p 1 -> Q.phi", "mju_rotVecQuat": "wl Q.p -> w", "mju_trnVecPose": "L.r L.p Q.r -> r",
     "mju_derivQuat": "Q.p w -> pdot", "mju_subQuat": "Q.p M.p -> K.phi",
     "mju_quatIntegrate": "M.p K.phi 1 -> Q.p", "mju_quatZ2Vec": "R -> p",
-    "mjd_quatIntegrate": "K.phi 1 -> K.R",
+    "mjd_quatIntegrate": "K.phi 1 -> K.R", "mjd_subQuat": "Q.p M.p K.p wl -> wl",
 }  # fmt: skip
 SIZES = {"p": 4, "R": 9, "r": 3, "phi": 3, "w": 3, "pdot": 4, "2pdot": 4}
 
@@ -106,6 +108,11 @@ def pose_function(name: str, given: Sequence[Any], forms: Sequence[str]) -> list
         rest = rotation_matrix(q).T @ R
         half = np.arctan2(rest[1, 0], rest[0, 0]) / 2
         return [quaternion_product(q, np.array([np.cos(half), 0.0, 0.0, np.sin(half)]))]
+    if name == "mjd_subQuat":
+        q, other, between, spin = given
+        of_first = np.zeros((3, 3))
+        mujoco.mjd_subQuat(q, other, of_first, None)
+        return [rate_maps(Pose(np.zeros(3), between))["phidot"] @ of_first @ spin]
     if name == "mjd_quatIntegrate":
         by_turn, by_velocity, by_scale = np.empty(9), np.empty(9), np.empty(3)
         mujoco.mjd_quatIntegrate(*given, by_turn, by_velocity, by_scale)
@@ -154,12 +161,15 @@ def _add_relative_probes(spec: Any, links: Sequence[Any], model: Model) -> None:
             sensor = _sensor(spec, f"{name} in first {k}", name, "SITE", f"probe {k}")
             sensor.reftype, sensor.refname = mujoco.mjtObj.mjOBJ_SITE, "probe 0"
         tendon = spec.add_tendon()
-        tendon.name = f"probe {k}"
+        tendon.name, tendon.limited = f"probe {k}", mujoco.mjtLimited.mjLIMITED_TRUE
+        tendon.range = [0.0, 1e3 * (1.0 + float(np.linalg.norm(anchor.pos)))]  # it is not reached
         for end in (ANCHOR, f"probe {k}", "", f"probe {k}", ANCHOR):
             _ = tendon.wrap_site(end) if end else tendon.wrap_pulley(2.0)
         _actuator(spec, f"probe {k}", "TENDON", f"probe {k}", 2.0 * np.eye(6)[0])
         for i, gear in enumerate(np.eye(6)[:3]):
             _actuator(spec, f"probe {k} {i}", "SITE", f"probe {k}", gear).refsite = ANCHOR
+        for name in ("TENDONLIMITPOS", "TENDONLIMITVEL"):
+            _sensor(spec, f"{name} {k}", name, "TENDON", f"probe {k}")
         for name, (kind, _, _) in DISTANCE_SENSORS.items():
             _sensor(spec, f"{name} {k}", name, kind, f"probe {k}")
 
@@ -209,6 +219,7 @@ def surface_answer(
         lambda: _add_frames(found, m, d, links, sites),
         lambda: _add_momenta(found, m, d, links),
         lambda: _add_relative(found, m, d, len(links)),
+        lambda: _add_tendon_limits(found, m, d, len(links)),
     )
     add_arrays(found, m, d, links, sites)
     add_parts(found, lambda: _add_torques(found, m, d, rates))
@@ -287,7 +298,7 @@ def _add_relative(found: Found, m: Any, d: Any, count: int) -> None:
     # a spatial tendon has a row of both points per straight piece or pulley
     away = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=-1)[:, None]
     found["frame_distance"] |= {
-        ("MjData.ten_length", *WRAPS): d.ten_length[tendons, None] / 1.5,
+        ("MjData.ten_length", *WRAPS, *TENDON_CLASSES): d.ten_length[tendons, None] / 1.5,
         ("MjData.wrap_xpos",): away,
     }
     found["frame_distance_rate"] |= {
@@ -313,6 +324,24 @@ def _add_relative(found: Found, m: Any, d: Any, count: int) -> None:
         ("MjData.actuator_velocity", "mjtTrn.mjTRN_SITE"): d.actuator_velocity[on_sites] @ turn.T,
         ("MjData.actuator_moment", "mjtTrn.mjTRN_SITE"): (moment @ d.qvel)[on_sites] @ turn.T,
     }
+
+
+def _add_tendon_limits(found: Found, m: Any, d: Any, count: int) -> None:
+    """Let the limits of the tendons count from where they are, in another model, and read the sensors."""
+    own = copy(m)
+    far = 2 * float(np.max(d.ten_length))
+    for k in range(count):
+        own.tendon_margin[own.tendon(f"probe {k}").id] = far
+    other = mujoco.MjData(own)
+    other.qpos[:], other.qvel[:] = d.qpos, d.qvel
+    mujoco.mj_forward(own, other)
+    place, speed = (
+        np.array([other.sensor(f"TENDONLIMIT{x} {k}").data.copy() for k in range(count)])
+        for x in ("POS", "VEL")
+    )
+    limit = "mjtConstraint.mjCNSTR_LIMIT_TENDON"
+    found["frame_distance"]["mjtSensor.mjSENS_TENDONLIMITPOS", limit] = (place + far) / 1.5
+    found["frame_distance_rate"]["mjtSensor.mjSENS_TENDONLIMITVEL", limit] = speed / 1.5
 
 
 def _rows(values: Array, of: Any, name: str, width: int) -> Float[Array, "rows width"]:

@@ -311,32 +311,87 @@ def _sparse_rows(d: Any, name: str, width: int) -> Array:
 
 
 def _forward_by_constraint_matrix(m: Any, d: Any) -> None:
-    """Solve for the forces of constraints by their matrix, that of dual solvers."""
+    """Solve for the forces of constraints by their matrix, that of dual solvers, and by its root."""
     mujoco.mj_forward(m, d)
-    count = len(d.efc_b)
-    d.efc_force[:] = -np.linalg.solve(_sparse_rows(d, "efc_AR", count), d.efc_b)
+    root = _sparse_rows(d, "efc_Y", m.nv)
+    matrices = _sparse_rows(d, "efc_AR", len(d.efc_b)), root @ root.T + np.diag(d.efc_R)
+    d.efc_force[:] = -sum(np.linalg.solve(matrix, d.efc_b) for matrix in matrices) / 2
     mujoco.mj_mulJacTVec(m, d, d.qfrc_constraint, d.efc_force)
     mujoco.mj_solveM(m, d, d.qacc[None], (d.qfrc_smooth + d.qfrc_constraint)[None])
 
 
-def _forward_by_constraint_rows(m: Any, d: Any) -> None:
-    """Solve for them by their Jacobian, softness and reference."""
-    mujoco.mj_forward(m, d)
+def _constraint_forces(m: Any, d: Any, softness: Array, reference: Array) -> Array:
+    """Solve for the forces of constraints by their Jacobian."""
     rows = _sparse_rows(d, "efc_J", m.nv)
     through, product = np.zeros_like(rows), np.zeros(len(rows))
     mujoco.mj_solveM(m, d, through, rows)
     mujoco.mj_mulJacVec(m, d, product, d.qacc_smooth)
-    force = np.linalg.solve(rows @ through.T + np.diag(d.efc_R), d.efc_aref - product)
-    mujoco.mj_constraintUpdate(m, d, -d.efc_R * force, None, 0)
+    return np.asarray(np.linalg.solve(rows @ through.T + np.diag(softness), reference - product))
+
+
+def _forward_by_constraint_rows(m: Any, d: Any) -> None:
+    """Solve for them by what makes up their softness, and let MuJoCo find them from the residuals."""
+    mujoco.mj_forward(m, d)
+    impedance = np.reshape(d.efc_KBIP, (-1, 4))[:, 2]
+    force = _constraint_forces(m, d, d.efc_diagA * (1 - impedance) / impedance, d.efc_aref)
+    mujoco.mj_constraintUpdate(m, d, -force / d.efc_D, None, 0)
     mujoco.mj_solveM(m, d, d.qacc[None], (d.qfrc_smooth + d.qfrc_constraint)[None])
 
 
 def _forward_by_islands(m: Any, d: Any) -> None:
-    """Read accelerations and forces of constraints from the arrays of islands."""
+    """Average what the arrays of islands say of accelerations, and of the forces of constraints."""
     mujoco.mj_forward(m, d)
-    d.qacc[:], d.efc_force[d.map_iefc2efc] = np.nan, d.iefc_force
-    rest = d.map_idof2dof[d.nidof :]
-    d.qacc[d.map_idof2dof[: d.nidof]], d.qacc[rest] = d.iacc, d.qacc_smooth[rest]
+    rows, dofs, size = d.map_iefc2efc, d.map_idof2dof[: d.nidof], len(d.efc_force)
+    softness, reference, own = np.ones((3, size))
+    softness[rows], reference[rows], own[rows] = d.iefc_R, d.iefc_aref, d.iefc_force
+    d.efc_force[:] = (own + _constraint_forces(m, d, softness, reference)) / 2
+    total, of_forces, smooth, change = d.qfrc_smooth.copy(), *np.zeros((3, m.nv))
+    total[dofs] = d.ifrc_smooth + d.ifrc_constraint
+    mujoco.mj_solveM(m, d, of_forces[None], total[None])
+    mujoco.mj_mulJacTVec(m, d, total, own)
+    mujoco.mj_solveM(m, d, change[None], total[None])
+    smooth[:] = d.qacc_smooth
+    d.qacc[:] = smooth
+    smooth[dofs], d.qacc[dofs] = d.iacc_smooth, d.iacc
+    d.qacc[:] = (d.qacc + of_forces + smooth + change) / 3
+
+
+def _forward_by_switched_welds(m: Any, d: Any) -> None:
+    """Switch the equalities on that are off in the model."""
+    d.eq_active[:] = 1
+    mujoco.mj_forward(m, d)
+
+
+def _switched_off(spec: Any) -> Any:
+    for equality in spec.equalities:
+        equality.active = False
+    return spec
+
+
+def _forward_with_flags(*members: str) -> Callable[[Any, Any], None]:
+    def forward(m: Any, d: Any) -> None:
+        for member in members:
+            m.opt.enableflags |= int(getattr(mujoco.mjtEnableBit, member.partition(".")[2]))
+        mujoco.mj_forward(m, d)
+
+    return forward
+
+
+def _never_asleep(spec: Any) -> Any:
+    for body in _bodies(spec):
+        if body.parent.name == "world":
+            body.sleep = mujoco.mjtSleepPolicy.mjSLEEP_NEVER
+    return spec
+
+
+def _without_sleep(m: Any, d: Any) -> tuple[Any, Any]:
+    m.opt.sleep_tolerance = 1e9
+    return m, d
+
+
+def _line_search(m: Any, d: Any) -> tuple[Any, Any]:
+    m.opt.iterations, m.opt.tolerance, m.opt.ls_iterations, m.opt.ls_tolerance = 3, 0.0, 7, 1e-3
+    return m, d
 
 
 def _set_options(**values: str | int) -> Callable[[Any, Any], tuple[Any, Any]]:
@@ -496,7 +551,7 @@ VARIANTS = (
     _free("option", ("mj_defaultOption",), remake=_default_options),
     Variant(
         "option",
-        ("mj_mulJacTVec", "MjData.efc_AR", "MjData.efc_b"),
+        ("mj_mulJacTVec", "MjData.efc_AR", "MjData.efc_b", "MjData.efc_Y", "MjData.efc_R"),
         Change(
             remake=_set_options(jacobian="mjtJacobian.mjJAC_SPARSE", solver="mjtSolver.mjSOL_PGS"),
             forward=_forward_by_constraint_matrix,
@@ -509,17 +564,47 @@ VARIANTS = (
             "mj_mulJacVec",
             "mj_constraintUpdate",
             "MjData.efc_J",
-            "MjData.efc_R",
             "MjData.efc_aref",
+            "MjData.efc_D",
+            "MjData.efc_diagA",
+            "MjData.efc_KBIP",
         ),
         Change(remake=_set_options(jacobian="mjtJacobian.mjJAC_SPARSE"), forward=_forward_by_constraint_rows),
         is_constrained,
     ),
     Variant(
         "option",
-        ("mj_island", "MjData.iacc", "MjData.iefc_force"),
+        (
+            "mj_island",
+            "MjData.iacc",
+            "MjData.iefc_force",
+            "MjData.iacc_smooth",
+            "MjData.ifrc_smooth",
+            "MjData.ifrc_constraint",
+            "MjData.iefc_R",
+            "MjData.iefc_aref",
+        ),
         Change(remake=_set_options(jacobian="mjtJacobian.mjJAC_SPARSE"), forward=_forward_by_islands),
         lambda model: model.has_loops,
+    ),
+    Variant(
+        "option",
+        ("MjData.eq_active",),
+        Change(describe=_switched_off, forward=_forward_by_switched_welds),
+        lambda model: model.has_loops,
+    ),
+    Variant(
+        "option",
+        ("MjOption.ls_iterations", "MjOption.ls_tolerance"),
+        Change(remake=_line_search),
+        lambda model: model.has_loops,
+    ),
+    _free(
+        "option",
+        ("mjtEnableBit.mjENBL_SLEEP", "mjtSleepPolicy", "MjOption.sleep_tolerance"),
+        describe=_never_asleep,
+        remake=_without_sleep,
+        forward=_forward_with_flags("mjtEnableBit.mjENBL_SLEEP"),
     ),
     # Of Newton's method, on a linear problem: the second and third remove rounding, more can add some.
     _options(3, jacobian="mjtJacobian.mjJAC_SPARSE"),
@@ -542,6 +627,15 @@ VARIANTS = (
             forward=actuation.forward_by_actuators(actuation.SERVO, "JOINTACTFRC"),
         ),
         _has_elements("stiffness", "damping"),
+    ),
+    Variant(
+        "spelling",
+        ("mjtGain.mjGAIN_PID", "mjtDyn.mjDYN_PID", "mjtCtrlInput"),
+        Change(
+            describe=actuation.with_actuators(actuation.PID),
+            forward=actuation.forward_by_actuators(actuation.PID),
+        ),
+        _has_elements("effort"),
     ),
     Variant(
         "spelling",
