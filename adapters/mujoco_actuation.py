@@ -262,6 +262,7 @@ def _tendons(m: Any) -> list[tuple[int, int]]:
 def forward_by_tendons(m: Any, d: Any) -> None:
     """Exert the efforts of hinges and slides by motors on their tendons, as their sensors report them.
 
+    The accelerations go through inverse dynamics and back, wrong with rotors of tendons before 3.3.4.
     These report the motors' forces without their gear: docs/surface/mujoco_tendon_actuator_force.py.
     """
     effort = d.qfrc_applied.copy()
@@ -275,6 +276,9 @@ def forward_by_tendons(m: Any, d: Any) -> None:
     for j, t in _tendons(m):
         rate, sensor = m.jnt_dofadr[j], d.sensor(f"TENDONACTFRC {m.tendon(t).name}")
         total[rate] += COEFFICIENT * GEAR * sensor.data[0] - effort[rate]
+    mujoco.mj_solveM(m, d, d.qacc[None], total[None])
+    mujoco.mj_inverse(m, d)
+    total = d.qfrc_inverse + d.qfrc_passive - d.qfrc_bias
     mujoco.mj_solveM(m, d, d.qacc[None], total[None])
     d.qfrc_applied[:] = effort
 

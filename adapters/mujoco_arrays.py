@@ -133,11 +133,13 @@ def _add_joint_frames(found: Found, m: Any, d: Any, links: Sequence[int]) -> Non
                 continue
             if name is None:
                 sensors |= {"BALLQUAT", "BALLANGVEL"}
-                own, w = (d.sensor(f"{kind} {j}").data for kind in ("BALLQUAT", "BALLANGVEL"))
+                own, w = (d.sensor(f"{kind} {m.joint(j).name}").data for kind in ("BALLQUAT", "BALLANGVEL"))
                 rates = [rotation_matrix(own).T @ x for x in rates] + [w]
             else:
                 sensors |= {"JOINTPOS", "JOINTVEL"}
-                q, v = (float(d.sensor(f"{kind} {j}").data[0]) for kind in ("JOINTPOS", "JOINTVEL"))
+                q, v = (
+                    float(d.sensor(f"{kind} {m.joint(j).name}").data[0]) for kind in ("JOINTPOS", "JOINTVEL")
+                )
                 q -= m.qpos0[m.jnt_qposadr[j]]
                 if name == "SLIDE":
                     moved = moved + rotation_matrix(quat) @ (q * m.jnt_axis[j])

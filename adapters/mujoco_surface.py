@@ -137,7 +137,7 @@ def add_probes(spec: Any, links: Sequence[Any], model: Model) -> None:
             sensor.name, sensor.type = f"{name} {k}", getattr(mujoco.mjtSensor, f"mjSENS_{name}")
             sensor.objtype = objects[kind]
             sensor.objname = site.name if kind == SITE else link.name
-    for name in ENERGIES:
+    for name in ENERGIES if hasattr(mujoco.mjtSensor, "mjSENS_E_KINETIC") else ():
         sensor = spec.add_sensor()
         sensor.name, sensor.type = name, getattr(mujoco.mjtSensor, f"mjSENS_{name}")
     _add_joint_sensors(spec)
@@ -189,14 +189,14 @@ def _actuator(spec: Any, name: str, transmission: str, target: str, gear: Array)
 
 
 def _add_joint_sensors(spec: Any) -> None:
-    """Add sensors of all joints but free ones, named by the joint's number."""
+    """Add sensors of all joints but free ones, named by the joint's name."""
     kinds = {mujoco.mjtJoint.mjJNT_BALL: BALL_SENSORS, mujoco.mjtJoint.mjJNT_FREE: ()}
     joints = [joint for body in spec.bodies for joint in body.joints]
     for j, joint in enumerate(joints):
         joint.name = joint.name or f"joint {j}"
         for name in kinds.get(joint.type, JOINT_SENSORS):
             sensor = spec.add_sensor()
-            sensor.name, sensor.type = f"{name} {j}", getattr(mujoco.mjtSensor, f"mjSENS_{name}")
+            sensor.name, sensor.type = f"{name} {joint.name}", getattr(mujoco.mjtSensor, f"mjSENS_{name}")
             sensor.objtype, sensor.objname = mujoco.mjtObj.mjOBJ_JOINT, joint.name
 
 
@@ -229,9 +229,6 @@ def surface_answer(
 def _add_sensors(found: Found, m: Any, d: Any, count: int, elastic: float) -> None:
     for stage in SENSOR_STAGES:
         getattr(mujoco, stage)(m, d)
-    kinetic, potential = (d.sensor(name).data.copy()[None] for name in ENERGIES)
-    found["kinetic_energy"]["mjtSensor.mjSENS_E_KINETIC",] = kinetic
-    found["gravity_energy"]["mjtSensor.mjSENS_E_POTENTIAL",] = potential - elastic
     read = {name: np.array([d.sensor(f"{name} {k}").data.copy() for k in range(count)]) for name in SENSORS}
     turn = rotation_matrix(read.pop("FRAMEQUAT"))
     axes = [read.pop(name) for name in AXES]
@@ -246,6 +243,11 @@ def _add_sensors(found: Found, m: Any, d: Any, count: int, elastic: float) -> No
     found["frame_position"]["MjData.sensordata", *SENSOR_CLASSES] = d.sensordata[
         np.array(places)[:, None] + np.arange(3)
     ]
+    # last: older versions lack them
+    _ = mujoco.mjtSensor.mjSENS_E_KINETIC
+    kinetic, potential = (d.sensor(name).data.copy()[None] for name in ENERGIES)
+    found["kinetic_energy"]["mjtSensor.mjSENS_E_KINETIC",] = kinetic
+    found["gravity_energy"]["mjtSensor.mjSENS_E_POTENTIAL",] = potential - elastic
 
 
 def _add_frames(found: Found, m: Any, d: Any, links: Sequence[int], sites: Sequence[int]) -> None:

@@ -384,9 +384,11 @@ def _never_asleep(spec: Any) -> Any:
     return spec
 
 
-def _without_sleep(m: Any, d: Any) -> tuple[Any, Any]:
+def _with_sleep(m: Any, d: Any) -> tuple[Any, Any]:
+    """Allow sleep before the data are made; of what may sleep, all is slow enough."""
     m.opt.sleep_tolerance = 1e9
-    return m, d
+    m.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+    return m, mujoco.MjData(m)
 
 
 def _line_search(m: Any, d: Any) -> tuple[Any, Any]:
@@ -603,7 +605,7 @@ VARIANTS = (
         "option",
         ("mjtEnableBit.mjENBL_SLEEP", "mjtSleepPolicy", "MjOption.sleep_tolerance"),
         describe=_never_asleep,
-        remake=_without_sleep,
+        remake=_with_sleep,
         forward=_forward_with_flags("mjtEnableBit.mjENBL_SLEEP"),
     ),
     # Of Newton's method, on a linear problem: the second and third remove rounding, more can add some.
