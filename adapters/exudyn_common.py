@@ -322,10 +322,20 @@ def make_rigid_body(node: Any, mass: float, J: Float[Array, "3 3"]) -> Any:
         The item, to be added to a system.
 
     """
-    sizes = {"mass": mass, "inertia": [J[0, 0], J[1, 1], J[2, 2], J[1, 2], J[0, 2], J[0, 1]]}
+    inertia = [J[0, 0], J[1, 1], J[2, 2], J[1, 2], J[0, 2], J[0, 1]]
+    return items.ObjectRigidBody(nodeNumber=node, **sizes_of_body(mass=mass, inertia=inertia))
+
+
+def sizes_of_body(**sizes: Any) -> Mapping[str, Any]:
+    """Name mass and inertia of a body as the version does."""
     if "mass" not in signature(items.ObjectRigidBody).parameters:  # before 1.12
         sizes = {f"physics{name.capitalize()}": value for name, value in sizes.items()}
-    return items.ObjectRigidBody(nodeNumber=node, **sizes)
+    return sizes
+
+
+def known_arguments(function: Callable[..., Any], given: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Leave out what older versions of a function have not."""
+    return {name: value for name, value in given.items() if name in signature(function).parameters}
 
 
 def kinetic_energy(mbs: Any, bodies: list[Any], quadratic_form: float) -> float:

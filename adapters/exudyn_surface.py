@@ -125,6 +125,8 @@ ExpSO3: phi -> R
 ExpS3: phi -> p
 ExpSE3: xi -> H
 ExpR3xSO3: rphi -> G
+TExpR3xSO3: Q.rphi -> @rphidot vwl
+TExpR3xSO3Inv: Q.rphi -> @vwl rphidot
 LogSO3: Q.R -> Q.skew
 LogSE3: Q.H -> Q.log
 TExpSO3: Q.phi -> @phidot wl

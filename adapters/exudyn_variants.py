@@ -14,7 +14,7 @@ import exudyn
 import numpy as np
 from exudyn import rigidBodyUtilities
 
-from adapters.exudyn_common import OtherItems, items, make_rigid_body
+from adapters.exudyn_common import OtherItems, items, known_arguments, make_rigid_body, sizes_of_body
 from adapters.pose_functions import Pose, rate_maps
 from plumbline.engines.variants import Variant
 from plumbline.model.datatypes import Array, Call, Float, JointKind, Model, Unsupported
@@ -93,7 +93,8 @@ def _add_by_short_names(mbs: Any, piece: Piece) -> tuple[Any, Any]:
     velocities = [*piece.velocity, *(euler_parameter_rates(piece.turn) @ piece.spin)]
     node = mbs.AddNode(items.RigidEP(referenceCoordinates=reference, initialVelocities=velocities))
     inertia = utilities.InertiaTensor2Inertia6D(piece.part.inertia)
-    body = mbs.AddObject(items.RigidBody(nodeNumber=node, mass=piece.part.mass, inertia=inertia))
+    sizes = sizes_of_body(mass=piece.part.mass, inertia=inertia)
+    body = mbs.AddObject(items.RigidBody(nodeNumber=node, **sizes))
     weight = mbs.AddMarker(items.MarkerBodyMass(bodyNumber=body))
     mbs.AddLoad(items.Gravity(markerNumber=weight, loadVector=piece.gravity.tolist()))
     return node, body
@@ -155,12 +156,16 @@ def _set_later(set_parameters: Callable[..., None]) -> Any:
 
 def _set_parameters(mbs: Any, node: Any, body: Any, rates: list[float], mass: float) -> None:
     mbs.SetNodeParameter(node, "initialVelocities", rates)
-    mbs.SetObjectParameter(body, "mass", mass)
+    for name, value in sizes_of_body(mass=mass).items():
+        mbs.SetObjectParameter(body, name, value)
 
 
 def _modify(mbs: Any, node: Any, body: Any, rates: list[float], mass: float) -> None:
     given: Any
-    for name, item, given in (("Node", node, {"initialVelocities": rates}), ("Object", body, {"mass": mass})):
+    for name, item, given in (
+        ("Node", node, {"initialVelocities": rates}),
+        ("Object", body, sizes_of_body(mass=mass)),
+    ):
         whole = getattr(mbs, f"Get{name}")(item) | given
         seen = {key: value for key, value in whole.items() if not key.startswith("V")}
         getattr(mbs, f"Modify{name}")(item, seen)
@@ -232,7 +237,8 @@ def _created(function: str, *given: str) -> Callable[[Any, Joint], Any]:
             "localPosition0": joint.points[0], "localPosition1": joint.points[1],
         }  # fmt: skip
         own = {name: values[name] for name in given}
-        return getattr(mbs, function)(bodyNumbers=list(joint.bodies), **own)
+        made = getattr(mbs, function)(bodyNumbers=list(joint.bodies), **own)
+        return made[0] if isinstance(made, list) else made  # before 1.10 with its markers
 
     return create
 
@@ -321,7 +327,12 @@ def _created_between(function: str, **more: Any) -> Callable[..., Any]:
             ends = [mbs.GetMarker(marker) for marker in markerNumbers]
             points = {f"localPosition{i}": end["localPosition"] for i, end in enumerate(ends)}
             create = getattr(mbs, function)
-            return create(bodyNumbers=[end["bodyNumber"] for end in ends], **points, **given, **more)
+            return create(
+                bodyNumbers=[end["bodyNumber"] for end in ends],
+                **points,
+                **given,
+                **known_arguments(create, more),
+            )
 
         return add
 
@@ -471,6 +482,13 @@ HAS: Mapping[str, Callable[[Model], bool]] = {
     "ObjectConnectorLinearSpringDamper": _has_elements_that("slide"),
     "ObjectConnectorTorsionalSpringDamper": _has_elements_that("turn"),
 }
+# under the name of the version; else the drag would act between the points
+_FUNCTION: Any = exudyn.MainSystem.CreateRigidBodySpringDamper
+_NOT_INTRINSIC = dict(
+    list(
+        known_arguments(_FUNCTION, {"useIntrinsicFormulation": False, "intrinsicFormulation": False}).items()
+    )[:1]
+)
 WAYS: tuple[tuple[str, Call, Callable[..., Any]], ...] = (
     *((kind, (f"itemInterface.{short}",), _renamed(short)) for kind, short in SHORT_NAMES.items()),
     *(
@@ -495,7 +513,7 @@ WAYS: tuple[tuple[str, Call, Callable[..., Any]], ...] = (
     ("ObjectConnectorLinearSpringDamper", ("MainSystem.CreateLinearSpringDamper",),
      _linear_by_function),
     ("ObjectConnectorRigidBodySpringDamper", ("MainSystem.CreateRigidBodySpringDamper",),
-     _created_between("CreateRigidBodySpringDamper", useIntrinsicFormulation=False)),
+     _created_between("CreateRigidBodySpringDamper", **_NOT_INTRINSIC)),
     ("ObjectConnectorRigidBodySpringDamper",
      ("itemInterface.ObjectConnectorRigidBodySpringDamperSpringForceTorqueUserFunction",), _six_by_function),
     ("ObjectConnectorRigidBodySpringDamper",
@@ -551,7 +569,8 @@ def _jacobian_of_items(chain: Any, C: Array) -> Array:
 
 
 def _mass_matrix_of_linearised(chain: Any, _: Array) -> Array:
-    M, *_others = chain.mbs.ComputeLinearizedSystem(autoAssemble=False)
+    function = chain.mbs.ComputeLinearizedSystem
+    M, *_others = function(**known_arguments(function, {"autoAssemble": False}))
     return np.asarray(M)
 
 

@@ -17,6 +17,7 @@ velocities of the body, which have a truth.  Poses are that of the body, which h
     H X XI G xi log         4 × 4 matrix; Plücker matrix, angular part first, and its inverse; 7 × 7 matrix of
                             R³ × SO(3); logarithm on SE(3), linear part first, and its 4 × 4 matrix
     w wl t                  angular velocity in the world and in Q's axes; twist in these, linear part first
+    vwl rphidot             ṙ in the world with w in Q's axes, or with the rate of phi
     pdot 2pdot phidot xyzdot rpydot xidot    rates of the forms
 
 A result "@pdot w" is a matrix that takes the first to the second.  "Rx" is the turn by x alone and "Tx" the
@@ -133,6 +134,11 @@ class Pose:
         return named | dict(zip(("x", "y", "z", "rx", "ry", "rz"), map(float, [*xyz, *self.r]), strict=True))
 
 
+def _beside_velocity(turning: Array, Q: Pose) -> Array:
+    """The twist's map from ṙ in the world and from what ``turning`` takes to ω in Q's axes."""
+    return np.block([[Q.R.T, np.zeros((3, 3))], [np.zeros((3, 3)), turning]])
+
+
 def rate_maps(Q: Pose) -> dict[str, Array]:
     """Return matrices at Q from the rates of forms to ω in Q's axes, or to the twist in them."""
     phi, (a, *_), (u, v, _) = (Q.forms[name] for name in ("phi", "xyz", "rpy"))
@@ -150,6 +156,8 @@ def rate_maps(Q: Pose) -> dict[str, Array]:
     return maps | {
         "phidot": _mean_of_exponential(-cross_matrix(phi)), "xidot": _mean_of_exponential(-generator),
         "pdot": np.stack([angular_velocity(Q.p, axis) for axis in np.eye(4)], 1), "t": np.eye(6),
+        "rphidot": _beside_velocity(_mean_of_exponential(-cross_matrix(phi)), Q),
+        "vwl": _beside_velocity(np.eye(3), Q),
         "2pdot": np.stack([angular_velocity(Q.p, axis) for axis in np.eye(4)], 1) / 2,
     }  # fmt: skip
 

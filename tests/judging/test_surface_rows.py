@@ -87,6 +87,21 @@ def test_every_variant_agrees_and_a_relative_change_of_1e_6_is_seen(engine, coun
     assert len(names) >= count and set(exercised_names(truth, evaluation)) == names
 
 
+def test_exudyns_ways_for_trees_agree_and_its_tree_of_vectors_gives_slides_the_last_mass():
+    model, states = mechanism(("slide", "hinge"), seed=1)
+    bare = dict.fromkeys(("force", "moment", "drag_force", "drag_moment"), 0)
+    model = replace(model, **{name: 0 * getattr(model, name) for name in bare})
+    truth, adapter = state_truth(model, states), load_adapter("exudyn-tree")
+    variants = evaluate_variants(adapter, model, states)
+    rows = judge_variants(WHO, truth, Evaluation([], None, None, 0.0, variants=variants))
+    wrong = {row.quantity for row in rows if row.verdict != Verdict.AGREES}
+    assert wrong == {f"{name}_by_vectors" for name in (
+        "acceleration", "angular_acceleration", "kinetic_energy", "mass_matrix",
+    )}  # fmt: skip
+    names = {name for calls in variants.values() for call in calls for name in call}
+    assert len(names) > 15 and "kinematicTree.KinematicTree33" in names
+
+
 def test_variants_of_flat_bodies_and_of_frames_turned_by_quarters_agree():
     model, _ = mechanism(("hinge",))
     about_x, about_y = np.array([0.8, 0.6, 0.0, 0.0]), np.array([1.0, 0.0, 1.0, 0.0]) / np.sqrt(2)
