@@ -125,8 +125,8 @@ def welds_as_points(spec: Any) -> Any:
 
 def attached(spec: Any) -> Any:
     """Attach the whole to an empty one, whose defaults have another rotor, damper and spring of joints."""
-    other = mujoco.MjSpec()
+    attach, other = mujoco.MjSpec.attach, mujoco.MjSpec()
     other.compiler.autolimits = False
     other.default.joint.armature = 3.0
-    other.attach(spec, frame=other.worldbody.add_frame(), prefix="attached ")
+    attach(other, spec, frame=other.worldbody.add_frame(), prefix="attached ")
     return other

@@ -402,18 +402,23 @@ def _add_factors(found: Found, m: Any, d: Any) -> None:
     root, momentum, back = np.zeros((3, m.nv))
     mujoco.mj_mulM2(m, d, root, d.qvel)
     mujoco.mj_mulM(m, d, momentum, d.qvel)
-    mujoco.mj_solveM2(m, d, back[None], momentum[None], np.sqrt(d.qLDiagInv))
+    diagonal = (np.sqrt(d.qLDiagInv),) if not hasattr(d, "qLDiagSqrtInv") else ()  # of older versions
+    mujoco.mj_solveM2(m, d, back[None], momentum[None], *diagonal)
+    found["kinetic_energy"] |= {
+        ("mj_mulM2",): np.array([[root @ root / 2]]),
+        ("mj_solveM2", "MjData.qLDiagInv"): np.array([[back @ back / 2]]),
+        ("MjData.energy",): d.energy[1:, None].copy(),
+    }
+
+
+def _add_sum(found: Found, m: Any, d: Any) -> None:
+    """Add the kinetic energy by M added to nothing."""
     added, columns = np.zeros(m.nM), np.zeros(m.nM, np.int32)  # the binding's sizes; it fills nC
     columns[: m.nC] = m.M_colind
     mujoco.mj_addM(m, d, added, m.M_rownnz.copy(), m.M_rowadr.copy(), columns)
     lower = _rows(added, m, "M", m.nv)
     through = lower @ d.qvel + np.tril(lower, -1).T @ d.qvel
-    found["kinetic_energy"] |= {
-        ("mj_mulM2",): np.array([[root @ root / 2]]),
-        ("mj_addM",): np.array([[d.qvel @ through / 2]]),
-        ("mj_solveM2", "MjData.qLDiagInv"): np.array([[back @ back / 2]]),
-        ("MjData.energy",): d.energy[1:, None].copy(),
-    }
+    found["kinetic_energy"]["mj_addM",] = np.array([[d.qvel @ through / 2]])
 
 
 def _add_torques(found: Found, m: Any, d: Any, rates: Array) -> None:
@@ -438,7 +443,11 @@ def _add_torques(found: Found, m: Any, d: Any, rates: Array) -> None:
         dynamics[*call, "MjData.qfrc_inverse"] = d.qfrc_inverse + d.qfrc_passive - rotors
     dynamics |= _joint_forces(m, d)
     dynamics[INVERSE_STAGES] = _inverse_by_stages(m, d, tau)
-    found["kinetic_energy"] |= _implicit_steps(m, d, dynamics)
+    add_parts(
+        found,
+        lambda: found["kinetic_energy"].update(_implicit_steps(m, d, dynamics)),
+        lambda: _add_sum(found, m, d),
+    )
     if not np.any(m.dof_damping):
         flags = m.opt.enableflags
         m.opt.enableflags = flags | int(mujoco.mjtEnableBit.mjENBL_INVDISCRETE)
