@@ -39,7 +39,8 @@ off on the catalogue's ten balls, 2e-8 on thirty, 8e-3 on fifty, where `crba` is
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -58,10 +59,13 @@ from adapters.pinocchio_common import (
     set_corrector,
     translation,
 )
+from adapters.pinocchio_loops import Loops, closed_accelerations
+from adapters.pinocchio_relations import add_accelerations
 from adapters.pinocchio_surface import POSE_FUNCTIONS, add_probe_frames, pose_function, surface_answer
 from adapters.pinocchio_variants import VARIANTS, Change, Spelling
 from adapters.pose_functions import add_pose_answers
 from plumbline.engines.integrators import dop853, rkmk4, sample_steps, semi_implicit_euler
+from plumbline.engines.missing_names import add_parts
 from plumbline.model.datatypes import (
     Array,
     Call,
@@ -96,6 +100,18 @@ JOINT_MODELS = {
     "slide": (pin.JointModelPX, pin.JointModelPY, pin.JointModelPZ),
 }
 HELICAL_MODELS = pin.JointModelHX, pin.JointModelHY, pin.JointModelHZ
+USUAL_NAMES = (
+    "Data", "Data.f", "Force", "Frame", "FrameType", "FrameType.OP_FRAME", "Inertia", "JointData",
+    "JointModel", "Model", "Model.addFrame", "Model.addJoint", "Model.appendBodyToJoint", "Model.armature",
+    "Model.createData", "Model.frames", "Model.gravity", "Model.inertias", "Model.jointPlacements",
+    "Model.joints", "Model.njoints", "Model.nq", "Model.nv", "Model.parents", "Motion", "ReferenceFrame",
+    "SE3", "StdVec_Force", "neutral",
+)  # fmt: skip
+NAMES_OF_LOOPS = (
+    "ContactType", "ContactType.CONTACT_6D", "ProximalSettings", "RigidConstraintData",
+    "RigidConstraintModel", "StdVec_RigidConstraintData", "StdVec_RigidConstraintModel",
+)  # fmt: skip
+CLOSED_STATES = 2  # at which loops are closed in all ways
 FIXED_STEPS = {"semi-implicit-euler": semi_implicit_euler, "rkmk4": rkmk4}
 
 
@@ -382,11 +398,7 @@ class PinocchioChain:
         self, q: Float[Array, "quaternion_entries"], v: Float[Array, "angle_entries"]
     ) -> Float[Array, "angle_entries"]:
         """Evaluate the accelerations under gravity and loads, by the chosen algorithm."""
-        if self.ends:
-            self.loads = list(self.constant_loads)
-            self._add_up_loads()
-        self.update_loads(q, v)
-        torque = self.joint_torque(q, v)
+        torque = self._load(q, v)
         if self.has_constraints:
             return self._closed_acceleration(q, v, torque)
         if self.algorithm in ("crba", "cholesky", "forwardDynamics"):
@@ -403,11 +415,27 @@ class PinocchioChain:
         convention = pin.Convention.WORLD if self.algorithm == "aba-world" else pin.Convention.LOCAL
         return np.asarray(pin.aba(self.pin_model, self.data, q, v, torque, self.fext, convention))
 
+    def _load(self, q: Array, v: Array) -> Array:
+        """Set the loads without forces of loops, and return the torques of the joints."""
+        if self.ends:
+            self.loads = list(self.constant_loads)
+            self._add_up_loads()
+        self.update_loads(q, v)
+        return self.joint_torque(q, v)
+
+    def loops(self, q: Array, v: Array) -> Loops:
+        """Return the tree with what closes and moves it."""
+        return Loops(self.pin_model, self.welds, self.weld_data, self._push(q, v, self._load(q, v)))
+
+    def _push(self, q: Array, v: Array, torque: Array) -> Array:
+        """Return torques and loads as joint torques."""
+        push = torque + pin.nonLinearEffects(self.pin_model, self.data, q, v)
+        return np.asarray(push - pin.rnea(self.pin_model, self.data, q, v, self.zero_torque, self.fext))
+
     def _closed_acceleration(self, q: Array, v: Array, torque: Array) -> Array:
         """Evaluate the accelerations with the loops closed; their forces are added to the loads."""
         engine, data = self.pin_model, self.data
-        push = torque + pin.nonLinearEffects(engine, data, q, v)
-        push -= pin.rnea(engine, data, q, v, self.zero_torque, self.fext)
+        push = self._push(q, v, torque)
         settings = pin.ProximalSettings(*PROXIMAL_SETTINGS)
         a = pin.constraintDynamics(engine, data, q, v, push, self.welds, self.weld_data, settings).copy()
         for (b, c), solved in zip(self.ends, self.weld_data, strict=True):
@@ -751,6 +779,51 @@ def rod_quaternion(u: Float[Array, "3"]) -> Float[Array, "4"]:
     return np.asarray(p / np.linalg.norm(p))
 
 
+def _add_closed(
+    answer: dict[str, dict[Call, Array]],
+    chain: PinocchioChain,
+    frames: Sequence[int],
+    motion: tuple[Array, Array, Array],
+) -> None:
+    """Add accelerations by all ways to close loops."""
+    for by_derivative, call, a in closed_accelerations(chain.loops(*motion[:2]), *motion[:2]):
+        suffix = "by_derivative" if by_derivative else "by_constraint_solver"
+        add_accelerations(answer, chain.pin_model, frames, motion, {call: a}, suffix)
+
+
+def _has_joint(kind: str) -> Callable[[Model], bool]:
+    """Whether a mechanism is built with such a joint."""
+
+    def has(model: Model) -> bool:
+        tree = PinocchioChain(cut_open(model).model if model.has_loops else model, "crba")
+        return any(joint.shortname() == f"JointModel{kind}" for joint in tree.joints)
+
+    return has
+
+
+COLUMN_NAMES = (
+    (USUAL_NAMES, lambda _: True),
+    (NAMES_OF_LOOPS, lambda model: model.has_loops),
+    *(
+        ((f"JointModel{kind}", f"JointData{kind}"), _has_joint(kind))
+        for kind in (
+            "RX",
+            "RY",
+            "RZ",
+            "PX",
+            "PY",
+            "PZ",
+            "HX",
+            "HY",
+            "HZ",
+            "Spherical",
+            "FreeFlyer",
+            "Composite",
+        )
+    ),
+)
+
+
 class Pinocchio(PinocchioAdapter):
     """Pinocchio on a chain of spherical joints; each integrator uses the algorithm that its note names."""
 
@@ -786,6 +859,7 @@ class Pinocchio(PinocchioAdapter):
     builds_trees = builds_elements = moves_loops = True
     options: ClassVar[tuple[str, ...]] = ("cholesky", "forwardDynamics")
     variants = VARIANTS
+    column_names = COLUMN_NAMES
     usual_algorithm: ClassVar[str] = "crba"  # for the accelerations of state evaluation
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
@@ -830,7 +904,10 @@ class Pinocchio(PinocchioAdapter):
             q, v = chain.coordinates(cut.state(state) if cut else state)
             motion = q, v, chain.acceleration(q, v)
             rates = None if cut else chain.rate_map(state, q)
-            found.append(surface_answer(chain.pin_model, frames, inertias, motion, rates))
+            answer = surface_answer(chain.pin_model, frames, inertias, motion, rates)
+            if cut and len(found) < CLOSED_STATES:
+                add_parts(answer, partial(_add_closed, answer, chain, frames, motion))
+            found.append(answer)
         add_pose_answers(found, states, POSE_FUNCTIONS, pose_function)
         return found
 

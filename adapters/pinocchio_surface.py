@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 
+from adapters.pinocchio_relations import add_mimic, relations
 from plumbline.engines.missing_names import add_parts
 from plumbline.model.datatypes import Array, Call, Float, Model
 from plumbline.model.kinematics import rotation_matrix
@@ -50,7 +51,8 @@ POSE_FUNCTIONS = {  # adapters/pose_functions.py describes the forms
     "rpy.rpyToMatrix": "rpy -> R", "rpy.matrixToRpy": "Q.R -> Q.rpy", "rpy.rotate": "'x' x -> Rx",
     "rpy.computeRpyJacobian": "Q.rpy -> @rpydot wl", "rpy.computeRpyJacobianInverse": "Q.rpy -> @wl rpydot",
     "liegroups.SO3": "L.xyzw Q.phi -> xyzw", "liegroups.SE3": "L.rxyzw Q.xi -> rxyzw",
-    "liegroups.R3": "L.r dr -> r",
+    "liegroups.R3": "L.r dr -> r", "liegroups.R2": "L.r dr -> r", "liegroups.R1": "L.r dr -> r",
+    "liegroups.Rn": "L.r dr -> r", "liegroups.SO2": "rz z -> Rz", "liegroups.SE2": "rz rx ry z -> Rz r",
 }  # fmt: skip
 OF_MOTIONS = ("exp6", "Jexp6")  # take a pin.Motion
 ANGULAR = {"velocity": "velocity", "acceleration": "acceleration", SPATIAL: "acceleration"}
@@ -91,18 +93,22 @@ def surface_answer(
 
     """
     found: Found = defaultdict(dict)
+    joints = {pin_model.frames[f].parentJoint for f in frames}
+    has_parts = rates is None or len(joints) < len(frames)
     add_parts(
         found,
         lambda: _add_frames(found, pin_model, frames, motion),
         lambda: _add_data(found, pin_model, frames, motion),
         lambda: _add_regressors(found, pin_model, frames, bodies, motion),
         lambda: _add_centres(found, pin_model, frames, motion, rates is None),
+        *relations(found, pin_model, frames, motion, is_tree=rates is not None, has_parts=has_parts),
     )
     if rates is not None:
         add_parts(
             found,
             lambda: _add_torques(found, pin_model, motion, rates),
             lambda: _add_batch(found, pin_model, motion, rates),
+            lambda: add_mimic(found, pin_model, motion, rates),
         )
     return found
 
@@ -112,11 +118,31 @@ def pose_function(name: str, given: Sequence[Any], _: Sequence[str]) -> list[Any
     function = pin
     for part in name.split("."):
         function = getattr(function, part)
+    if name in ("liegroups.SO2", "liegroups.SE2"):
+        return _plane_function(function(), *given)
     if name.startswith("liegroups"):
-        return [function().integrate(*given)]
+        size = int(name[-1]) if name[-1].isdigit() and len(name) == len("liegroups.R1") else len(given[0])
+        group = function(size) if name == "liegroups.Rn" else function()
+        starts = range(len(given[0]) - size, -1, -1)
+        found = np.zeros(len(given[0]))
+        for at in starts:
+            found[at : at + size] = group.integrate(*(np.ravel(x)[at : at + size] for x in given))
+        return [found]
     arguments = [pin.SE3(x) if np.shape(x) == (4, 4) else x for x in given]
     result = function(*(map(pin.Motion, given) if name in OF_MOTIONS else arguments))
     return [result.homogeneous if isinstance(result, pin.SE3) else getattr(result, "vector", result)]
+
+
+def _plane_function(group: Any, height: float, *given: float) -> list[Any]:
+    """Step from one place in the plane, or from one angle, to another as the group's difference says."""
+    *place, angle = given
+    before, there = (
+        np.array([*(x - shift for x in place), np.cos(angle - shift), np.sin(angle - shift)])
+        for shift in (0.5, 0.0)
+    )
+    *moved, c, s = group.integrate(before, group.difference(before, there))
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return [turn, np.array([*moved, height])][: 1 + bool(place)]
 
 
 def _product(matrix: Any, x: Array) -> Array:
@@ -156,7 +182,10 @@ class _Twists:
         """Put all into the answer."""
         frame = self.frame
         for (function, what, by), values in self.found.items():
-            call, halves = (function, f"ReferenceFrame.{self.name}"), np.split(np.array(values), 2, 1)
+            call, halves = (
+                (*function.split(), f"ReferenceFrame.{self.name}"),
+                np.split(np.array(values), 2, 1),
+            )
             found[f"frame_{what}{frame.of_point}{by}"][call] = halves[0]
             found[f"frame_angular_{ANGULAR[what]}{frame.of_rotation}{by}"][call] = halves[1]
 
@@ -170,6 +199,7 @@ def _add_frames(
     pin.computeForwardKinematicsDerivatives(m, derived, q, v, a)
     pin.updateFramePlacements(m, derived)
     pin.computeJointJacobiansTimeVariation(m, data, q, v)
+    pin.computeJointKinematicHessians(m, derived, q)
     for name in FRAMES:
         twists = _Twists(m, data, name)
         reference, of_rate = twists.reference, twists.frame.of_rate
@@ -177,6 +207,8 @@ def _add_frames(
             joint = m.frames[f].parentJoint
             _read_twists(twists, "Frame", f, f, derived, v, a)
             _read_twists(twists, "Joint", joint, f, derived, v, a)
+            _read_hessian(twists, "Joint", joint, f, derived, v, a)
+            _read_hessian(twists, "Frame", f, f, derived, v, a)
             J = np.array(pin.computeFrameJacobian(m, other, q, f, reference))
             rate = _rate(pin.frameJacobianTimeVariation(m, other, q, v, f, reference), J, v, a)
             twists.add("computeFrameJacobian", "velocity", _product(J, v), f)
@@ -208,7 +240,12 @@ def _read_twists(
         (f"get{plain}Acceleration", SPATIAL, read(f"get{plain}Acceleration"), ""),
         (f"get{of}Jacobian", "velocity", _product(J, v), ""),
         (f"get{of}JacobianTimeVariation", twists.frame.of_rate, _rate(dJ, J, v, a), "_by_jacobian_rate"),
-        (f"get{of}VelocityDerivatives", "velocity", _product(by_v, v), by),
+        (
+            f"get{of}VelocityDerivatives computeForwardKinematicsDerivatives",
+            "velocity",
+            _product(by_v, v),
+            by,
+        ),
         # the derivatives of vectors in the world's axes are those of spatial ones
         (f"get{of}VelocityDerivatives", SPATIAL, _rate(by_q, by_v, v, a), by),
         (f"get{of}AccelerationDerivatives", SPATIAL, _rate(of_v, of_a, v / 2, a), by),
@@ -217,6 +254,21 @@ def _read_twists(
     if twists.name != "WORLD":
         function = f"get{plain}ClassicalAcceleration"
         twists.add(function, "acceleration", read(function), f, "", is_of_joint)
+
+
+def _read_hessian(
+    twists: _Twists, of: str, number: int, f: int, derived: pin.Data, v: Array, a: Array
+) -> None:
+    """Add J̇ v + J v̇ with J̇ by the Hessian, whose numbers come in C++'s order.
+
+    docs/surface/pinocchio_kinematic_hessians.py shows that order.
+    """
+    is_of_joint, given = of == "Joint", (twists.m, twists.data, number, twists.reference)
+    J = getattr(pin, f"get{of}Jacobian")(*given)
+    H = np.array(getattr(pin, f"get{of}KinematicHessian")(twists.m, derived, number, twists.reference))
+    H = H.ravel().reshape(H.shape, order="F")
+    function, what = f"get{of}KinematicHessian computeJointKinematicHessians", twists.frame.of_rate
+    twists.add(function, what, _rate(H @ v, J, v, a), f, "_by_jacobian_rate", is_of_joint)
 
 
 def _add_points(
@@ -442,7 +494,13 @@ def _add_torques(found: Found, m: pin.Model, motion: tuple[Array, Array, Array],
         ("", dynamics),
         ("_by_derivative", {("computeRNEADerivatives", "Data.dtau_dv"): derivative}),
         ("_by_aba", {("aba", "Data.ddq"): again}),
-        ("_by_coriolis_matrix", {("computeCoriolisMatrix", "Data.C"): coriolis}),
+        (
+            "_by_coriolis_matrix",
+            {
+                ("computeCoriolisMatrix", "Data.C"): coriolis,
+                ("getCoriolisMatrix",): _product(pin.getCoriolisMatrix(m, derived), v) + rest,
+            },
+        ),
     ):
         own = {call: value - rotors for call, value in values.items()}
         found[f"inverse_dynamics{by}"] |= _on_rates(own, rates)
@@ -472,7 +530,7 @@ def _add_products(
     world = np.reshape(pin.crba(m, m.createData(), q, pin.Convention.WORLD), M.shape)
     momenta = {
         ("crba", "Data.M"): momentum,
-        ("crba", "Convention.WORLD"): world @ v,
+        ("crba", "Convention", "Convention.WORLD"): world @ v,
         ("cholesky.decompose", "Data.U", "Data.D"): U @ (D * (U.T @ v)),
         ("computeAllTerms", "Data.M"): upper @ v + np.triu(upper, 1).T @ v,
     }

@@ -22,7 +22,11 @@ from adapters.pinocchio_common import composite
 from plumbline.engines.variants import Variant
 from plumbline.model.datatypes import Array, Call, Float, Model
 
-ABOUT_AXES = pin.JointModelRX, pin.JointModelRY, pin.JointModelRZ
+LIMITS = (
+    "damping", "effortLimit", "friction", "lowerDryFrictionLimit", "lowerEffortLimit", "lowerPositionLimit",
+    "lowerVelocityLimit", "positionLimitMargin", "rotorGearRatio", "rotorInertia", "upperDryFrictionLimit",
+    "upperEffortLimit", "upperPositionLimit", "upperVelocityLimit", "velocityLimit",
+)  # fmt: skip
 ANGLES = np.array([0.4, -0.7, 1.1])  # rad, far from singular ones
 
 
@@ -66,6 +70,12 @@ def _universal(joint: Any) -> Any:
     parts = _parts(joint)
     is_meant = all(part.shortname().startswith("JointModelR") for part in parts)
     return pin.JointModelUniversal(*map(_axis, parts)) if is_meant else joint
+
+
+def _about_axes(*kinds: str) -> Any:
+    """Three turns; screws have to be told their pitch (docs/surface/pinocchio_pitch_of_screws.py)."""
+    given = {kind: (0.0,) if kind.startswith("H") else () for kind in kinds}
+    return composite(*(getattr(pin, f"JointModel{kind}")(*pitch) for kind, pitch in given.items()))
 
 
 def _planar(joint: Any) -> Any:
@@ -138,6 +148,54 @@ def _appended(model: pin.Model) -> pin.Model:
     return other
 
 
+def _with_limits(model: pin.Model) -> pin.Model:
+    """Give limits that are not reached, and what no algorithm for motions reads."""
+    other = model.copy()
+    for name in LIMITS:
+        values = np.array(getattr(other, name), float)
+        values[:] = np.linspace(2.0, 3.0, len(values)) * 1e6 * (-1 if name.startswith("lower") else 1)
+        setattr(other, name, values)
+    other.referenceConfigurations["home"] = pin.neutral(other)
+    return other
+
+
+def _with_other_inertias(model: pin.Model) -> pin.Model:
+    """Give each inertia that has a mass by its parameters, by its pseudo-inertia and by six numbers."""
+    other = model.copy()
+    for j in range(1, other.njoints):
+        given = other.inertias[j]
+        if given.mass and np.min(np.linalg.eigvalsh(given.inertia)) > 0:  # of no point and no line
+            own = pin.Inertia.FromDynamicParameters(given.toDynamicParameters())
+            again = pin.Inertia.FromPseudoInertia(pin.PseudoInertia.FromInertia(own))
+            other.inertias[j] = pin.Inertia(again.mass, again.lever, pin.Symmetric3(again.inertia).matrix())
+    return other
+
+
+def _as_frames(model: pin.Model) -> pin.Model:
+    """Give each inertia with a frame of a body on a frame of its joint."""
+    other = model.copy()
+    for j in range(1, other.njoints):
+        joint = other.addJointFrame(j, 0)
+        body = other.addBodyFrame(f"body of {j}", j, pin.SE3.Identity(), joint)
+        inertia, other.inertias[j] = other.inertias[j].copy(), pin.Inertia.Zero()
+        kinds = pin.FrameType.FIXED_JOINT, pin.FrameType.SENSOR
+        for kind, share in zip(kinds, (0.25, 0.75), strict=True):
+            part = pin.Inertia(share * inertia.mass, inertia.lever, share * inertia.inertia)
+            frame = pin.Frame(f"{kind} of {j}", j, body, pin.SE3.Identity(), kind, part)
+            other.addFrame(frame, True)
+    return other
+
+
+def _constant(q: Array) -> Callable[[Array], Array]:
+    """The same coordinates whatever the usual ones are."""
+    return lambda _: q
+
+
+def _cosines(q: Array) -> Array:
+    """Give angles by their cosines and sines."""
+    return np.stack([np.cos(q), np.sin(q)], axis=1).ravel()
+
+
 def _of_all_trees(names: Call, **change: Any) -> Variant:
     return Variant("option", names, Change(**change), _is_tree)
 
@@ -160,6 +218,19 @@ VARIANTS = (
     ),
     _of_all_trees(("buildReducedModel", "Model.addJointFrame"), remake=_with_locked_joint),
     _of_all_trees(("appendModel",), remake=_appended),
+    _of_all_trees(
+        (*(f"Model.{name}" for name in LIMITS), "Model.referenceConfigurations"), remake=_with_limits
+    ),
+    Variant("spelling", ("PseudoInertia", "Symmetric3"), Change(remake=_with_other_inertias), _is_tree),
+    Variant(
+        "spelling",
+        (
+            "Model.addBodyFrame",
+            *(f"FrameType.{kind}" for kind in ("BODY", "JOINT", "FIXED_JOINT", "SENSOR")),
+        ),
+        Change(remake=_as_frames),
+        _is_tree,
+    ),
     _spelled(
         _names("RevoluteUnaligned"),
         _of_axes("R", Spelling(lambda joint: pin.JointModelRevoluteUnaligned(_axis(joint)))),
@@ -192,6 +263,17 @@ VARIANTS = (
         lambda model: _moves("turn")(model) or _moves("slide")(model),
     ),
     _spelled(
+        _names("PX", "PY"),
+        {
+            "JointModelFreeFlyer": Spelling(
+                lambda _: composite(
+                    pin.JointModelPX(), pin.JointModelPY(), pin.JointModelPZ(), pin.JointModelSpherical()
+                )
+            )
+        },
+        lambda model: bool(np.any(model.free)),
+    ),
+    _spelled(
         _names("Translation"),
         {
             "JointModelFreeFlyer": Spelling(
@@ -203,13 +285,20 @@ VARIANTS = (
     *(
         _spelled(
             names,
-            {"JointModelSpherical": Spelling(make, lambda _: ANGLES, at_angles=True, has_own_rates=True)},
+            {"JointModelSpherical": Spelling(make, _constant(q), at_angles=True, has_own_rates=True)},
             lambda model: any(kind.holds_no_turn for kind in model.kinds),
         )
-        for names, make in (
-            (_names("SphericalZYX"), lambda _: pin.JointModelSphericalZYX()),
-            (_names("Ellipsoid"), lambda _: pin.JointModelEllipsoid(0.0, 0.0, 0.0)),
-            (_names("RX", "RY"), lambda _: composite(*(make() for make in ABOUT_AXES))),
+        for names, make, q in (
+            (_names("SphericalZYX"), lambda _: pin.JointModelSphericalZYX(), ANGLES),
+            (_names("Ellipsoid"), lambda _: pin.JointModelEllipsoid(0.0, 0.0, 0.0), ANGLES),
+            (_names("RX", "RY"), lambda _: _about_axes("RX", "RY", "RZ"), ANGLES),
+            (_names("HX", "HY", "HZ"), lambda _: _about_axes("HX", "HY", "HZ"), ANGLES),
+            (_names("RUBX", "RUBY"), lambda _: _about_axes("RUBX", "RUBY", "RUBZ"), _cosines(ANGLES)),
+            (
+                ("JointModelRevoluteUnboundedUnaligned", "JointDataRevoluteUnboundedUnalignedTpl"),
+                lambda _: _about_axes("RevoluteUnboundedUnaligned", "RUBY", "RUBZ"),
+                _cosines(ANGLES),
+            ),
         )
     ),
 )  # fmt: skip

@@ -35,8 +35,10 @@ Wrong so far, each with a script or an entry of the known issues, are
   a composite joint is universal or planar ([script](surface/pinocchio_composite_rates.py)), its
   `computeMinverse` on long chains, its kinetic energy of rotors on revolute and helical joints about a given
   axis ([script](surface/pinocchio_kinetic_energy_of_rotors.py)), the gravity of models that `appendModel`
-  makes ([script](surface/pinocchio_append_model.py)), and the order of the entries of kinematic Hessians in
-  Python ([script](surface/pinocchio_kinematic_hessians.py));
+  makes ([script](surface/pinocchio_append_model.py)), the pitch of screw joints that are made without one
+  ([script](surface/pinocchio_pitch_of_screws.py)), the Delassus matrices of constraints between two bodies
+  ([script](surface/pinocchio_delassus_of_two_bodies.py)), and the order of the entries of kinematic
+  Hessians in Python ([script](surface/pinocchio_kinematic_hessians.py));
 - Exudyn's tangent operators of SE(3), `TExpSE3` and `TExpSE3Inv`
   ([script](surface/exudyn_tangent_operators.py)), `GetODE2CoordinatesTotal`, which corrupts memory
   ([script](surface/exudyn_coordinates_total.py)), the masses that slides of `KinematicTree33` carry

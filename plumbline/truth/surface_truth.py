@@ -387,7 +387,10 @@ _BY_ALGORITHM = {
     "by_tangent_operator": ("body_velocity", "frame_angular_velocity"),
     "by_map_rate": ("momentum_rate", "centroidal_angular_momentum_rate"),
     "by_coriolis_matrix": ("inverse_dynamics",),
-    "by_aba": ("inverse_dynamics", "momentum_through_inverse"),
+    "by_constraint_solver": ("frame_acceleration", "frame_angular_acceleration"),
+    "by_aba": (
+        "inverse_dynamics", "momentum_through_inverse", "frame_acceleration", "frame_angular_acceleration",
+    ),
 }  # fmt: skip
 SURFACE_QUANTITIES: Mapping[str, tuple[str, Callable[[Motion], Rounded]]] = {
     **_FORMULAS,
