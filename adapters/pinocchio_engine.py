@@ -423,7 +423,7 @@ class PinocchioChain:
         self.update_loads(q, v)
         return self.joint_torque(q, v)
 
-    def loops(self, q: Array, v: Array) -> Loops:
+    def loops(self, q: Float[Array, "nq"], v: Float[Array, "nv"]) -> Loops:
         """Return the tree with what closes and moves it."""
         return Loops(self.pin_model, self.welds, self.weld_data, self._push(q, v, self._load(q, v)))
 

@@ -17,7 +17,7 @@ import numpy as np
 import pinocchio as pin
 from scipy.linalg import lu_factor, lu_solve
 
-from plumbline.model.datatypes import Array, Call
+from plumbline.model.datatypes import Array, Call, Float
 
 DAMPING, STEPS = 1e-8, 12  # μ over the largest entry of J M⁻¹ Jᵀ, and how many times
 FINE = pin.ProximalSettings(1e-15, 1e-14, 50)
@@ -30,74 +30,90 @@ class Loops(NamedTuple):
     m: pin.Model
     welds: Any
     data: Any  # of the welds
-    push: Array  # τ with loads, (nv,)
+    push: Float[Array, "nv"]  # τ with loads
 
 
-def closed_accelerations(loops: Loops, q: Array, v: Array) -> Iterator[tuple[bool, Call, Array]]:
+class _Rows:
+    """The rows of a state, and what solves them densely."""
+
+    def __init__(self, loops: Loops, q: Array, v: Array) -> None:
+        m = loops.m
+        self.loops, self.m, self.q, self.v = loops, m, q, v
+        self.still, self.solved = _still(m, q, v), m.createData()
+        pin.initConstraintDynamics(m, self.solved, loops.welds, loops.data)
+        pin.constraintDynamics(m, self.solved, q, v, loops.push, loops.welds, loops.data, FINE)
+        self.mass = np.reshape(pin.crba(m, m.createData(), q), (m.nv, m.nv))
+        self.force = loops.push - pin.nonLinearEffects(m, m.createData(), q, v)
+        self.J = np.array(pin.getConstraintsJacobian(m, self.still, loops.welds, loops.data))
+        self.bias = _bias(self.still, loops.welds)
+        inverse = np.linalg.solve(self.mass, self.J.T)
+        self.damping = DAMPING * float(np.max(np.sum(self.J.T * inverse, axis=0)))
+
+    def by_rows(self, rows: Array, bias: Array) -> Array:
+        """Return v̇ by other rows."""
+        corner = -self.damping * np.eye(len(rows))
+        factored = lu_factor(np.block([[corner, rows], [rows.T, self.mass]]))
+        return self.by(lambda b: np.asarray(lu_solve(factored, b)), bias, self.damping)
+
+    def by_force(self, multipliers: Array) -> Array:
+        """Return v̇ by the forces of the rows."""
+        return np.asarray(np.linalg.solve(self.mass, self.force + self.J.T @ multipliers))
+
+    def by(self, solve: Callable[[Array], Array], bias: Array, damping: float) -> Array:
+        """Return v̇ by what solves the damped system."""
+        count = len(bias)
+        found, multipliers = self.force, np.zeros(count)
+        for _ in range(STEPS):
+            found = solve(np.concatenate([damping * multipliers - bias, self.force]))
+            multipliers = -found[:count]
+        return np.asarray(found[count:])
+
+
+def closed_accelerations(
+    loops: Loops, q: Float[Array, "nq"], v: Float[Array, "nv"]
+) -> Iterator[tuple[bool, Call, Any]]:
     """Return by call the accelerations, and whether they come from analytical derivatives."""
-    m, push = loops.m, loops.push
-    solved, still = m.createData(), _still(m, q, v)
-    pin.initConstraintDynamics(m, solved, loops.welds, loops.data)
-    pin.constraintDynamics(m, solved, q, v, push, loops.welds, loops.data, FINE)
-    solution, lambda_c, prox = (
-        np.array(x) for x in (solved.primal_dual_contact_solution, solved.lambda_c, solved.lambda_c_prox)
-    )
-    rhs, factors = -np.array(solved.primal_rhs_contact), solved.constraint_chol
-    mass = np.reshape(pin.crba(m, m.createData(), q), (m.nv, m.nv))
-    force = push - pin.nonLinearEffects(m, m.createData(), q, v)
-    J, bias = (
-        np.array(pin.getConstraintsJacobian(m, still, loops.welds, loops.data)),
-        _bias(still, loops.welds),
-    )
-
-    damping = DAMPING * float(np.max(np.sum(J.T * np.linalg.solve(mass, J.T), axis=0)))
-
-    def by_rows(rows: Array, gamma: Array) -> Array:
-        count = len(rows)
-        factored = lu_factor(np.block([[-damping * np.eye(count), rows], [rows.T, mass]]))
-        return _proximal(lambda b: np.asarray(lu_solve(factored, b)), gamma, force, damping)
-
-    def by_force(multipliers: Array) -> Array:
-        return np.linalg.solve(mass, force + J.T @ multipliers)
-
+    rows = _Rows(loops, q, v)
+    m, J, solved, by = rows.m, rows.J, rows.solved, "constraintDynamics"
     each = zip(loops.welds, loops.data, strict=True)
-    one_by_one = np.vstack(list(starmap(lambda w, d: pin.getConstraintJacobian(m, still, w, d), each)))
-    yield False, ("getConstraintsJacobian",), by_rows(J, bias)
-    yield False, ("getConstraintJacobian",), by_rows(one_by_one, bias)
-    yield False, ("constraintDynamics", "Data.primal_rhs_contact"), by_rows(J, rhs)
-    yield False, ("constraintDynamics", "Data.primal_dual_contact_solution"), solution[len(J) :]
-    yield False, ("constraintDynamics", "Data.lambda_c"), by_force(lambda_c)
-    yield False, ("constraintDynamics", "Data.lambda_c_prox"), by_force(prox)
-    yield (
-        False,
-        ("constraintDynamics", "Data.constraint_chol"),
-        _proximal(lambda b: np.ravel(factors.solve(b[:, None])), bias, force, FINE.mu),
-    )
+    one_by_one = np.vstack(list(starmap(lambda w, d: pin.getConstraintJacobian(m, rows.still, w, d), each)))
+    yield False, ("getConstraintsJacobian",), rows.by_rows(J, rows.bias)
+    yield False, ("getConstraintJacobian",), rows.by_rows(one_by_one, rows.bias)
+    yield False, (by, "Data.primal_rhs_contact"), rows.by_rows(J, -np.array(solved.primal_rhs_contact))
+    solution = np.array(solved.primal_dual_contact_solution)
+    yield False, (by, "Data.primal_dual_contact_solution"), solution[len(J) :]
+    yield False, (by, "Data.lambda_c"), rows.by_force(np.array(solved.lambda_c))
+    yield False, (by, "Data.lambda_c_prox"), rows.by_force(np.array(solved.lambda_c_prox))
+    factors = solved.constraint_chol
+    a = rows.by(lambda b: np.ravel(factors.solve(b[:, None])), rows.bias, FINE.mu)
+    yield False, (by, "Data.constraint_chol"), a
+    yield from _by_derivatives(rows)
+    if hasattr(pin, "FrameAnchorConstraintModel"):
+        yield from _by_anchors(rows)
+
+
+def _by_derivatives(rows: _Rows) -> Iterator[tuple[bool, Call, Any]]:
+    loops, m, v, J, solved = rows.loops, rows.m, rows.v, rows.J, rows.solved
     derivatives = pin.computeConstraintDynamicsDerivatives(m, solved, loops.welds, loops.data, FINE)
     _, a_v, a_tau, _, f_v, f_tau = (np.array(x) for x in derivatives)
-    pushed = push - pin.computeGeneralizedGravity(m, m.createData(), q)
+    pushed = loops.push - pin.computeGeneralizedGravity(m, m.createData(), rows.q)
     by = "computeConstraintDynamicsDerivatives"
     if np.linalg.matrix_rank(J) == np.sum(np.any(J != 0, axis=1)):  # they have no proximal iterations
         yield True, (by, "Data.ddq_dv", "Data.ddq_dtau"), a_v @ v / 2 + a_tau @ pushed
-        yield True, (by, "Data.dlambda_dv", "Data.dlambda_dtau"), by_force(f_v @ v / 2 + f_tau @ pushed)
-        pin.computeAllTerms(m, still, q, v)
-        pin.forwardDynamics(m, still, q, v, push, J, bias, damping)
-        inverse = np.array(pin.getKKTContactDynamicMatrixInverse(m, still, J))
-        split = m.nv
+        force = f_v @ v / 2 + f_tau @ pushed
+        yield True, (by, "Data.dlambda_dv", "Data.dlambda_dtau"), rows.by_force(force)
+        pin.computeAllTerms(m, rows.still, rows.q, v)
+        pin.forwardDynamics(m, rows.still, rows.q, v, loops.push, J, rows.bias, rows.damping)
+        inverse, nv = np.array(pin.getKKTContactDynamicMatrixInverse(m, rows.still, J)), m.nv
 
         def by_inverse(b: Array) -> Array:
-            x = inverse @ np.concatenate([b[-split:], b[:-split]])
-            return np.concatenate([x[split:], x[:split]])
+            return np.roll(inverse @ np.roll(b, nv), -nv)  # it has v̇ first
 
-        yield (
-            False,
-            ("forwardDynamics", "getKKTContactDynamicMatrixInverse"),
-            _proximal(by_inverse, bias, force, damping),
-        )
+        a = rows.by(by_inverse, rows.bias, rows.damping)
+        yield False, ("forwardDynamics", "getKKTContactDynamicMatrixInverse"), a
     of_a, of_v, of_q = (np.array(x) for x in (solved.dac_da, solved.dac_dv, solved.dvc_dq))
-    yield True, (by, "Data.dac_da", "Data.dac_dv"), by_rows(of_a, of_v @ v / 2)
-    yield True, (by, "Data.dvc_dq"), by_rows(of_a, of_q @ v)
-    yield from _by_anchors(loops, q, v, by_rows, force, damping)
+    yield True, (by, "Data.dac_da", "Data.dac_dv"), rows.by_rows(of_a, of_v @ v / 2)
+    yield True, (by, "Data.dvc_dq"), rows.by_rows(of_a, of_q @ v)
 
 
 def _still(m: pin.Model, q: Array, v: Array) -> pin.Data:
@@ -125,31 +141,11 @@ def _bias(data: pin.Data, welds: Any) -> Array:
     return np.concatenate(rows)
 
 
-def _proximal(solve: Callable[[Array], Array], bias: Array, force: Array, damping: float) -> Array:
-    """Return v̇."""
-    count = len(bias)
-    found, multipliers = force, np.zeros(count)
-    for _ in range(STEPS):
-        found = solve(np.concatenate([damping * multipliers - bias, force]))
-        multipliers = -found[:count]
-    return found[count:]
-
-
-def _by_anchors(
-    loops: Loops,
-    q: Array,
-    v: Array,
-    by_rows: Callable[[Array, Array], Array],
-    force: Array,
-    damping: float,
-) -> Iterator[tuple[bool, Call, Array]]:
+def _by_anchors(rows: _Rows) -> Iterator[tuple[bool, Call, Any]]:
     """Close the loops by the constraints of version 4: frames, and three points of each."""
-    if not hasattr(pin, "FrameAnchorConstraintModel"):
-        return
-    m, still = loops.m, _still(loops.m, q, v)
-    bias = _bias(still, loops.welds)
+    loops, m, still = rows.loops, rows.m, _still(rows.m, rows.q, rows.v)
     frames, data = pin.StdVec_ConstraintModel(), pin.StdVec_ConstraintData()
-    rigid = pin.StdVec_RigidConstraintModel()
+    rigid, rigid_data = pin.StdVec_RigidConstraintModel(), pin.StdVec_RigidConstraintData()
     points, of_points = list[Array](), list[Array]()
     size = max(np.linalg.norm(place.translation) for place in still.oMi)
     for weld in loops.welds:
@@ -157,7 +153,9 @@ def _by_anchors(
         frame = pin.FrameAnchorConstraintModel(m, *ends)
         frames.append(pin.ConstraintModel(frame))
         data.append(frames[-1].createData())
+        frames[-1].calc(m, still, data[-1])
         rigid.append(pin.convertToRigidConstraintModel(m, frame))
+        rigid_data.append(rigid[-1].createData())
         for corner in size * CORNERS:
             at = pin.SE3(np.eye(3), corner)
             point = pin.PointAnchorConstraintModel(m, ends[0], ends[1] * at, ends[2], ends[3] * at)
@@ -165,37 +163,34 @@ def _by_anchors(
             point.calc(m, still, own)
             points.append(np.array(point.jacobian(m, still, own)))
             of_points.append(_of_point(still, point))
-    for one, own in zip(frames, data, strict=True):
-        one.calc(m, still, own)
     names = "FrameAnchorConstraintModel", "FrameAnchorConstraintData"
+    J = -np.array(pin.getConstraintsJacobian(m, still, frames, data))
     lists = "ConstraintModel", "ConstraintData"
-    rows = -np.array(pin.getConstraintsJacobian(m, still, frames, data))
-    yield False, ("getConstraintsJacobian", *names, *lists), by_rows(rows, bias)
+    yield False, ("getConstraintsJacobian", *names, *lists), rows.by_rows(J, rows.bias)
     by = "PointAnchorConstraintModel", "PointAnchorConstraintData"
-    yield False, by, by_rows(np.vstack(points), np.concatenate(of_points))
-    rigid_data = pin.StdVec_RigidConstraintData()
-    for one in rigid:
-        rigid_data.append(one.createData())
+    yield False, by, rows.by_rows(np.vstack(points), np.concatenate(of_points))
     solved = m.createData()
     pin.initConstraintDynamics(m, solved, rigid, rigid_data)
-    a = pin.constraintDynamics(m, solved, q, v, loops.push, rigid, rigid_data, FINE).copy()
+    a = pin.constraintDynamics(m, solved, rows.q, rows.v, loops.push, rigid, rigid_data, FINE).copy()
     yield False, ("convertToRigidConstraintModel",), a
-    factors = pin.ConstraintCholeskyDecomposition(m, still, frames, data)
-    factors.compute(m, still, frames, data, damping)
+    yield from _by_factors(rows, still, frames, data)
+
+
+def _by_factors(rows: _Rows, still: pin.Data, frames: Any, data: Any) -> Iterator[tuple[bool, Call, Any]]:
+    """Solve with factors of the whole matrix, and with those of J M⁻¹ Jᵀ."""
+    factors = pin.ConstraintCholeskyDecomposition(rows.m, still, frames, data)
+    factors.compute(rows.m, still, frames, data, rows.damping)
+    signs = np.concatenate([np.full(len(rows.bias), -1.0), np.ones(rows.m.nv)])
 
     def solve(b: Array) -> Array:
-        given = np.concatenate([-b[: len(bias)], b[len(bias) :]])  # its rows have the other sign
-        x = np.ravel(factors.solve(given[:, None]))
-        return np.concatenate([-x[: len(bias)], x[len(bias) :]])
+        return np.asarray(signs * np.ravel(factors.solve((signs * b)[:, None])))
 
-    yield False, ("ConstraintCholeskyDecomposition",), _proximal(solve, bias, force, damping)
-    delassus, multipliers = factors.getDelassusOperatorCholeskyExpression(), np.zeros(len(bias))
-    mass = np.reshape(pin.crba(m, m.createData(), q), (m.nv, m.nv))
-    free = rows @ np.linalg.solve(mass, force) + bias
+    yield False, ("ConstraintCholeskyDecomposition",), rows.by(solve, rows.bias, rows.damping)
+    delassus, multipliers = factors.getDelassusOperatorCholeskyExpression(), np.zeros(len(rows.bias))
+    free = rows.J @ np.linalg.solve(rows.mass, rows.force) + rows.bias
     for _ in range(STEPS):
-        multipliers = -np.ravel(delassus.solve((free - damping * multipliers)[:, None]))
-    a = np.asarray(np.linalg.solve(mass, force + rows.T @ multipliers))
-    yield False, ("DelassusOperatorCholeskyExpression",), a
+        multipliers = -np.ravel(delassus.solve((free - rows.damping * multipliers)[:, None]))
+    yield False, ("DelassusOperatorCholeskyExpression",), rows.by_force(multipliers)
 
 
 def _of_point(data: pin.Data, point: Any) -> Array:

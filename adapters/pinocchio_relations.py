@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from plumbline.model.datatypes import Array, Call
+from plumbline.model.datatypes import Array, Call, Float
 
 Motion = tuple[Array, Array, Array]  # q, v and v̇
 Found = dict[str, dict[Call, Array]]
@@ -254,7 +254,7 @@ def _add_body_forces(found: Found, m: pin.Model, frames: Sequence[int], motion: 
         found[quantity]["computeCoriolisMatrix", "Data.B"] = half
 
 
-def add_mimic(found: Found, m: pin.Model, motion: Motion, rates: Array) -> None:
+def add_mimic(found: Found, m: pin.Model, motion: Motion, rates: Float[Array, "nv nu"]) -> None:
     """Add the torques where each screw is a turn, and a slide that mimics it."""
     if not any(joint.shortname().startswith("JointModelH") for joint in m.joints):
         return
