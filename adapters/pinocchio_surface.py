@@ -137,7 +137,7 @@ def _plane_function(group: Any, height: float, *given: float) -> list[Any]:
     """Step from one place in the plane, or from one angle, to another as the group's difference says."""
     *place, angle = given
     before, there = (
-        np.array([*(x - shift for x in place), np.cos(angle - shift), np.sin(angle - shift)])
+        np.array([*(x * (1.0 - shift) for x in place), np.cos(angle - shift), np.sin(angle - shift)])
         for shift in (0.5, 0.0)
     )
     *moved, c, s = group.integrate(before, group.difference(before, there))
