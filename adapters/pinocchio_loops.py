@@ -17,6 +17,7 @@ import numpy as np
 import pinocchio as pin
 from scipy.linalg import lu_factor, lu_solve
 
+from adapters.pinocchio_common import init_constraint_dynamics
 from plumbline.model.datatypes import Array, Call, Float
 
 DAMPING, STEPS = 1e-8, 12  # μ over the largest entry of J M⁻¹ Jᵀ, and how many times
@@ -40,7 +41,7 @@ class _Rows:
         m = loops.m
         self.loops, self.m, self.q, self.v = loops, m, q, v
         self.still, self.solved = _still(m, q, v), m.createData()
-        pin.initConstraintDynamics(m, self.solved, loops.welds, loops.data)
+        init_constraint_dynamics(m, self.solved, loops.welds, loops.data)
         pin.constraintDynamics(m, self.solved, q, v, loops.push, loops.welds, loops.data, FINE)
         self.mass = np.reshape(pin.crba(m, m.createData(), q), (m.nv, m.nv))
         self.force = loops.push - pin.nonLinearEffects(m, m.createData(), q, v)
@@ -170,7 +171,7 @@ def _by_anchors(rows: _Rows) -> Iterator[tuple[bool, Call, Any]]:
     by = "PointAnchorConstraintModel", "PointAnchorConstraintData"
     yield False, by, rows.by_rows(np.vstack(points), np.concatenate(of_points))
     solved = m.createData()
-    pin.initConstraintDynamics(m, solved, rigid, rigid_data)
+    init_constraint_dynamics(m, solved, rigid, rigid_data)
     a = pin.constraintDynamics(m, solved, rows.q, rows.v, loops.push, rigid, rigid_data, FINE).copy()
     yield False, ("convertToRigidConstraintModel",), a
     yield from _by_factors(rows, still, frames, data)
