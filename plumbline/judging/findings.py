@@ -171,7 +171,7 @@ def _plain_identity(row: Row) -> Identity:
     if row.verdict == Verdict.HARNESS_FAILED:
         return "", row.verdict, row.quantity
     if row.verdict in (Verdict.UNSUPPORTED, Verdict.FAILED):
-        return _engine(row), row.verdict, row.reason
+        return _engine(row), row.verdict, str(row.extra.get(WRONG_CALL, row.reason))
     return _engine(row), row.verdict, row.level, row.integrator, str(row.extra.get(WRONG_CALL, row.quantity))
 
 
@@ -234,10 +234,11 @@ def _identity(cause: Cause) -> Identity:
 
 def _title(identity: Identity, cause: Cause | None, row: Row) -> str:
     if cause is None:
+        if by := row.extra.get(WRONG_CALL):
+            return f"{'wrong' if row.verdict == Verdict.DISAGREES else row.verdict} by {by}"
         if row.verdict == Verdict.DISAGREES:
             at = "" if row.integrator == "-" else f" of {row.integrator}"
-            by = row.extra.get(WRONG_CALL)
-            return f"wrong by {by}" if by else f"{row.quantity.replace('_', ' ')}{at} at level {row.level}"
+            return f"{row.quantity.replace('_', ' ')}{at} at level {row.level}"
         at = "" if row.integrator == "-" else f", {row.integrator}"
         return f"{row.verdict}: {row.quantity.replace('_', ' ')} at level {row.level}{at}"
     kind, term, *rest = identity

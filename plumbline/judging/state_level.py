@@ -92,7 +92,7 @@ def judge_variants(context: RowContext, truth: StateTruth, evaluation: Evaluatio
         for call, answer in answers.items():
             names = ", ".join(call)
             if isinstance(answer, NoAnswer):
-                missing.append((answer, f"by {names}: {answer.message}"))
+                missing.append((answer, names))
                 continue
             first = slice(len(answer))
             true = replace(truth, quantities=truth.quantities[first], bounds=truth.bounds[first])
@@ -114,10 +114,11 @@ def judge_variants(context: RowContext, truth: StateTruth, evaluation: Evaluatio
             name = f"{quantity}_by_{kind}"
             rows.append(replace(row, level="surface", quantity=name, reason=reason, extra=extra))
         if missing:  # refusals are shown too: what was not compared is no agreement
-            is_refused = all(answer.is_refusal for answer, _ in missing)
-            verdict = Verdict.INFORMATION if is_refused else Verdict.FAILED
-            reason = "; ".join(text for _, text in missing)
-            rows.append(context.make_row("surface", "-", f"all_by_{kind}", verdict, reason))
+            failed = sorted(names for answer, names in missing if not answer.is_refusal)
+            verdict = Verdict.FAILED if failed else Verdict.INFORMATION
+            reason = "; ".join(f"by {names}: {answer.message}" for answer, names in missing)
+            extra = {WRONG_CALL: failed[0]} if failed else {}
+            rows.append(context.make_row("surface", "-", f"all_by_{kind}", verdict, reason, extra=extra))
     return rows
 
 

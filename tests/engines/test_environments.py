@@ -154,6 +154,14 @@ def test_the_supported_versions_work_beside_the_installed_ones(tmp_path):
         assert result.engines[name].missing is None
         assert Version(result.engines[name].version) == Version(name.partition("@")[2])
     wrong = {r.key: r for r in result.rows if r.verdict in ("disagrees", "failed")}
+    print(
+        sorted(
+            {
+                (r.engine, r.level, r.integrator, r.extra.get("wrong_call", r.quantity), r.known_issue)
+                for r in wrong.values()
+            }
+        )
+    )
     old = {
         f"{s.name}/{name}/trajectory/RK4/order" for s in chosen for name in OLDER_VERSIONS if "mujoco" in name
     }
