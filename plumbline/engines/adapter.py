@@ -25,6 +25,7 @@ from plumbline.engines.answers import (
     check_record,
     check_version,
 )
+from plumbline.engines.missing_names import missing_name
 from plumbline.engines.variants import Variant
 from plumbline.model.datatypes import (
     Array,
@@ -351,6 +352,11 @@ class Adapter(ABC):
                     f"{self.name} refuses a mechanism for its {refusal.gap}, and it has none: {refusal}"
                 ) from None
             raise
+        except (AttributeError, ModuleNotFoundError) as error:
+            name = missing_name(error, type(self).__module__)
+            if name is None:
+                raise
+            raise Unsupported(f"this version of {self.title} has no {name}", missing=name) from error
 
 
 def _has_elements(model: Model, is_meant: Callable[[JointKind], bool], *elements: str) -> bool:

@@ -17,7 +17,7 @@ import numpy as np
 
 from plumbline.engines.adapter import Adapter, EngineInfo
 from plumbline.engines.environments import declared_attribute
-from plumbline.engines.missing_names import MISSING_NAMES, OWN_PACKAGES, missing_name
+from plumbline.engines.missing_names import MISSING_NAMES, OWN_PACKAGES
 from plumbline.engines.registry import load_adapter
 from plumbline.engines.variants import NoAnswer, VariantKind
 from plumbline.model.datatypes import (
@@ -174,15 +174,12 @@ def evaluate_states(
     if quantities and not failure and "surface" in besides:
         try:
             surface = stack_answers(adapter.surface(model, states[:SURFACE_STATES]))
-        except Unsupported:
-            pass  # the adapter offers nothing of the mechanism
+        except Unsupported as refusal:  # the adapter offers nothing of the mechanism, or lacks a name
+            surface = {MISSING_NAMES: {(refusal.missing,): np.zeros((1, 1, 1))}} if refusal.missing else {}
         except MemoryError:
             raise
         except Exception as error:  # as above
-            if lacking := missing_name(error):
-                surface = {MISSING_NAMES: {(lacking,): np.zeros((1, 1, 1))}}
-            else:
-                surface_failure = describe_exception(error)
+            surface_failure = describe_exception(error)
     if quantities and not failure and "variants" in besides:
         variants = evaluate_variants(adapter, model, states[:SURFACE_STATES])
     cpu_time, more = time.process_time() - begin, (surface, surface_failure, variants)
@@ -210,9 +207,7 @@ def evaluate_variants(
         except MemoryError:
             raise
         except Exception as error:  # as above
-            name = missing_name(error)
-            message = describe_exception(error) if name is None else f"this version has no {name}"
-            by_names[variant.names] = NoAnswer(message, is_refusal=name is not None)
+            by_names[variant.names] = NoAnswer(describe_exception(error), is_refusal=False)
     return found
 
 

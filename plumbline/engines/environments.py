@@ -25,6 +25,7 @@ from packaging.specifiers import SpecifierSet
 from packaging.utils import InvalidWheelFilename, canonicalize_name, parse_wheel_filename
 from packaging.version import Version
 
+from plumbline.engines.missing_names import BASE_REQUIREMENTS
 from plumbline.engines.registry import ENGINES, IMPORTERS, USER_ENGINES
 from plumbline.layout import IS_INSTALLED, PREFIX, ROOT
 from plumbline.processes.exceptions import PlumblineError
@@ -36,7 +37,6 @@ from plumbline.processes.user_cache import (
     user_cache_folder,
 )
 
-BASE_REQUIREMENTS = ("numpy", "scipy", "packaging", "pydantic")  # imported by adapters and core in workers
 INSTALL_TIMEOUT = 900  # s for uv to fetch and install
 
 

@@ -7,20 +7,21 @@ from types import ModuleType
 
 import numpy as np
 
-from plumbline.engines.environments import BASE_REQUIREMENTS
 from plumbline.model.datatypes import Array, Call
 
 # Under this name an answer of the surface has the names of the engine that its version lacks.
 MISSING_NAMES = "missing names"
+BASE_REQUIREMENTS = ("numpy", "scipy", "packaging", "pydantic")  # imported by adapters and core in workers
 # What every environment has: what is missing there is a mistake of this project or of the environment.
 OWN_PACKAGES = {"plumbline", "adapters", "reference_impl", *BASE_REQUIREMENTS, ""}
 
 
-def missing_name(error: Exception) -> str | None:
+def missing_name(error: Exception, adapter: str = "") -> str | None:
     """Return the name of an engine that an error says to be missing; None of another error.
 
     Args:
         error: whose source is an attribute of a module, class or object, or an import.
+        adapter: module of the adapter, in which a name that is missing is a mistake.
 
     """
     if isinstance(error, ModuleNotFoundError):
@@ -30,7 +31,8 @@ def missing_name(error: Exception) -> str | None:
         found, package = error.name, getattr(owner, "__module__", None) or getattr(owner, "__name__", "")
     else:
         return None
-    return found if str(package).partition(".")[0] not in {*OWN_PACKAGES, "builtins"} else None
+    own = {*OWN_PACKAGES, "builtins", adapter.partition(".")[0]}
+    return found if str(package).partition(".")[0] not in own else None
 
 
 def add_parts(found: dict[str, dict[Call, Array]], *parts: Callable[[], object]) -> None:

@@ -53,10 +53,15 @@ def _no_coordinates() -> Array:
 class Unsupported(PlumblineError):
     """The engine has no such feature; the message is the sentence that results and report show."""
 
-    def __init__(self, reason: str, gap: str = "") -> None:
-        """Refuse because of a gap that the column declares, or of none: then the refusal counts."""
+    def __init__(self, reason: str, gap: str = "", missing: str = "") -> None:
+        """Refuse because of a gap that the column declares, or of none: then the refusal counts.
+
+        Args:
+            missing: name that the installed version of the engine lacks, where that is the reason.
+
+        """
         super().__init__(reason)
-        self.gap = gap
+        self.gap, self.missing = gap, missing
 
 
 class EngineFailure(PlumblineError):

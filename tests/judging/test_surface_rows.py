@@ -193,7 +193,7 @@ def test_names_that_a_version_lacks_are_listed_and_the_rest_is_compared(tree, mo
     assert told.reason.startswith("version 0 has no ModelPool, rotate:")
     (told,) = (row for row in judge_variants(WHO, truth, evaluation) if row.quantity == "all_by_spelling")
     assert told.verdict == Verdict.INFORMATION and told.reason.endswith(
-        "this version has no JointModelSphericalZYX"
+        "this version of Pinocchio has no JointModelSphericalZYX"
     )
     assert {row.quantity for row in rows} > {"inverse_dynamics", "momentum", "frame_axes"}
 
