@@ -38,7 +38,7 @@ def short_type(link: Any) -> str:
     return name[0] + name[-1].lower()
 
 
-def robot_of(links: Sequence[Any], gravity: Array) -> Any:
+def robot_of(links: Sequence[Any], gravity: Float[Array, "3"]) -> Any:
     """Make a robot of links."""
     robot = robots.Robot(gravity=gravity.tolist(), referenceConfiguration=[0.0] * len(links))
     for link in links:
