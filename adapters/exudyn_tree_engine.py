@@ -510,7 +510,12 @@ class ExudynTree(ExudynAdapter):
         Integrator("DOPRI5", "step", 5, note="steps as given", method=_DORMAND_PRINCE, **_alone("DOPRI5")),
         Integrator("RK67", "step", 6, note="Butcher, order 6", method=_BUTCHER, **_alone("RK67")),
         Integrator(
-            "VelocityVerlet", "step", 2, note="velocity Verlet", method=_VERLET, **_alone("VelocityVerlet")
+            "VelocityVerlet",
+            "step",
+            1,
+            note="velocity Verlet; of order 2 without terms of velocities",
+            method=_VERLET,
+            **_alone("VelocityVerlet"),
         ),
     )
     unsupported: ClassVar[Mapping[str, str]] = {

@@ -113,6 +113,42 @@ def _add_attitudes(found: Found, m: Any, d: Any, links: Sequence[int], sites: Se
     found["frame_position"]["mj_local2Global", "mjtSameFrame"] = places
 
 
+def _own_motion(m: Any, d: Any, b: int, sensors: set[str]) -> tuple[Array, Array, list[Array]]:
+    """A body in its parent by what sensors report of its joints, whose kinds are noted.
+
+    Returns:
+        Position, attitude, and the angular velocities of the joints in the body's frame.
+
+    """
+    quat, moved = m.body_quat[b].copy(), m.body_pos[b].copy()
+    joints = range(m.body_jntadr[b], m.body_jntadr[b] + m.body_jntnum[b])
+    rates = [np.zeros(3)]
+    for j in joints:
+        name = SCALAR.get(mujoco.mjtJoint(m.jnt_type[j]))
+        if m.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE:  # it has no sensor
+            at = m.jnt_qposadr[j]
+            moved, quat = d.qpos[at : at + 3], d.qpos[at + 3 : at + 7]
+            rates.append(d.qvel[m.jnt_dofadr[j] + 3 :][:3])
+            continue
+        if name is None:
+            sensors |= {"BALLQUAT", "BALLANGVEL"}
+            own, w = (d.sensor(f"{kind} {m.joint(j).name}").data for kind in ("BALLQUAT", "BALLANGVEL"))
+            rates = [rotation_matrix(own).T @ x for x in rates] + [w]
+        else:
+            sensors |= {"JOINTPOS", "JOINTVEL"}
+            q, v = (float(d.sensor(f"{kind} {m.joint(j).name}").data[0]) for kind in ("JOINTPOS", "JOINTVEL"))
+            q -= m.qpos0[m.jnt_qposadr[j]]
+            if name == "SLIDE":
+                moved = moved + rotation_matrix(quat) @ (q * m.jnt_axis[j])
+                continue
+            own = quaternion_exponential(q * m.jnt_axis[j] / 2)
+            rates = [rotation_matrix(own).T @ x for x in rates] + [v * m.jnt_axis[j]]
+        near = moved + rotation_matrix(quat) @ m.jnt_pos[j]
+        quat = quaternion_product(quat, own)
+        moved = near - rotation_matrix(quat) @ m.jnt_pos[j]
+    return moved, quat, rates
+
+
 def _add_joint_frames(found: Found, m: Any, d: Any, links: Sequence[int]) -> None:
     """Go from joint to joint by what sensors report of each, and by the frames of the joints."""
     turn, spin = np.broadcast_to(np.eye(3), (m.nbody, 3, 3)).copy(), np.zeros((m.nbody, 3))
@@ -120,35 +156,9 @@ def _add_joint_frames(found: Found, m: Any, d: Any, links: Sequence[int]) -> Non
     sensors = set[str]()
     for b in range(1, m.nbody):
         up = m.body_parentid[b]
-        quat, moved = m.body_quat[b].copy(), m.body_pos[b].copy()
+        moved, quat, rates = _own_motion(m, d, b, sensors)
         rate = turn[up].T @ spin[up]
         joints = range(m.body_jntadr[b], m.body_jntadr[b] + m.body_jntnum[b])
-        rates = [np.zeros(3)]
-        for j in joints:
-            name = SCALAR.get(mujoco.mjtJoint(m.jnt_type[j]))
-            if m.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE:  # it has no sensor
-                at = m.jnt_qposadr[j]
-                moved, quat = d.qpos[at : at + 3], d.qpos[at + 3 : at + 7]
-                rates.append(d.qvel[m.jnt_dofadr[j] + 3 :][:3])
-                continue
-            if name is None:
-                sensors |= {"BALLQUAT", "BALLANGVEL"}
-                own, w = (d.sensor(f"{kind} {m.joint(j).name}").data for kind in ("BALLQUAT", "BALLANGVEL"))
-                rates = [rotation_matrix(own).T @ x for x in rates] + [w]
-            else:
-                sensors |= {"JOINTPOS", "JOINTVEL"}
-                q, v = (
-                    float(d.sensor(f"{kind} {m.joint(j).name}").data[0]) for kind in ("JOINTPOS", "JOINTVEL")
-                )
-                q -= m.qpos0[m.jnt_qposadr[j]]
-                if name == "SLIDE":
-                    moved = moved + rotation_matrix(quat) @ (q * m.jnt_axis[j])
-                    continue
-                own = quaternion_exponential(q * m.jnt_axis[j] / 2)
-                rates = [rotation_matrix(own).T @ x for x in rates] + [v * m.jnt_axis[j]]
-            near = moved + rotation_matrix(quat) @ m.jnt_pos[j]
-            quat = quaternion_product(quat, own)
-            moved = near - rotation_matrix(quat) @ m.jnt_pos[j]
         own_turn = rotation_matrix(quat)
         turn[b], place[b] = turn[up] @ own_turn, place[up] + turn[up] @ moved
         spin[b] = turn[b] @ (own_turn.T @ rate + sum(rates))

@@ -337,6 +337,8 @@ def _add_tendon_limits(found: Found, m: Any, d: Any, count: int) -> None:
     other = mujoco.MjData(own)
     other.qpos[:], other.qvel[:] = d.qpos, d.qvel
     mujoco.mj_forward(own, other)
+    if np.count_nonzero(other.efc_type == mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON) < count:
+        return  # a distance that nothing changes has no row
     place, speed = (
         np.array([other.sensor(f"TENDONLIMIT{x} {k}").data.copy() for k in range(count)])
         for x in ("POS", "VEL")

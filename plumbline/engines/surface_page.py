@@ -28,8 +28,8 @@ A name is exercised where a relative change of 1e-6 in what it returns turns a r
 
 Wrong so far, each with a script or an entry of the known issues, are
 
-- MuJoCo's sensor of the actuator force at a tendon, `tendonactuatorfrc`, and the limit of that force, which
-  leave out the gears ([script](surface/mujoco_tendon_actuator_force.py)), and before 4.0 `cdof` and
+- MuJoCo's sensor of the actuator force at a tendon, `tendonactuatorfrc`, which leaves out the
+  gears ([script](surface/mujoco_tendon_actuator_force.py)), and before 4.0 `cdof` and
   `cdof_dot` of joints by name or number ([script](surface/mujoco_named_joint_axes.py));
 - Pinocchio's rates of Jacobians, Coriolis matrix, rate of the centroidal map and analytical derivatives where
   a composite joint is universal or planar ([script](surface/pinocchio_composite_rates.py)), its

@@ -40,7 +40,12 @@ def installed_adapters():
             continue  # the fixture `engine` skips with the reason
 
 
-INTEGRATORS = [(adapter.name, method) for adapter in installed_adapters() for method in adapter.integrators]
+INTEGRATORS = [
+    (adapter.name, method)
+    for adapter in installed_adapters()
+    for method in adapter.integrators
+    if method.has_motions
+]
 UNSUPPORTED_BY_ENGINE = [
     (adapter.name, kind) for adapter in installed_adapters() for kind in adapter.unsupported
 ]

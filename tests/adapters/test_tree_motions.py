@@ -49,7 +49,7 @@ def test_motions_of_random_trees_converge_to_the_truth(engine, mix, seed):
     model = random_tree(np.random.default_rng(seed), 6, MIXES[mix])
     state = calm_state(model, seed)
     true = simulate_notes_form(model, state, TIMES, 1e-12)
-    for method in adapter.integrators:
+    for method in (one for one in adapter.integrators if one.has_motions):
         resolutions = (2.0**-9, 2.0**-10) if method.kind == "step" else (1e-8, 1e-11)
         try:
             runs, errors = converging_runs(
@@ -82,7 +82,7 @@ def test_motions_with_elements_converge_to_the_truth_and_conserve_energy(engine,
     model = random_tree(np.random.default_rng(3), 4, kinds, loads=False, elements=(element,))
     state, times = calm_state(model, 3), np.arange(17) / 128
     true = simulate_notes_form(model, state, times, 1e-12)
-    for method in adapter.integrators:
+    for method in (one for one in adapter.integrators if one.has_motions):
         coarse = 2.0**-12 if method.order == 1 else 2.0**-9  # dampers have transients of 1e-3 s
         resolutions = (coarse, coarse / 2) if method.kind == "step" else (1e-8, 1e-11)
         try:
@@ -123,7 +123,7 @@ def torsional_oscillator():
 def test_a_spring_on_an_angle_counts_full_turns(engine):
     model, state, times, truth = torsional_oscillator()
     adapter = load_adapter(engine)
-    for method in adapter.integrators:
+    for method in (one for one in adapter.integrators if one.has_motions):
         sizes = (2.0**-9, 2.0**-10) if method.kind == "step" else (1e-11,)
         runs = [adapter.simulate(model, state, times, method.name, size) for size in sizes]
         run, errors = runs[-1], [np.max(attitude_error(x.p, truth)) for x in runs]

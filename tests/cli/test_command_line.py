@@ -245,7 +245,7 @@ def test_list_scenarios_and_engines_as_text_and_json():
     assert "RK4" in engines["mujoco"]["integrators"]
     names = {x["name"]: x for x in json.loads(invoke("list", "surface", "mujoco", "--json").stdout)}
     assert names["mj_fullM"] | {"place": ""} == {
-        "name": "mj_fullM", "place": "", "status": "compared", "detail": "mass_matrix"
+        "name": "mj_fullM", "place": "", "status": "compared", "detail": "rows of the level surface"
     }  # fmt: skip
     assert invoke("list", "engines", "mujoco").exit_code == 2
 

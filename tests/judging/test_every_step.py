@@ -55,7 +55,7 @@ def subject(name):
 def test_every_step_of_honest_engines_agrees(engine, name):
     model, states = subject(name)
     adapter = load_adapter(engine)
-    for integrator in [i for i in adapter.integrators if i.method is not None][-2:]:
+    for integrator in [i for i in adapter.integrators if i.method is not None and i.has_motions][-2:]:
         rows = [row for row in rows_of(adapter, integrator, model, states) if row.quantity in RUN_QUANTITIES]
         assert all(row.verdict == Verdict.AGREES and row.ratio < 1 for row in rows), rows
         if engine != "exudyn":

@@ -36,7 +36,7 @@ def rows(adapter, model=MODEL, states=STATES):
 def test_every_engine_gives_the_same_bits_again(engine):
     adapter = load_adapter(engine)
     found = rows(adapter)
-    assert set(found) == {"-", *(integrator.name for integrator in adapter.integrators)}
+    assert set(found) == {"-", *(one.name for one in adapter.integrators if one.has_motions)}
     assert {row.verdict for row in found.values()} == {"agrees"}, [row.reason for row in found.values()]
     assert all(row.value == row.tolerance == 0 for row in found.values())
     assert found["-"].reason == "repeatability of Engine: 4 states gave the same bits each time"
