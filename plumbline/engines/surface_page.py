@@ -24,7 +24,8 @@ by rows of a run, outside for one of five reasons (contact, rendering, input and
 physics), or not compared yet, with the reason. `plumbline list surface` counts the names and lists those
 that the installed version has besides, as a night does.
 A name is exercised where a relative change of 1e-6 in what it returns turns a row red
-(`python -m plumbline.studies.exercised_names > adapters/surface/exercised.json` computes it).
+(`python -m plumbline.studies.exercised_names > adapters/surface/exercised.json` computes it). Of names that a
+variant or the column itself uses together, everything that they return together is changed.
 
 Wrong so far, each with a script or an entry of the known issues, are
 
