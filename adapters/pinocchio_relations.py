@@ -107,7 +107,8 @@ def _add_configurations(found: Found, m: pin.Model, frames: Sequence[int], motio
             continue
         there = np.ravel(configuration())
         if call == ("RobotWrapper",):
-            poses = [pin.RobotWrapper(m).framePlacement(there, f).copy() for f in frames]
+            robot = pin.RobotWrapper(m)
+            poses = [robot.framePlacement(there, f).copy() for f in frames]
         else:
             pin.framesForwardKinematics(m, data, there)
             poses = [data.oMf[f].copy() for f in frames]
@@ -161,7 +162,7 @@ def _add_velocities(found: Found, m: pin.Model, frames: Sequence[int], motion: M
 
 def _add_spatial(found: Found, m: pin.Model, frames: Sequence[int], motion: Motion) -> None:
     """Add what is read of single joints."""
-    (q, v, a), data, derived = motion, m.createData(), m.createData()
+    (q, v, a), data, derived, chain = motion, m.createData(), m.createData(), m.createData()
     pin.forwardKinematics(m, data, q, v, a)
     pin.computeRNEADerivatives(m, derived, q, v, a)
     J, dAdv = (np.reshape(x, (6, m.nv)) for x in (derived.J, derived.dAdv))
@@ -176,7 +177,6 @@ def _add_spatial(found: Found, m: pin.Model, frames: Sequence[int], motion: Moti
         rows["square"].append(pose.rotation @ (here + pin.skewSquare(turn, turn) @ arm))
         own = [i for k in m.supports[j] for i in range(m.idx_vs[k], m.idx_vs[k] + m.nvs[k])]
         rows["spatial"].append(dAdv[:, own] @ v[own] / 2 + J[:, own] @ a[own])
-        chain = m.createData()
         pin.computeJointJacobian(m, chain, q, j)
         base = next(i for i in m.supports[j] if i)
         ends = data.oMi[base] * chain.iMf[base] * place
