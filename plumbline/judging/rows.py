@@ -315,10 +315,10 @@ class JudgingResult:
     deviations: dict[str, Deviation] = field(default_factory=dict)  # by the key of a row that disagrees
 
     def has_disagreement(self) -> bool:
-        """Find out whether a row disagrees.
+        """Find out whether a row disagrees that is diagnosed: those of the surface name a call and are not.
 
         Returns:
             Whether there is such a row.
 
         """
-        return any(row.verdict == Verdict.DISAGREES for row in self.rows)
+        return any(row.verdict == Verdict.DISAGREES and row.level != "surface" for row in self.rows)
