@@ -106,7 +106,9 @@ class _Scenario(_Part):
 
 
 def _are_kinds(given: Any, count: int) -> bool:
-    return isinstance(given, list) and len(given) == count and all(kind in KINDS for kind in given)
+    if not isinstance(given, list) or len(given) != count:
+        return False
+    return all(isinstance(kind, str) and kind in KINDS for kind in given)
 
 
 def _check_shapes(what: str, given: dict[str, Any] | None, shapes: dict[str, tuple[int, ...]]) -> None:
