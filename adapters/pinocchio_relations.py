@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from plumbline.engines.missing_names import add_parts
 from plumbline.model.datatypes import Array, Call, Float
 
 Motion = tuple[Array, Array, Array]  # q, v and v̇
@@ -37,13 +38,13 @@ def relations(
 
     Args:
         frames: the probe frames by body.
-        is_tree: whether v̇ is that of no closed loops.
+        is_tree: whether the mechanism has no loops.
         has_parts: whether a joint carries several bodies.
 
     """
     is_fixed = all(joint.shortname() != "JointModelFreeFlyer" for joint in m.joints)
     is_short = is_tree and is_fixed and m.njoints <= SHORT + 1
-    parts = [_add_configurations, _add_velocities, _add_spatial, _add_momenta]
+    parts = [_add_configurations, _add_velocities, _add_tangent_maps, _add_spatial, _add_momenta]
     parts += [] if has_parts else [_add_body_forces]
     parts += [_add_forward_derivatives, _add_batch] if is_short else []
     return [partial(part, found, m, frames, motion) for part in parts]
@@ -102,9 +103,8 @@ def _add_configurations(found: Found, m: pin.Model, frames: Sequence[int], motio
             [q[at : at + n] for at, n in zip(m.idx_qs, m.nqs, strict=True)]
         ),
     }
-    for call, configuration in reached.items():
-        if not hasattr(pin, call[0]):
-            continue
+
+    def add(call: Call, configuration: Callable[[], Any]) -> None:
         there = np.ravel(configuration())
         if call == ("RobotWrapper",):
             robot = pin.RobotWrapper(m)
@@ -115,9 +115,11 @@ def _add_configurations(found: Found, m: pin.Model, frames: Sequence[int], motio
         found["frame_position"][call] = np.array([pose.translation for pose in poses])
         found["frame_axes"][call] = np.concatenate([pose.rotation.T for pose in poses])
 
+    add_parts(found, *(partial(add, *one) for one in reached.items()))
+
 
 def _add_velocities(found: Found, m: pin.Model, frames: Sequence[int], motion: Motion) -> None:
-    (q, v, _), data = motion, m.createData()
+    q, v, _ = motion
     step = _step(m, frames, q)
     before, after = pin.integrate(m, q, -step), pin.integrate(m, q, step)
     of_q, of_step = (np.reshape(pin.dIntegrate(m, q, step, at), (m.nv, m.nv)) for at in (ARG0, ARG1))
@@ -139,21 +141,32 @@ def _add_velocities(found: Found, m: pin.Model, frames: Sequence[int], motion: M
         found_v["dIntegrateTransport", "dIntegrate", f"ArgumentPosition.{at}"] = np.linalg.solve(
             matrix, moved
         )
-    if hasattr(pin, "tangentMap"):
-        T, rate = (
-            np.reshape(pin.tangentMap(m, q), (m.nq, m.nv)),
-            np.ravel(pin.tangentMapProduct(m, q, v[:, None])),
-        )
-        back, inverse = np.ravel(pin.tangentMapTransposeProduct(m, q, rate[:, None])), np.linalg.pinv(T)
-        compact = np.reshape(pin.compactTangentMap(m, q), (m.nq, -1))
-        sizes, starts = map(list, pin.getTangentToConfigurationSparsitySegment(m))
-        rows = [row[:n] @ v[at : at + n] for row, at, n in zip(compact, starts, sizes, strict=True)]
-        found_v |= {
-            ("tangentMap", "tangentMapProduct"): inverse @ rate,
-            ("compactTangentMap", "getTangentToConfigurationSparsitySegment"): inverse @ np.array(rows),
-            ("tangentMapTransposeProduct",): np.linalg.solve(T.T @ T, back),
-        }
-    for call, value in found_v.items():
+    _add_frame_velocities(found, m, frames, q, found_v)
+
+
+def _add_tangent_maps(found: Found, m: pin.Model, frames: Sequence[int], motion: Motion) -> None:
+    q, v, _ = motion
+    T, rate = (
+        np.reshape(pin.tangentMap(m, q), (m.nq, m.nv)),
+        np.ravel(pin.tangentMapProduct(m, q, v[:, None])),
+    )
+    back, inverse = np.ravel(pin.tangentMapTransposeProduct(m, q, rate[:, None])), np.linalg.pinv(T)
+    compact = np.reshape(pin.compactTangentMap(m, q), (m.nq, -1))
+    sizes, starts = map(list, pin.getTangentToConfigurationSparsitySegment(m))
+    rows = [row[:n] @ v[at : at + n] for row, at, n in zip(compact, starts, sizes, strict=True)]
+    velocities: dict[Call, Any] = {
+        ("tangentMap", "tangentMapProduct"): inverse @ rate,
+        ("compactTangentMap", "getTangentToConfigurationSparsitySegment"): inverse @ np.array(rows),
+        ("tangentMapTransposeProduct",): np.linalg.solve(T.T @ T, back),
+    }
+    _add_frame_velocities(found, m, frames, q, velocities)
+
+
+def _add_frame_velocities(
+    found: Found, m: pin.Model, frames: Sequence[int], q: Array, velocities: Mapping[Call, Any]
+) -> None:
+    data = m.createData()
+    for call, value in velocities.items():
         pin.forwardKinematics(m, data, q, value)
         pin.updateFramePlacements(m, data)
         twists = np.array([pin.getFrameVelocity(m, data, f, ALIGNED).vector for f in frames])
@@ -166,10 +179,10 @@ def _add_spatial(found: Found, m: pin.Model, frames: Sequence[int], motion: Moti
     pin.forwardKinematics(m, data, q, v, a)
     pin.computeRNEADerivatives(m, derived, q, v, a)
     J, dAdv = (np.reshape(x, (6, m.nv)) for x in (derived.J, derived.dAdv))
-    rows = dict[str, list[Array]](classic=[], at=[], square=[], spatial=[], ends=[], turns=[])
+    rows = dict[str, list[Array]](classic=[], square=[], spatial=[], ends=[], turns=[])
     for f in frames:
         j, place = m.frames[f].parentJoint, m.frames[f].placement
-        pose, at = data.oMi[j], data.oMi[j] * place
+        pose = data.oMi[j]
         rows["classic"].append(pin.classicAcceleration(data.v[j], data.a[j], place))
         twist = pin.Motion(data.v[j])
         spatial, turn, arm = data.a[j], twist.angular, place.translation
@@ -182,7 +195,6 @@ def _add_spatial(found: Found, m: pin.Model, frames: Sequence[int], motion: Moti
         ends = data.oMi[base] * chain.iMf[base] * place
         rows["ends"].append(ends.translation)
         rows["turns"].append(ends.rotation.T)
-        rows["at"].append(at.translation)
     found["frame_acceleration_local"]["classicAcceleration",] = np.array(rows["classic"])
     found["frame_acceleration"]["skewSquare",] = np.array(rows["square"])
     by = "computeRNEADerivatives", "Data.dAdv", "Model.idx_vs", "Model.nvs"

@@ -73,7 +73,7 @@ def _universal(joint: Any) -> Any:
 
 
 def _about_axes(*kinds: str) -> Any:
-    """Three turns; screws have to be told their pitch (docs/surface/pinocchio_pitch_of_screws.py)."""
+    """Three turns; screws are given a pitch of 0, which is arbitrary by default."""
     given = {kind: (0.0,) if kind.startswith("H") else () for kind in kinds}
     return composite(*(getattr(pin, f"JointModel{kind}")(*pitch) for kind, pitch in given.items()))
 
@@ -164,7 +164,7 @@ def _with_other_inertias(model: pin.Model) -> pin.Model:
     other = model.copy()
     for j in range(1, other.njoints):
         given = other.inertias[j]
-        if given.mass and np.min(np.linalg.eigvalsh(given.inertia)) > 0:  # of no point and no line
+        if given.mass and np.min(np.linalg.eigvalsh(given.inertia)) > 0:  # else it refuses
             own = pin.Inertia.FromDynamicParameters(given.toDynamicParameters())
             again = pin.Inertia.FromPseudoInertia(pin.PseudoInertia.FromInertia(own))
             other.inertias[j] = pin.Inertia(again.mass, again.lever, pin.Symmetric3(again.inertia).matrix())

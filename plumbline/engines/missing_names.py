@@ -28,7 +28,8 @@ def missing_name(error: Exception, adapter: str = "") -> str | None:
         found, package = error.name, error.name
     elif isinstance(error, AttributeError):
         owner = error.obj if isinstance(error.obj, ModuleType | type) else type(error.obj)
-        found, package = error.name, getattr(owner, "__module__", None) or getattr(owner, "__name__", "")
+        found = error.name if isinstance(owner, ModuleType) else f"{owner.__name__}.{error.name}"
+        package = getattr(owner, "__module__", None) or getattr(owner, "__name__", "")
     else:
         return None
     own = {*OWN_PACKAGES, "builtins", adapter.partition(".")[0]}

@@ -33,13 +33,8 @@ CHANGE = 1e-6  # relative
 MECHANISMS = (
     "rest", "double-rod-then-ball", "furuta", "sprung-slider-on-arm", "free-body-with-rotors",
     "tree-of-seven", "universal-pendulum", "planar-top", "slider-crank",
-    "cart-pole", "nesc-tumbling-brick", "helical-screw",
-    "double-loaded-balls",
-    "spring-pendulum",
-    "sprung-without-rotors",
-    "sprung-hinge",
-    "light-cart-pole",
-    "acrobot",
+    "cart-pole", "nesc-tumbling-brick", "helical-screw", "double-loaded-balls", "spring-pendulum",
+    "sprung-without-rotors", "sprung-hinge", "light-cart-pole", "acrobot",
 )  # fmt: skip
 _CONTEXT = RowContext("", "", "", "the engine", "")
 
