@@ -14,32 +14,17 @@ from unittest.mock import patch
 from xml.etree import ElementTree
 
 import pytest
-from click.testing import CliRunner
 
 import plumbline as package
 from plumbline.cli.main import COMMANDS, main
-from plumbline.cli.terminal_output import count_noun
 from plumbline.cli.verdict_matrix import engine_heading
 from plumbline.execution.runner import exit_code, summarize_verdicts
 from plumbline.judging.findings import find_findings
 from plumbline.judging.rows import RowContext, Verdict
 from plumbline.storage.results_store import SCHEMA_VERSION
+from tests.helpers.commands import ROOT, invoke, run_plumbline, run_python
 
-ROOT = Path(__file__).resolve().parents[2]
 CONTEXT = RowContext("scenario", "family", "engine", "Engine", "1.0")
-
-
-def run_plumbline(*words, cwd=ROOT, **environment):
-    return subprocess.run(
-        [sys.executable, "-m", "plumbline", *map(str, words)],
-        cwd=cwd, capture_output=True, text=True, timeout=240,
-        env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
-    )  # fmt: skip
-
-
-def invoke(*words):
-    """The command in this process, which costs a tenth of one of its own."""
-    return CliRunner().invoke(main, list(map(str, words)))
 
 
 def test_help_has_examples_and_exit_codes():
@@ -58,14 +43,9 @@ def test_help_has_examples_and_exit_codes():
     assert "\\b" not in result.stdout
 
 
-def test_no_arguments_print_the_help():
-    result = CliRunner().invoke(main, [])
-    assert result.exit_code == 0
-    assert result.stdout == CliRunner().invoke(main, ["--help"]).stdout
-
-
 def test_every_command_has_a_short_help_that_the_list_shows_whole():
-    listed = CliRunner().invoke(main, []).stdout
+    listed = invoke().stdout
+    assert listed == invoke("--help").stdout
     for name, (_, short_help) in COMMANDS.items():
         assert re.search(rf"^  {name} +{re.escape(short_help)}$", listed, re.M)
         command = main.get_command(None, name)
@@ -77,7 +57,7 @@ def test_the_version_is_that_of_the_project():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     assert project["tool"]["hatch"]["version"]["path"] == "plumbline/__init__.py"
     assert re.fullmatch(r"\d+\.\d+\.\d+", package.__version__)
-    assert CliRunner().invoke(main, ["--version"]).stdout == f"plumbline {package.__version__}\n"
+    assert invoke("--version").stdout == f"plumbline {package.__version__}\n"
 
 
 def test_the_launcher_runs_this_checkout_from_another_folder(tmp_path):
@@ -152,12 +132,6 @@ def test_a_launcher_never_silently_runs_another_checkout(checkouts, current, lau
     assert (
         f"the current folder is in another checkout, {here}: call {here}/.venv/bin/plumbline" in done.stderr
     )
-
-
-def test_numbers_agree_with_their_nouns():
-    assert count_noun(1, "disagreement") == "1 disagreement"
-    assert count_noun(0, "disagreement") == "0 disagreements"
-    assert count_noun(2, "body", "bodies") == "2 bodies"
 
 
 def row(verdict, known_issue=None, quantity="q", **more):
@@ -284,19 +258,6 @@ def test_stdout_holds_json_alone_with_the_users_tolerance(tmp_path):
     assert document["run"]["exit_code"] == result.exit_code == 0
 
 
-def test_a_scenario_by_path(tmp_path):
-    mine = tmp_path / "my pendulum.yaml"
-    mine.write_text((ROOT / "scenarios" / "single" / "rest.yaml").read_text())
-    result = invoke(
-        "run", mine, "--engine", "pinocchio", "--level", "state", "--matrix", "--out", tmp_path / "o"
-    )
-    assert result.exit_code == 0, result.output
-    assert "my pendulum" in result.stdout
-    result = invoke("check", mine)
-    assert result.exit_code == 0
-    assert "ok" in result.stdout
-
-
 def test_a_name_stays_text_on_the_terminal_in_html_and_in_junit(tmp_path):
     name = "[red] <img src=x onerror=alert(1)> & 'quoted' $(reboot)"
     mine = tmp_path / "hostile.yaml"
@@ -341,10 +302,12 @@ def test_a_name_stays_text_on_the_terminal_in_html_and_in_junit(tmp_path):
         (["report", ""], "the path is empty"),
         (["history", "nowhere"], "`python -m plumbline nightly` makes one"),
         (["run", "dubble"], "did you mean `--family double`?"),
+        (["prove", "no-such-scenario"], "no-such-scenario: unknown scenario"),
+        (["prove", "tumbling-ball", "--precision", "half"], "--precision"),
     ],
 )
 def test_bad_usage_ends_with_2_and_a_suggestion(words, expected):
-    result = CliRunner().invoke(main, words)
+    result = invoke(*words)
     assert result.exit_code == 2, result.output
     assert expected in " ".join(result.stderr.split())
 
@@ -356,10 +319,7 @@ def test_missing_files_are_reported_before_the_imports_of_the_command(command, t
         "import sys\nfrom plumbline.cli.main import main\ntry:\n    main(sys.argv[1:])\n"
         "finally:\n    assert not {'numpy', 'pydantic', 'ruamel.yaml'} & {*sys.modules}, 'loaded'\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code, *words], cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)},
-        capture_output=True, text=True,
-    )  # fmt: skip
+    done = run_python("-c", code, *words, cwd=tmp_path)
     files = words[2:] if command == "run" else words[1:]
     assert done.stderr.splitlines() == [
         f"{name}: cannot be read: No such file or directory" for name in files
@@ -380,7 +340,7 @@ def test_a_closed_form_that_does_not_fit_is_reported_with_line_and_column(tmp_pa
     for name, scenario in (("a", "tumbling-ball"), ("b", "tumbling-rod")):
         text = (ROOT / "scenarios" / "single" / f"{scenario}.yaml").read_text()
         (tmp_path / f"{name}.yaml").write_text(f"exact: free-top\n{text}")
-    result = CliRunner().invoke(main, ["check", str(tmp_path / "a.yaml"), str(tmp_path / "b.yaml")])
+    result = invoke("check", tmp_path / "a.yaml", tmp_path / "b.yaml")
     assert result.exit_code == 2
     lines = result.stderr.splitlines()
     for name, line in zip("ab", lines, strict=True):

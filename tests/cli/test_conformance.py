@@ -2,23 +2,20 @@
 
 import os
 import re
-import subprocess
 import sys
-from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.helpers.commands import ROOT, run_python
+
+PYTEST = ("-m", "pytest", "-q", "-p", "no:cacheprovider", "-c", os.devnull, "--rootdir")
 TOY = ROOT / "tests" / "helpers" / "toy_server.py"
 
 
 def outcomes(folder, server, *words):
-    command = [
-        sys.executable, "-m", "pytest", "-q", "-p", "plumbline.conformance.plugin", "-p", "no:cacheprovider",
-        "-c", os.devnull, "--rootdir", folder, "--pyargs", "plumbline.conformance",
+    done = run_python(
+        *PYTEST, folder, "-p", "plumbline.conformance.plugin", "--pyargs", "plumbline.conformance",
         "--plumbline-engine", f"cmd:{sys.executable} {server}",
-        "-k", "state/tumbling-ball or state/double-tumbling-balls", *words,
-    ]  # fmt: skip
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, env=environment)
+        "-k", "state/tumbling-ball or state/double-tumbling-balls", *words, cwd=folder,
+    )  # fmt: skip
     found = {what: int(n) for n, what in re.findall(r"(\d+) (passed|failed|skipped|xfailed)", done.stdout)}
     return done.stdout + done.stderr, found
 
@@ -56,20 +53,7 @@ test_wrong = contract_tests(Wrong, ["tumbling-ball"], "state")
 
 def test_an_adapter_is_tested_beside_its_own_tests(tmp_path):
     (tmp_path / "test_mine.py").write_text(CONTRACT)
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-q",
-        "-p",
-        "no:cacheprovider",
-        "-c",
-        os.devnull,
-        "--rootdir",
-        tmp_path,
-    ]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=environment)
+    done = run_python(*PYTEST, tmp_path, cwd=tmp_path)
     assert "1 failed, 1 passed" in done.stdout, done.stdout + done.stderr
     assert "test_wrong[tumbling-ball]" in done.stdout and "gravity" in done.stdout
 

@@ -9,9 +9,7 @@ from collections import Counter
 from unittest.mock import patch
 
 import pytest
-from click.testing import CliRunner
 
-from plumbline.cli.main import main
 from plumbline.engines.adapter import EngineInfo
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.known_issues import KNOWN_ISSUES_FILE
@@ -21,6 +19,7 @@ from plumbline.scenario.yaml_source import YamlSource
 from plumbline.studies import sweep_file
 from reports.reference_tables import STORED_RESULTS
 from tests.helpers import example_results
+from tests.helpers.commands import invoke
 from tests.helpers.mutations import damaged_bytes, damaged_document, limited_time
 from tests.helpers.scenario_mutations import mutated
 
@@ -70,7 +69,7 @@ def check_examples(stored, tmp_path, command, count, seed):
             "reproduce": ["reproduce", str(folder)],
         }[command]
         with limited_time():
-            result = CliRunner().invoke(main, words)
+            result = invoke(*words)
         about = f"example {number} of seed {seed}, {name}: {result.output[-2000:]}"
         assert result.exit_code in (0, 2), about
         assert "Traceback" not in result.output, about
@@ -163,7 +162,7 @@ def check_user_files(tmp_path, make, words, count, seed):
         about = f"example {number} of seed {seed}, {name}"
         try:
             with limited_time(READING_SECONDS):
-                result = CliRunner().invoke(main, [*words, str(path)])
+                result = invoke(*words, str(path))
         except Accepted:
             outcomes["accepted"] += 1
             continue

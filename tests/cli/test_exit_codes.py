@@ -11,39 +11,22 @@ from pathlib import Path
 from unittest.mock import patch
 
 import pytest
-from click.testing import CliRunner
 
-from plumbline.cli.main import main
 from plumbline.cli.study_commands import _sweep_exit_code
 from plumbline.execution.exit_codes import EXIT_CODE_MEANINGS, ExitCode
-from plumbline.execution.plan import Plan
-from plumbline.execution.runner import run_plan
 from plumbline.judging.known_issues import load_known_issues
 from plumbline.processes import worker_process
-from plumbline.processes.worker_pool import ExecutorLost, Limits
-from plumbline.scenario import loader
+from plumbline.processes.worker_pool import ExecutorLost
 from plumbline.truth.ground_truth import TRUTHS_DIFFER
 from tests.helpers import wrong_truths
+from tests.helpers.commands import ROOT, invoke, run_plumbline, run_python, user_environment
 
-ROOT = Path(__file__).resolve().parents[2]
-WORDS = ("-m", "plumbline", "run")
-
-
-def run(out, *words, **environment):
-    return subprocess.run(
-        [sys.executable, *WORDS, *words, "--jobs", "1", "--out", str(out)],
-        cwd=ROOT, capture_output=True, text=True, timeout=240,
-        env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
-    )  # fmt: skip
-
-
-def invoke(out, *words):
-    return CliRunner().invoke(main, ["run", *words, "--jobs", "1", "--out", str(out)])
+ON_ONE = ("--jobs", "1", "--out")
 
 
 def with_module(folder, name, text):
     (folder / f"{name}.py").write_text(text)
-    return {"PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"}
+    return {"path": (folder, ROOT)}
 
 
 # one table
@@ -51,7 +34,7 @@ def with_module(folder, name, text):
 
 def test_every_code_has_a_meaning_and_the_help_has_the_table():
     assert set(EXIT_CODE_MEANINGS) == set(ExitCode)
-    shown = CliRunner().invoke(main, ["--help"]).stdout
+    shown = invoke("--help").stdout
     table = shown[shown.index("Exit codes:") :]
     assert all(len(line) <= 80 for line in table.splitlines())
     shown = re.sub(r"\n {8,}", " ", shown)
@@ -69,14 +52,16 @@ def test_the_pages_have_the_same_table(page):
 
 
 def test_an_engine_without_the_level_compares_nothing(tmp_path):
-    result = invoke(tmp_path, "rest", "--engine", "pinocchio-aba", "--level", "trajectory")
+    result = invoke("run", "rest", "--engine", "pinocchio-aba", "--level", "trajectory", *ON_ONE, tmp_path)
     assert result.exit_code == ExitCode.DISAGREEMENT, result.output
     assert "nothing was compared" in result.stdout
     assert "Every cell agrees" not in (tmp_path / "report.html").read_text()
 
 
 def test_recorded_gaps_alone_are_no_comparison(tmp_path):
-    result = invoke(tmp_path, "chain-3-balls", "--engine", "reference-printed", "--level", "state")
+    result = invoke(
+        "run", "chain-3-balls", "--engine", "reference-printed", "--level", "state", *ON_ONE, tmp_path
+    )
     assert result.exit_code == ExitCode.DISAGREEMENT, result.output
     assert "0 independent checks: 1 unsupported as declared, nothing was compared" in result.stdout
 
@@ -89,13 +74,14 @@ def test_recorded_gaps_alone_are_no_comparison(tmp_path):
         ("raise RuntimeError('libGL broken')\n", "RuntimeError: libGL broken"),
         ("raise ImportError('libGL.so.1: cannot open')\n", "ImportError: libGL.so.1: cannot open"),
         ("import time\ntime.sleep(600)\n", "timeout: no answer within 5 s"),
+        ("raise ModuleNotFoundError('No module', name='scipy.x')\n", "ModuleNotFoundError: No module"),
     ],
-    ids=["exit", "crash", "exception", "missing library", "timeout"],
+    ids=["exit", "crash", "exception", "missing library", "timeout", "missing module of the harness"],
 )
 def test_an_engine_that_fails_at_import_has_failed(tmp_path, text, words):
     place = with_module(tmp_path, "mujoco", text)
     names = ["--engine", "mujoco", "--engine", "reference", "--level", "state", "--timeout", "5"]
-    result = run(tmp_path / "out", "rest", *names, **place)
+    result = run_plumbline("run", "rest", *names, *ON_ONE, tmp_path / "out", **place)
     assert result.returncode == ExitCode.ENGINE_FAILED, result.stdout + result.stderr
     shown = " ".join(result.stdout.split())
     assert words in shown and "1 failed" in shown and "7 agree" in shown
@@ -109,24 +95,20 @@ MISSING = "raise ModuleNotFoundError(\"No module named 'exudyn'\", name='exudyn'
 
 def test_a_missing_engine_is_a_failure_only_where_it_was_named(tmp_path):
     place = with_module(tmp_path, "exudyn", MISSING)
-    named = run(tmp_path / "a", "rest", "--engine", "exudyn", "--level", "state", **place)
+    named = run_plumbline(
+        "run", "rest", "--engine", "exudyn", "--level", "state", *ON_ONE, tmp_path / "a", **place
+    )
     assert named.returncode == ExitCode.ENGINE_FAILED, named.stdout + named.stderr
     assert "it was named explicitly" in " ".join(named.stdout.split())
-    usual = run(tmp_path / "b", "rest", "--level", "state", **place)
+    usual = run_plumbline("run", "rest", "--level", "state", *ON_ONE, tmp_path / "b", **place)
     assert usual.returncode == ExitCode.SUCCESS, usual.stdout + usual.stderr
     assert "2 not installed" in usual.stdout
-
-
-def test_a_missing_module_of_the_harness_is_no_missing_engine(tmp_path):
-    place = with_module(tmp_path, "exudyn", "raise ModuleNotFoundError('No module', name='scipy.x')\n")
-    result = run(tmp_path / "out", "rest", "--level", "state", **place)
-    assert result.returncode == ExitCode.ENGINE_FAILED and "ModuleNotFoundError" in result.stdout
 
 
 def test_a_version_whose_environment_cannot_be_made_has_failed(tmp_path, monkeypatch):
     for name in ("PATH", "XDG_CACHE_HOME"):
         monkeypatch.setenv(name, str(tmp_path))
-    result = invoke(tmp_path / "out", "rest", "--engine", "mujoco@0.0.1", "--level", "state")
+    result = invoke("run", "rest", "--engine", "mujoco@0.0.1", "--level", "state", *ON_ONE, tmp_path / "out")
     assert result.exit_code == ExitCode.ENGINE_FAILED, result.output
     assert "1 failed" in result.stdout
     beside = (ROOT, Path(sys.prefix).resolve().parent)
@@ -154,9 +136,7 @@ def test_a_sweep_needs_the_engines_that_its_file_names(verdicts, code):
 
 def test_a_truth_with_a_wrong_gravity_fails_the_harness(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(worker_process, "initialize_worker", wrong_truths.prepare)
-    result = CliRunner().invoke(
-        main, ["run", "tumbling-ball", "--engine", "mujoco", "--jobs", "1", "--out", str(tmp_path)]
-    )
+    result = invoke("run", "tumbling-ball", "--engine", "mujoco", *ON_ONE, tmp_path)
     assert result.exit_code == ExitCode.HARNESS_FAILED, result.output
     first = " ".join(result.stdout.split())
     assert first.startswith(f"☒ the harness failed: tumbling-ball: {TRUTHS_DIFFER}")
@@ -171,7 +151,7 @@ def test_a_truth_with_a_wrong_gravity_fails_the_harness(monkeypatch, tmp_path, c
 def test_a_certified_state_that_contradicts_the_definition_fails_the_harness(monkeypatch, tmp_path):
     monkeypatch.setattr(worker_process, "initialize_worker", wrong_truths.prepare_states)
     chosen = ["run", "double-loaded-rods", "--engine", "pinocchio", "--level", "state"]
-    result = CliRunner().invoke(main, [*chosen, "--jobs", "1", "--out", str(tmp_path)])
+    result = invoke(*chosen, *ON_ONE, tmp_path)
     assert result.exit_code == ExitCode.HARNESS_FAILED, result.output
     assert "contradicts the definition of the mechanism" in " ".join(result.stdout.split())
     document = json.loads((tmp_path / "results.json").read_text())
@@ -184,7 +164,7 @@ def test_engines_that_agree_against_an_accepted_truth_put_the_harness_in_doubt(
 ):
     monkeypatch.setattr(worker_process, "initialize_worker", wrong_truths.prepare_accepted)
     chosen = ["run", "tumbling-ball", "--engine", "mujoco", "--engine", "reference", "--level", level]
-    result = CliRunner().invoke(main, [*chosen, "--jobs", "1", "--out", str(tmp_path)])
+    result = invoke(*chosen, *ON_ONE, tmp_path)
     assert result.exit_code == ExitCode.HARNESS_FAILED, result.output
     shown = " ".join(result.stdout.split())
     assert shown.startswith(
@@ -199,16 +179,9 @@ def test_engines_that_agree_against_an_accepted_truth_put_the_harness_in_doubt(
     assert 'type="harness failed"' in (tmp_path / "junit.xml").read_text()
 
 
-def test_the_same_run_without_the_mistake_is_green():
-    chosen = loader.load_scenarios(["tumbling-ball"])
-    result = run_plan(Plan(chosen, ["mujoco"], "trajectory", limits=Limits(120)), lambda *_: None)
-    assert result.metadata["exit_code"] == 0, result.metadata["sentence"]
-
-
 def test_an_internal_error_is_a_sentence_and_a_file(tmp_path):
-    words = ["run", "rest", "--engine", "reference", "--level", "state", "--out", str(tmp_path)]
     with patch("plumbline.cli.run_commands.run_plan", side_effect=KeyError("a mistake\nof two lines")):
-        result = CliRunner().invoke(main, words)
+        result = invoke("run", "rest", "--engine", "reference", "--level", "state", "--out", tmp_path)
     assert result.exit_code == ExitCode.HARNESS_FAILED
     (line,) = result.stderr.splitlines()
     found = re.fullmatch(r"internal error: KeyError: '.+'; the traceback is in (.+)", line)
@@ -222,9 +195,8 @@ def test_an_internal_error_is_a_sentence_and_a_file(tmp_path):
     [(ExecutorLost("the scheduler has gone"), "the cluster was lost"), (OSError(28, "full"), "I/O error")],
 )
 def test_a_machine_that_fails_exits_with_4(tmp_path, error, words):
-    arguments = ["run", "rest", "--engine", "reference", "--level", "state", "--out", str(tmp_path)]
     with patch("plumbline.cli.run_commands.run_plan", side_effect=error):
-        result = CliRunner().invoke(main, arguments)
+        result = invoke("run", "rest", "--engine", "reference", "--level", "state", "--out", tmp_path)
     assert result.exit_code == ExitCode.MACHINE_FAILED and words in result.stderr
 
 
@@ -234,11 +206,10 @@ def test_a_machine_that_fails_exits_with_4(tmp_path, error, words):
 @pytest.mark.parametrize("which", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_an_interrupted_run_explains_how_to_resume_and_leaves_no_process(tmp_path, own_cells, which):
     process = subprocess.Popen(
-        [sys.executable, *WORDS, "chain-3-balls", "--engine", "mujoco", "--jobs", "1", "--out", tmp_path],
+        [sys.executable, "-m", "plumbline", "run", "chain-3-balls", "--engine", "mujoco", *ON_ONE, tmp_path],
         cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
         # also under nohup, where the signal would be ignored
-        preexec_fn=lambda: signal.signal(which, signal.SIG_DFL),
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        preexec_fn=lambda: signal.signal(which, signal.SIG_DFL), env=user_environment(),
     )  # fmt: skip
     deadline = time.monotonic() + 60
     while not list(own_cells.glob("*.cell")) and time.monotonic() < deadline:
@@ -282,19 +253,15 @@ def test_an_interruption_inside_an_import_has_the_exit_code_too(tmp_path, statem
         f"def stop(*_, **__):\n    {statement}\n    time.sleep(5)\n"
         "with patch('plumbline.cli.run_commands.run_plan', stop):\n    main(['run', 'rest'])\n"
     )
-    words = [sys.executable, "-m", "interrupted"]  # only of modules is the exit code replaced
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(tmp_path)])}
-    done = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=60)
+    # only of modules is the exit code replaced
+    done = run_python("-m", "interrupted", cwd=tmp_path, path=(ROOT, tmp_path))
     assert "interrupted" in done.stderr
     assert done.returncode == ExitCode.INTERRUPTED, done
 
 
 def test_an_interruption_while_loading_prints_no_traceback(tmp_path):
     (tmp_path / "click.py").write_text("raise KeyboardInterrupt\n")
-    done = subprocess.run(
-        [sys.executable, "-m", "plumbline", "--help"], cwd=ROOT, capture_output=True, text=True,
-        env={**os.environ, "PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"},
-    )  # fmt: skip
+    done = run_plumbline("--help", path=(tmp_path, ROOT))
     assert (done.returncode, done.stderr) == (ExitCode.INTERRUPTED, "")
 
 
@@ -320,7 +287,7 @@ def test_a_bad_file_of_known_issues_is_bad_usage(tmp_path, command, text, words)
     path = tmp_path / "known.yaml"
     if text is not None:
         path.write_text(text)
-    result = CliRunner().invoke(main, [command, "rest", "--known", str(path), "--out", str(tmp_path / "out")])
+    result = invoke(command, "rest", "--known", path, "--out", tmp_path / "out")
     assert result.exit_code == ExitCode.BAD_USAGE, result.output
     assert f"{path}" in result.stderr and words in result.stderr, result.stderr
     assert not (tmp_path / "out").exists()
@@ -333,9 +300,9 @@ class Stopped(Exception):
 @pytest.mark.parametrize("where", ["plumbline.cli.run_commands.run_plan", "plumbline.cli.nightly.run_plan"])
 def test_known_issues_of_the_user_are_added_to_those_of_the_project(tmp_path, where):
     (tmp_path / "known.yaml").write_text(MINE)
-    words = ["run" if "run_commands" in where else "nightly", "rest", "--known", str(tmp_path / "known.yaml")]
+    words = ["run" if "run_commands" in where else "nightly", "rest", "--known", tmp_path / "known.yaml"]
     with patch(where, side_effect=Stopped) as called:
-        CliRunner().invoke(main, [*words, "--engine", "mujoco", "--out", str(tmp_path / "out")])
+        invoke(*words, "--engine", "mujoco", "--out", tmp_path / "out")
     plan = called.call_args.args[0]
     assert [issue.id for issue in plan.known_issues] == [e.id for e in load_known_issues()] + ["mine"]
     assert plan.are_engines_required
@@ -355,6 +322,6 @@ def test_streams_that_take_no_words_or_not_all_letters(tmp_path, command, code):
     done = subprocess.run(
         f"'{sys.executable}' -m plumbline {command.format(tmp_path / 'out')}", shell=True, cwd=ROOT,
         capture_output=True, text=True, timeout=240,
-        env={**os.environ, "PYTHONPATH": str(ROOT), "PYTHONIOENCODING": "ascii"},
+        env=user_environment(PYTHONIOENCODING="ascii"),
     )  # fmt: skip
     assert done.returncode == code and "internal error" not in done.stderr, done

@@ -2,15 +2,13 @@
 
 import json
 import os
-import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
+from tests.helpers.commands import ROOT, run_plumbline
 from tests.helpers.terminal_counts import agreed
 
-ROOT = Path(__file__).resolve().parents[2]
 SECRET = "TOP-SECRET-4711"
 LINK = """<link name="{name}"><inertial><mass value="1"/>
 <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>
@@ -39,7 +37,7 @@ def hostile(tmp_path_factory):
     secret.write_text(f"<mujocoinclude><!-- {SECRET} --><body name='{SECRET}'/></mujocoinclude>")
     os.mkfifo(outside / "mesh.stl")  # whoever opens it hangs
     code = f"open({str(mark)!r}, 'a').write(__name__ + '\\n')\n"
-    names = (
+    for name in [
         "engine",
         "numpy",
         "mujoco",
@@ -49,8 +47,7 @@ def hostile(tmp_path_factory):
         "conftest",
         "json",
         "setup",
-    )
-    for name in names:
+    ]:
         (folder / f"{name}.py").write_text(code)
     for name in ("plumbline", "adapters", "reference_impl", "reports"):
         (folder / name).mkdir()
@@ -95,17 +92,6 @@ def hostile(tmp_path_factory):
     return folder, mark, files
 
 
-def plumbline(folder, *words):
-    """The command as its script starts it, which does not put the current folder on the import path."""
-    environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")} | {
-        "PYTHONPATH": str(ROOT)
-    }
-    return subprocess.run(
-        [sys.executable, "-P", "-m", "plumbline", *map(str, words)], cwd=folder, capture_output=True,
-        text=True, timeout=100, env=environment, check=False,
-    )  # fmt: skip
-
-
 def check(hostile, done):
     folder, mark, _ = hostile
     assert not mark.exists(), f"executed: {mark.read_text()}"
@@ -117,11 +103,11 @@ def check(hostile, done):
 def test_no_engine_of_the_folder_is_started_and_no_module_imported(hostile):
     folder = hostile[0]
     run = "run", "tumbling-ball", "--level", "state", "--jobs", 1, "--out", "plumbline-out"
-    done = plumbline(folder, *run, "--engine", "mujoco")
+    done = run_plumbline(*run, "--engine", "mujoco", cwd=folder)
     assert done.returncode == 0 and agreed(done.stdout) >= 7, done.stdout + done.stderr
     check(hostile, done)
     for name in ("program", "file", "module", "shell"):
-        done = plumbline(folder, *run, "--engine", name)
+        done = run_plumbline(*run, "--engine", name, cwd=folder)
         assert done.returncode == 2 and "--trust allows it" in done.stderr, done.stderr
         check(hostile, done)
 
@@ -129,7 +115,9 @@ def test_no_engine_of_the_folder_is_started_and_no_module_imported(hostile):
 def test_no_file_outside_is_read_for_a_model_file(hostile):
     folder, _, files = hostile
     for words in (("run", "--level", "state", "--engine", "mujoco"), ("model", "--engine", "mujoco")):
-        done = plumbline(folder, *words, *files, "scenario.yaml", "--jobs", 1, "--out", "plumbline-out")
+        done = run_plumbline(
+            *words, *files, "scenario.yaml", "--jobs", 1, "--out", "plumbline-out", cwd=folder
+        )
         assert done.returncode == 2, (words, done.stdout, done.stderr)
         check(hostile, done)
         for name in ("include.xml", "absolute.xml", "through-link.xml", "mesh.xml", "meshdir.xml"):
@@ -139,6 +127,6 @@ def test_no_file_outside_is_read_for_a_model_file(hostile):
 
 def test_meshes_outside_do_not_matter_to_a_mechanism_and_are_not_opened(hostile):
     for name in ("up.urdf", "file.urdf", "package.urdf"):
-        done = plumbline(hostile[0], "model", name, "--to-scenario", "arm.yaml")
+        done = run_plumbline("model", name, "--to-scenario", "arm.yaml", cwd=hostile[0])
         assert done.returncode == 0, done.stderr
         check(hostile, done)

@@ -9,10 +9,10 @@ from unittest.mock import patch
 
 import click
 import pytest
-from click.testing import CliRunner
 
 from plumbline.cli.main import COMMANDS, main
 from tests.helpers import example_results
+from tests.helpers.commands import invoke
 from tests.helpers.mutations import limited_time
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -113,7 +113,7 @@ def check_commands(places, count, seed):
             words = [name, *random_words(main.get_command(None, name), draw, places)]
             try:
                 with limited_time():
-                    result = CliRunner().invoke(main, words)
+                    result = invoke(*words)
             except Accepted:
                 outcomes[name]["accepted"] += 1
                 continue

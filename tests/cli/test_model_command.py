@@ -2,14 +2,15 @@
 
 import json
 import xml.etree.ElementTree as ET
+from functools import partial
 
 import pytest
-from click.testing import CliRunner
 
-from plumbline.cli.main import main
 from plumbline.model_files.model_rows import REFUSED
 from plumbline.model_files.model_run import ModelPlan, run_model_files
+from tests.helpers.commands import invoke
 
+run = partial(invoke, "model", "--jobs", 1)
 ROBOT = """<robot name="arm">
 <link name="base"><inertial><mass value="3"/>
 <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>
@@ -28,10 +29,6 @@ MJCF = """<mujoco model="m"><option gravity="0 0 -1.62"/>
 """
 
 
-def run(*arguments):
-    return CliRunner().invoke(main, ["model", "--jobs", "1", *map(str, arguments)])
-
-
 def test_importers_that_agree_exit_with_0_and_a_table(tmp_path):
     path = tmp_path / "arm.urdf"
     path.write_text(ROBOT)
@@ -48,7 +45,9 @@ def differing(tmp_path_factory):
     folder = tmp_path_factory.mktemp("differing")
     path = folder / "moon.xml"
     path.write_text(MJCF)
-    result = run(path, "--engine", "pinocchio", "--states", 3, "--out", folder / "out", "--json")
+    result = invoke(
+        "model", "--jobs", 1, path, "--engine", "pinocchio", "--states", 3, "--out", folder / "out", "--json"
+    )
     return folder, json.loads(result.stdout), result
 
 
@@ -196,7 +195,9 @@ def test_a_refusal_is_an_answer_and_a_gap_only_where_the_importer_was_named(tmp_
 def test_one_state_can_be_given(tmp_path):
     path = tmp_path / "arm.urdf"
     path.write_text(ROBOT)
-    result = run(path, "--engine", "mujoco", "--at", "j1=0.3", "--base", "free", "--json")
+    result = invoke(
+        "model", "--jobs", 1, path, "--engine", "mujoco", "--at", "j1=0.3", "--base", "free", "--json"
+    )
     assert result.exit_code == 0, result.output
     (file,) = json.loads(result.stdout)["files"]
     assert file["degrees_of_freedom"] == 7

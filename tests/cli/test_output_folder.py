@@ -3,28 +3,19 @@
 import json
 import os
 import shutil
-import subprocess
-import sys
-from pathlib import Path
 from unittest.mock import patch
 
 import pytest
-from click.testing import CliRunner
 
-from plumbline.cli.main import main
 from plumbline.cli.options import LOCK_FILE
 from plumbline.execution.exit_codes import ExitCode
 from plumbline.processes.isolation import FileLock
 from tests.helpers import example_results
+from tests.helpers.commands import ROOT, invoke, run_plumbline
 
-ROOT = Path(__file__).resolve().parents[2]
 SWEEP = (
     "schema_version: 1\nscenario: tumbling-rod\nvary: {'bodies[0].mass': {values: [1, 2]}}\nduration: 0.25\n"
 )
-
-
-def invoke(*words):
-    return CliRunner().invoke(main, list(map(str, words)))
 
 
 @pytest.fixture
@@ -132,10 +123,7 @@ def test_the_command_that_repeats_a_cell_names_the_file_as_given(tmp_path, monke
     shutil.copy(ROOT / "scenarios" / "single" / "rest.yaml", mine)
     for given, stored in (("rest.yaml", "./rest.yaml"), (str(mine), str(mine)), ("rest", "rest.yaml")):
         words = ["run", given, "--engine", "mujoco", "--level", "state", "--jobs", "1", "--out", "out"]
-        done = subprocess.run(
-            [sys.executable, "-m", "plumbline", *words], capture_output=True, text=True,
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
-        )  # fmt: skip
+        done = run_plumbline(*words, cwd=tmp_path)
         assert done.returncode == 0, done.stdout + done.stderr
         document = json.loads((tmp_path / "out" / "results.json").read_text())
         assert document["scenarios"]["rest"]["file"] == stored
@@ -144,11 +132,9 @@ def test_the_command_that_repeats_a_cell_names_the_file_as_given(tmp_path, monke
 def test_an_engine_that_crashes_at_import_ends_no_sweep(tmp_path):
     (tmp_path / "sweep.yaml").write_text(SWEEP + "engines: {mujoco: RK4}\n")
     (tmp_path / "mujoco.py").write_text("import os\nos.abort()\n")
-    done = subprocess.run(
-        [sys.executable, "-m", "plumbline", "sweep", "sweep.yaml", "--jobs", "1", "--out", "out"],
-        cwd=tmp_path, capture_output=True, text=True,
-        env={**os.environ, "PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"},
-    )  # fmt: skip
+    done = run_plumbline(
+        "sweep", "sweep.yaml", "--jobs", "1", "--out", "out", cwd=tmp_path, path=(tmp_path, ROOT)
+    )
     assert done.returncode == ExitCode.ENGINE_FAILED, done.stdout + done.stderr
     assert "mujoco failed 2; reference agrees 2" in done.stdout
     assert "crashed: the worker died of SIGABRT" in done.stdout

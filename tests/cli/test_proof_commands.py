@@ -7,23 +7,18 @@ from importlib.util import find_spec
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from plumbline.cli.main import main
 from plumbline.execution.plan import Plan, TaskKey, TaskKind
 from plumbline.execution.scenario_verdicts import ScenarioRun
 from plumbline.scenario.loader import find_scenario_file, load_scenario
 from plumbline.truth import certificate_proof
 from plumbline.truth.trajectory_truth import trajectory_truth
+from tests.helpers.commands import invoke
 
 pytestmark = pytest.mark.skipif(
     not all(find_spec(module) for module in ("heyoka", "mpmath", "flint")),
     reason="the truth tools are not installed",
 )
-
-
-def type_command(*words):
-    return CliRunner().invoke(main, [str(word) for word in words])
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +27,7 @@ def certificate(tmp_path_factory):
     folder = tmp_path_factory.mktemp("certificates")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PLUMBLINE_CACHE", str(folder / "cache"))
-        result = type_command("prove", "tumbling-ball", "--duration", 0.25, "--out", folder)
+        result = invoke("prove", "tumbling-ball", "--duration", 0.25, "--out", folder)
     assert result.exit_code == 0, result.output
     return folder / "tumbling-ball.json.gz", result.output
 
@@ -53,7 +48,7 @@ def test_a_name_never_leads_out_of_the_folder(tmp_path, name):
     text = json.dumps(name.replace("/ABSOLUTE", str(tmp_path)))
     (tmp_path / "x.yaml").write_text(source.replace("\ntitle", f"\nname: {text}\ntitle", 1))
     before = sorted(tmp_path.rglob("*"))
-    result = type_command("prove", tmp_path / "x.yaml", "--duration", 0.125, "--out", tmp_path / "a" / "b")
+    result = invoke("prove", tmp_path / "x.yaml", "--duration", 0.125, "--out", tmp_path / "a" / "b")
     assert result.exit_code == 2, result.output
     assert f"{tmp_path / 'x.yaml'}:" in result.stderr and ": name: " in result.stderr
     assert sorted(tmp_path.rglob("*")) == before
@@ -61,7 +56,7 @@ def test_a_name_never_leads_out_of_the_folder(tmp_path, name):
 
 def test_verify_proves_it_again_without_heyoka(certificate, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "heyoka", None)
-    result = type_command("verify", certificate[0], "--json")
+    result = invoke("verify", certificate[0], "--json")
     assert result.exit_code == 0, result.output
     (record,) = json.loads(result.stdout)
     assert record["verdict"] == "proved" and record["until"] == 0.25
@@ -76,7 +71,7 @@ def claiming(certificate, path, **changes):
 
 
 def test_verify_prints_of_what_a_certificate_is_a_proof(certificate):
-    result = type_command("verify", certificate[0])
+    result = invoke("verify", certificate[0])
     assert result.exit_code == 0, result.output
     words = "proof of tumbling-ball, whose 2 s it covers up to 0.25 s; 0 … 0.25 s, 1 body, joints 1 × ball, "
     assert f"{certificate[0]}: {words}gravity (0, 0, -9.81) m/s², numbers " in result.stdout
@@ -92,29 +87,29 @@ def lighter(tmp_path_factory):
     path.write_text(f"name: tumbling-ball\ngravity: [0, 0, -9.8]\n{text}", encoding="utf-8")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PLUMBLINE_CACHE", str(folder / "cache"))
-        result = type_command("prove", path, "--duration", 0.125, "--out", folder)
+        result = invoke("prove", path, "--duration", 0.125, "--out", folder)
     assert result.exit_code == 0, result.output
     return folder / "tumbling-ball.json.gz", path
 
 
 def test_numbers_decide_of_which_scenario_a_certificate_is_a_proof(certificate, lighter):
-    result = type_command("verify", lighter[0], certificate[0], "--json")
+    result = invoke("verify", lighter[0], certificate[0], "--json")
     assert result.exit_code == 0, result.output
     other, own = json.loads(result.stdout)
     assert other["scenarios"] == [] and own["scenarios"] == ["tumbling-ball"]
     assert other["gravity"] == [0, 0, -9.8] and other["digest"] != own["digest"]
     assert other["bodies"] == 1 and other["joints"] == {"ball": 1} and other["until"] == 0.125
-    assert "no scenario of the catalogue has its numbers" in type_command("verify", lighter[0]).stdout
+    assert "no scenario of the catalogue has its numbers" in invoke("verify", lighter[0]).stdout
 
 
 @pytest.mark.parametrize("is_own, code", [(True, 0), (False, 1)])
 def test_a_named_scenario_has_to_have_the_numbers(certificate, lighter, is_own, code):
     for path, scenario in ((certificate[0], "tumbling-ball"), lighter):
         wanted = scenario if is_own else "tumbling-rod"
-        result = type_command("verify", path, "--scenario", wanted, "--json")
+        result = invoke("verify", path, "--scenario", wanted, "--json")
         assert result.exit_code == code, result.output
         assert json.loads(result.stdout)[0]["verdict"] == ("proved" if is_own else "rejected")
-    result = type_command("verify", lighter[0], "--scenario", "tumbling-ball")
+    result = invoke("verify", lighter[0], "--scenario", "tumbling-ball")
     assert result.exit_code == 1
     assert "rejected: its numbers are not those of tumbling-ball" in result.stderr
 
@@ -134,7 +129,7 @@ def test_a_claim_that_the_numbers_contradict_is_a_warning(certificate, tmp_path)
     paths = [
         claiming(certificate, tmp_path / f"{k}.json.gz", scenario=claim) for k, claim in enumerate(claims)
     ]
-    result = type_command("verify", *paths, "--json")
+    result = invoke("verify", *paths, "--json")
     assert result.exit_code == 0
     for record, message in zip(json.loads(result.stdout), claims.values(), strict=True):
         assert record["scenarios"] == ["tumbling-ball"]
@@ -152,7 +147,7 @@ def blanks(size):
 def test_a_file_that_holds_gigabytes_is_refused_at_its_limit(tmp_path):
     path = tmp_path / "bomb.json.gz"
     path.write_bytes(blanks(6700))
-    result = type_command("verify", path, "--memory", 1)
+    result = invoke("verify", path, "--memory", 1)
     assert result.exit_code == 2
     assert f"{path}: malformed: holds more than 256 MB" in result.stderr
 
@@ -161,7 +156,7 @@ def test_a_proof_ends_at_its_time_limit(certificate, tmp_path):
     """Here of a certificate with many samples."""
     times = [float.hex(k * 1e-5) for k in range(20_000)]
     path = claiming(certificate, tmp_path / "slow.json.gz", times=times)
-    result = type_command("verify", path, "--timeout", 1)
+    result = invoke("verify", path, "--timeout", 1)
     assert result.exit_code == 3
     assert f"{path}: failed: not checked: timeout: no answer within 1 s" in result.stderr
 
@@ -171,7 +166,7 @@ def test_a_certificate_that_proves_nothing_exits_with_1(certificate, tmp_path):
     document["steps"][0][1][1] += 1 << 109
     path = tmp_path / "wrong.json"
     path.write_text(json.dumps(document))
-    result = type_command("verify", path, certificate[0])
+    result = invoke("verify", path, certificate[0])
     assert result.exit_code == 1
     assert f"{path}: rejected: step 1 of {len(document['steps'])}: inequality (5)" in result.stderr
     assert "tumbling-ball.json.gz" in result.stdout
@@ -180,25 +175,10 @@ def test_a_certificate_that_proves_nothing_exits_with_1(certificate, tmp_path):
 def test_a_malformed_file_exits_with_2_and_names_what_is_wrong(certificate, tmp_path):
     path = tmp_path / "cut.json.gz"
     path.write_bytes(certificate[0].read_bytes()[:500])
-    result = type_command("verify", path, tmp_path / "none")
+    result = invoke("verify", path, tmp_path / "none")
     assert result.exit_code == 2
     assert f"{path}: malformed: not a complete gzip or JSON file" in result.stderr
     assert "none: malformed: cannot be read: No such file" in result.stderr
-
-
-@pytest.mark.parametrize(
-    "words, message",
-    [
-        (["prove"], "Missing argument 'SCENARIO...'"),
-        (["prove", "no-such-scenario"], "no-such-scenario"),
-        (["prove", "tumbling-ball", "--duration", "-1"], "--duration"),
-        (["prove", "tumbling-ball", "--precision", "half"], "--precision"),
-        (["verify"], "Missing argument 'FILE...'"),
-    ],
-)
-def test_bad_usage_exits_with_2(words, message):
-    result = type_command(*words)
-    assert result.exit_code == 2 and message in result.stderr
 
 
 def test_a_run_uses_the_proof_of_its_own_numbers_only():
@@ -242,5 +222,5 @@ def test_the_rounded_motion_is_within_its_radius():
 
 
 def test_motions_of_loops_are_refused_with_a_reason():
-    result = type_command("prove", "tumbling-ball", "four-bar")
+    result = invoke("prove", "tumbling-ball", "four-bar")
     assert result.exit_code == 2 and "closed loops are not proved" in " ".join(result.stderr.split())

@@ -5,9 +5,7 @@ from io import StringIO
 from unittest.mock import patch
 
 import pytest
-from click.testing import CliRunner
 
-from plumbline.cli.main import main
 from plumbline.cli.run_display import RunDisplay
 from plumbline.cli.terminal_output import make_console, print_matrix
 from plumbline.cli.verdict_matrix import VerdictMatrix
@@ -17,6 +15,7 @@ from plumbline.execution.plan import Plan, RunObserver
 from plumbline.execution.runner import run_plan
 from plumbline.judging.rows import SHOWN_STYLES, Row, Verdict
 from plumbline.scenario import loader
+from tests.helpers.commands import invoke
 
 ENGINES = {"mujoco": EngineInfo("mujoco", "MuJoCo", "4.0.0", ())}
 
@@ -74,7 +73,7 @@ def test_an_interrupted_run_leaves_the_findings_of_what_has_finished(tmp_path, o
 
     words = ["run", "rest", "conical", "--engine", "mujoco", "--out", str(tmp_path), *option]
     with patch("plumbline.cli.run_commands.run_plan", side_effect=interrupted):
-        result = CliRunner().invoke(main, words)
+        result = invoke(*words)
     assert result.exit_code == ExitCode.INTERRUPTED
     assert "1 scenario   ✓ 1\n" in result.stdout
     assert "1 of 2 scenarios finished" in result.stdout

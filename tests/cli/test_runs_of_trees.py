@@ -4,9 +4,8 @@ import json
 from unittest.mock import patch
 
 import pyarrow.parquet as pq
-from click.testing import CliRunner
 
-from plumbline.cli.main import main
+from tests.helpers.commands import invoke
 
 
 def test_a_sweep_and_a_drift_table_of_a_tree_and_a_loop(tmp_path):
@@ -14,22 +13,18 @@ def test_a_sweep_and_a_drift_table_of_a_tree_and_a_loop(tmp_path):
         "schema_version: 1\nscenario: four-bar\nvary:\n  bodies[0].mass: {values: [1.0, 2.0]}\n"
         "duration: 0.25\nengines: {mujoco: RK4}\n"
     )
-    done = CliRunner().invoke(main, ["sweep", str(tmp_path / "s.yaml"), "--out", str(tmp_path / "out")])
+    done = invoke("sweep", str(tmp_path / "s.yaml"), "--out", str(tmp_path / "out"))
     assert done.exit_code == 0, done.output
     rows = pq.read_table(tmp_path / "out" / "sweep.parquet").to_pylist()
     assert [row["verdict"] for row in rows] == ["agrees"] * 4, [row["reason"] for row in rows]
     with patch("plumbline.studies.drift.TIMES", (0.25, 0.5)):
-        done = CliRunner().invoke(
-            main, ["drift", "sprung-hinge", "--rtol", "1e-6", "--out", str(tmp_path / "out")]
-        )
+        done = invoke("drift", "sprung-hinge", "--rtol", "1e-6", "--out", str(tmp_path / "out"))
     assert done.exit_code == 0, done.output
     assert len(pq.read_table(tmp_path / "out" / "drift.parquet")) == 6
 
 
 def test_a_tree_is_compared_with_its_joint_moments(tmp_path):
-    done = CliRunner().invoke(
-        main, ["run", "universal-pendulum", "--engine", "mujoco", "--out", str(tmp_path), "--json"]
-    )
+    done = invoke("run", "universal-pendulum", "--engine", "mujoco", "--out", str(tmp_path), "--json")
     assert done.exit_code == 0, done.output
     results = json.loads((tmp_path / "results.json").read_text())
     rows = {row["quantity"]: row["verdict"] for row in results["rows"]}
@@ -41,9 +36,7 @@ def test_a_tree_is_compared_with_its_joint_moments(tmp_path):
 
 
 def test_coverage_of_a_tree(tmp_path):
-    done = CliRunner().invoke(
-        main, ["coverage", "hinge-pendulum", "--level", "state", "--json", "--out", str(tmp_path / "out")]
-    )
+    done = invoke("coverage", "hinge-pendulum", "--level", "state", "--json", "--out", str(tmp_path / "out"))
     assert done.exit_code == 0, done.output
     entries = json.loads(done.stdout)["entries"]
     assert {"mass", "inertia", "frame", "body_frame", "coordinate", "rate"} <= {e["kind"] for e in entries}

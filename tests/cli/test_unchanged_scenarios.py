@@ -4,11 +4,10 @@ import os
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from plumbline.cli import options
-from plumbline.cli.main import main
 from plumbline.scenario import loader
+from tests.helpers.commands import invoke
 
 
 @pytest.fixture
@@ -54,11 +53,11 @@ def test_a_closed_form_that_does_not_fit_is_reported_each_time(built):
     text = loader.find_scenario_file("spherical").read_text()
     mine.write_text(text.replace("exact: spherical-pendulum", "exact: planar-pendulum"))
     for _ in range(2):
-        done = CliRunner().invoke(main, ["run", str(mine), "--out", str(mine.parent / "out")])
+        done = invoke("run", str(mine), "--out", str(mine.parent / "out"))
         assert done.exit_code == 2 and "exact" in done.output, done.output
 
 
 def test_the_command_computes_with_one_thread(monkeypatch):
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "4")
-    CliRunner().invoke(main, ["--version"])
+    invoke("--version")
     assert os.environ["OPENBLAS_NUM_THREADS"] == "1"

@@ -6,14 +6,12 @@ import sys
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 
-from plumbline.cli.main import main
 from plumbline.engines import specifications
 from plumbline.engines.registry import USER_ENGINES
 from plumbline.processes.line_process import BadSpecification
+from tests.helpers.commands import ROOT, invoke
 
-ROOT = Path(__file__).resolve().parents[2]
 TOY = ROOT / "tests" / "helpers" / "toy_server.py"
 RUN = ("run", "tumbling-ball", "--level", "state")
 
@@ -26,10 +24,6 @@ def no_engine_is_left(tmp_path, monkeypatch):
     USER_ENGINES.clear()
 
 
-def run(*words, folder=None):
-    return CliRunner().invoke(main, [*map(str, words)], catch_exceptions=False)
-
-
 def toy(path=TOY):
     return f"cmd:{shlex.quote(sys.executable)} {shlex.quote(str(path))}"
 
@@ -39,7 +33,7 @@ def test_a_program_is_a_column_and_its_answers_are_kept_until_it_changes(tmp_pat
     server = tmp_path / "toy.py"
     server.write_text(TOY.read_text())
     words = *RUN, "--adapter", toy("toy.py"), "--out", tmp_path / "out"
-    first, second = run(*words), run(*words)
+    first, second = invoke(*words), invoke(*words)
     assert first.exit_code == second.exit_code == 0, first.output
     assert "2 agree" in first.stdout and "answers of earlier runs" not in first.stderr
     assert "answers of earlier runs were used" in second.stderr
@@ -48,7 +42,7 @@ def test_a_program_is_a_column_and_its_answers_are_kept_until_it_changes(tmp_pat
     lifted = {row["quantity"] for row in results["rows"] if row["extra"].get("lifted")}
     assert lifted == {"acceleration", "angular_acceleration"}
     server.write_text(server.read_text().replace("omega, J @ omega", "omega, 1.001 * J @ omega"))
-    third = run(*words)
+    third = invoke(*words)
     assert third.exit_code == 1 and "disagree" in third.stdout, third.output
 
 
@@ -61,18 +55,18 @@ def test_what_the_folder_names_is_started_only_with_consent_to_its_contents(tmp_
     Path("plumbline.toml").write_text(f"[engines]\nmine = {json.dumps(f'cmd:{python} engine.py')}\n")
     words = *RUN, "--engine", "mine", "--out", tmp_path / "out"
     for command in (words, (*RUN, "--engine", "reference", "--out", tmp_path / "out")):
-        refused = run(*command)
+        refused = invoke(*command)
         assert not marks.exists()
-    refused = run(*words)
+    refused = invoke(*words)
     assert refused.exit_code == 2 and "--trust allows it" in refused.stderr and not marks.exists()
-    assert run(*words, "--trust").exit_code == 3 and marks.exists()
+    assert invoke(*words, "--trust").exit_code == 3 and marks.exists()
     USER_ENGINES.clear()
     marks.unlink()
-    assert run(*words, "--fresh").exit_code == 3 and marks.exists(), "the consent is kept"
+    assert invoke(*words, "--fresh").exit_code == 3 and marks.exists(), "the consent is kept"
     USER_ENGINES.clear()
     marks.unlink()
     server.write_text(server.read_text() + "\n")
-    assert run(*words).exit_code == 2 and not marks.exists(), "another file needs another consent"
+    assert invoke(*words).exit_code == 2 and not marks.exists(), "another file needs another consent"
 
 
 @pytest.mark.parametrize(
@@ -89,7 +83,7 @@ def test_what_the_folder_names_is_started_only_with_consent_to_its_contents(tmp_
     ],
 )
 def test_a_specification_with_a_mistake_is_bad_usage(text, reason):
-    done = run(*RUN, "--adapter", text)
+    done = invoke(*RUN, "--adapter", text)
     assert done.exit_code == 2 and reason in " ".join(done.stderr.split())
 
 
@@ -105,7 +99,7 @@ def test_a_bad_project_file_is_bad_usage(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for text in ("[engines", "[engines]\nx = 1\n", "engines = 3\n"):
         Path("plumbline.toml").write_text(text)
-        done = run(*RUN, "--engine", "mine")
+        done = invoke(*RUN, "--engine", "mine")
         assert done.exit_code == 2 and "plumbline.toml" in done.stderr
     with pytest.raises(BadSpecification):
         list(specifications.found_engines(tmp_path))
@@ -117,14 +111,14 @@ def test_an_adapter_of_a_file_is_a_column(tmp_path):
         "from adapters.reference_engine import Reference\n"
         "class Mine(Reference):\n    name = 'mine'\n    title = 'Mine'\n"
     )
-    done = run(*RUN, "--adapter", f"{file}:Mine", "--out", tmp_path / "out")
+    done = invoke(*RUN, "--adapter", f"{file}:Mine", "--out", tmp_path / "out")
     assert done.exit_code == 0 and "7 agree" in done.stdout, done.output
 
 
 def test_a_contract_names_what_differs_with_its_cause_and_writes_junit(tmp_path):
     wrong = tmp_path / "wrong.py"
     wrong.write_text(TOY.read_text().replace("omega, J @ omega", "omega, 1.001 * J @ omega"))
-    done = run("contract", toy(wrong), "--level", "state", "--junit", tmp_path / "junit.xml")
+    done = invoke("contract", toy(wrong), "--level", "state", "--junit", tmp_path / "junit.xml")
     assert done.exit_code == 1, done.stderr
     assert "✗ tumbling-ball/wrong/state/-/acceleration" in done.stdout
     assert "unsupported as declared" in done.stdout

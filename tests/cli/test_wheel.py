@@ -13,11 +13,12 @@ import pytest
 
 from plumbline.engines.environments import _run_uv
 from plumbline.truth import has_independent_truth
+from tests.helpers.commands import ROOT, run_plumbline
 from tests.helpers.dask_cluster import cluster
 from tests.helpers.terminal_counts import agreed
 from tools.release import problem, release_notes
 
-ROOT = Path(__file__).resolve().parents[2]
+RUN = ("run", "tumbling-ball", "--level", "state", "--engine", "reference", "--engine", "mujoco")
 MAX_WHEEL_BYTES = 1.5e6
 MAX_INSTALLED_BYTES = 500e6  # with MuJoCo alone, without the bytecode that Python makes of it or not
 MAX_SECONDS_TO_VERDICT = 30  # of CPU: another test may run on the same cores
@@ -61,18 +62,9 @@ def test_the_wheel_is_small_and_has_one_package(wheel, unpacked):
     assert len(list((unpacked / "plumbline/scenarios").rglob("*.yaml"))) > 60
 
 
-def run_installed(unpacked, folder, *words):
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
-    return subprocess.run(
-        [sys.executable, "-P", "-m", "plumbline", *words], cwd=folder, capture_output=True, text=True,
-        timeout=120, env=environment | {"PYTHONPATH": str(unpacked)}, check=False,
-    )  # fmt: skip
-
-
 def test_installed_it_compares_engines_and_writes_one_folder(unpacked, tmp_path):
     (tmp_path / ".git").mkdir()  # of the user: not of this project
-    words = "run", "tumbling-ball", "--level", "state", "--engine", "reference", "--engine", "mujoco"
-    done = run_installed(unpacked, tmp_path, *words, "--fresh")
+    done = run_plumbline(*RUN, "--fresh", cwd=tmp_path, path=[unpacked])
     assert done.returncode == 0, done.stdout + done.stderr
     assert {path.name for path in tmp_path.iterdir()} == {".git", "plumbline-out"}
     assert (tmp_path / "plumbline-out/report.html").is_file()
@@ -84,19 +76,8 @@ def test_installed_it_compares_engines_and_writes_one_folder(unpacked, tmp_path)
 @pytest.mark.timeout(300)
 def test_installed_it_runs_on_a_cluster_without_a_checkout(unpacked, tmp_path):
     pytest.importorskip("distributed")
-    words = (
-        "run",
-        "tumbling-ball",
-        "--level",
-        "state",
-        "--engine",
-        "reference",
-        "--engine",
-        "mujoco",
-        "--fresh",
-    )
     with cluster(tmp_path, 1, import_path=unpacked) as (address, _):
-        done = run_installed(unpacked, tmp_path, *words, "--scheduler", address)
+        done = run_plumbline(*RUN, "--fresh", "--scheduler", address, cwd=tmp_path, path=[unpacked])
     assert done.returncode == 0 and agreed(done.stdout) >= 14, done.stdout + done.stderr
 
 
@@ -104,9 +85,7 @@ def test_without_an_independent_truth_no_row_agrees(unpacked, tmp_path):
     """python-flint cannot be imported: a module of its name is empty, and has no specification."""
     assert has_independent_truth()
     (tmp_path / "sitecustomize.py").write_text("import sys\nsys.modules['flint'] = None\n")
-    words = "run", "tumbling-ball", "--level", "state", "--engine", "reference", "--engine", "mujoco"
-    path = f"{tmp_path}{os.pathsep}{unpacked}"
-    done = run_installed(path, tmp_path, *words, "--json")
+    done = run_plumbline(*RUN, "--json", cwd=tmp_path, path=[tmp_path, unpacked])
     rows = json.loads(done.stdout)["rows"]
     assert {row["verdict"] for row in rows} == {"unresolved"}
     assert all(row["reason"].startswith("no independent truth") for row in rows)

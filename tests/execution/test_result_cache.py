@@ -9,9 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from plumbline.cli.main import main
 from plumbline.diagnosis.cause import Cause, Diagnosis
 from plumbline.engines.environments import EnvironmentUnavailable, ensure_interpreter
 from plumbline.execution import environment_fingerprint
@@ -25,6 +23,7 @@ from plumbline.processes.user_cache import CheckedFiles, recall, remember
 from plumbline.processes.worker_environment import hashed_environment
 from plumbline.processes.worker_pool import Task, WorkerPool
 from plumbline.scenario import loader
+from tests.helpers.commands import invoke
 from tests.helpers.in_process import InProcessWorkers
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -257,9 +256,7 @@ def test_no_code_of_a_cell_runs(tmp_path):
 
 
 def run_command(out):
-    result = CliRunner().invoke(
-        main, ["run", "rest", "--engine", "reference", "--level", "state", "--out", str(out)]
-    )
+    result = invoke("run", "rest", "--engine", "reference", "--level", "state", "--out", str(out))
     assert result.exit_code == 0, result.output
     return result.stderr
 

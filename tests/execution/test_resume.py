@@ -15,9 +15,7 @@ import numpy as np
 import psutil
 import pyarrow.parquet as pq
 import pytest
-from click.testing import CliRunner
 
-from plumbline.cli.main import main
 from plumbline.engines import engine_calls
 from plumbline.execution import environment_fingerprint
 from plumbline.execution.plan import Plan
@@ -25,6 +23,7 @@ from plumbline.execution.result_cache import DiskResultCache, task_hash
 from plumbline.execution.runner import run_plan
 from plumbline.processes.worker_pool import Outcome, Pickled, Task
 from plumbline.scenario import loader
+from tests.helpers.commands import invoke
 
 ROOT = Path(__file__).resolve().parents[2]
 TIME_FIELDS = {"cpu_time", "cost"}  # what may differ between two runs
@@ -247,7 +246,7 @@ def test_the_key_is_the_content():
 
 
 def run_in_process(*more):
-    result = CliRunner().invoke(main, ["run", "rest", "--engine", "mujoco", "--level", "state", *more])
+    result = invoke("run", "rest", "--engine", "mujoco", "--level", "state", *more)
     assert result.exit_code == 0, result.output
     return result.stderr
 

@@ -25,28 +25,6 @@ ADDED = 2e-3
 CHAIN_QUANTITIES = [quantity for quantity in STATE_UNITS if quantity != "joint_moment"]
 
 
-def acceleration_verdict(scale_of_bound, shift=0.0):
-    """The verdict on acceleration of the reference against itself, its bound and answer changed."""
-    reported = load_adapter("reference").evaluate(MODEL, STATES)
-    bounds = [state_rounding_bound(MODEL, s) for s in STATES]
-    bounds = [replace(b, acceleration=b.acceleration * scale_of_bound) for b in bounds]
-    truth = StateTruth(STATES, reported, bounds, "itself")
-    off = [
-        replace(a, acceleration=a.acceleration + shift * b.acceleration[:, None])
-        for a, b in zip(reported, bounds, strict=True)
-    ]
-    rows = judge_states(WHO, truth, Evaluation(off, None, None, 0.0)).rows
-    return next(row.verdict for row in rows if row.quantity == "acceleration")
-
-
-@pytest.mark.parametrize(
-    ("scale", "shift", "expected"),
-    [(1, 0.5, "agrees"), (1, 2.0, "disagrees"), (1e6, 0.0, "unresolved"), (np.nan, 0.0, "unresolved")],
-)
-def test_a_bound_decides_only_where_it_is_sharp(scale, shift, expected):
-    assert acceleration_verdict(scale, shift) == expected
-
-
 def test_the_reason_of_an_inconclusive_row_states_the_measured_bound():
     bounds = [
         replace(b, acceleration=1e6 * b.acceleration) for b in map(state_rounding_bound, [MODEL] * 3, STATES)

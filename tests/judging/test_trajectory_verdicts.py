@@ -191,11 +191,6 @@ def test_order_is_of_positions_and_velocities_over_their_scales():
     np.testing.assert_allclose(held.scaled_states[0], expected, rtol=1e-13)
 
 
-def test_rounding_of_a_quaternion_is_twice_that_of_the_angle():
-    grown = judged_rows(growth=np.full(17, 1e4))["attitude_limit"]
-    assert grown.tolerance == pytest.approx(2e-12 + 2 * RUN_ROUNDING * 1e4, rel=ROUNDED)
-
-
 def test_a_limit_elsewhere_disagrees_only_where_the_study_shows_its_order():
     shifted = [1e-9 + 0.01 * h**2 for h in STEPS]
     found = judged_rows(refinement_study(shifted))

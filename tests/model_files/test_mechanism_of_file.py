@@ -5,9 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from plumbline.cli.main import main
 from plumbline.engines.importer_calls import read_model_file
 from plumbline.importers.lumping import lump_fixed_bodies
 from plumbline.importers.neutral_model import ElementaryJoint, NeutralBody, NeutralModel
@@ -30,6 +28,7 @@ from plumbline.model_files.model_comparison import model_states
 from plumbline.model_files.prepared_file import prepare_file
 from plumbline.scenario.loader import load_scenario, scenario_from_dict
 from plumbline.truth.certified_state import certify_state
+from tests.helpers.commands import invoke
 from tests.helpers.random_robots import random_mjcf, random_urdf
 from tests.helpers.terminal_counts import agreed
 
@@ -185,7 +184,7 @@ ROBOT = """<robot name="arm">
 
 
 def plumbline(*arguments):
-    return CliRunner().invoke(main, [*map(str, arguments)])
+    return invoke(*map(str, arguments))
 
 
 @pytest.fixture

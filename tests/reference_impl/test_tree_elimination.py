@@ -113,16 +113,6 @@ def test_baumgarte_damps_constraint_errors():
     np.testing.assert_allclose((ahead - back) / (2 * h), -2 * a * first - a * a * C, atol=1e-6)
 
 
-def test_both_integrators_agree_on_a_tree():
-    """The direct form with DOP853 and the O(bodies) form with collocation."""
-    model = random_tree(np.random.default_rng(6), 5)
-    start, times = off_manifold(model, 6, 0.0), np.array([0.0, 0.2, 0.5])
-    one = integrate_collocation([model], *start, times, 1e-12)
-    other = integrate_dop853(model, *start, times, 1e-12)
-    np.testing.assert_allclose(one.r, other.r, atol=1e-9)
-    np.testing.assert_allclose(one.p, other.p, atol=1e-9)
-
-
 @pytest.mark.parametrize("joints", [[0, 0, 0], [1, 0, 1], [1, 1]])
 def test_chains_from_any_point_move_as_trees_do(joints):
     chain = random_model(np.random.default_rng(3), joints)

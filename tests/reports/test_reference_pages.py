@@ -12,9 +12,7 @@ from typing import Any
 
 import pyarrow as pa
 import pytest
-from click.testing import CliRunner
 
-from plumbline.cli.main import main
 from plumbline.judging.smallest_detectable_mistake import CoverageEntry
 from plumbline.storage.results_store import DRIFT_TABLE
 from plumbline.studies import sweep
@@ -23,6 +21,7 @@ from plumbline.studies.parquet_files import write_table
 from reports import coverage_table as coverage_page
 from reports import html_report, reference_tables, sweep_page
 from reports.stored_results import Results, replace_unprintable
+from tests.helpers.commands import invoke
 from tests.helpers.example_results import HOSTILE, NASTY
 
 MEASURED: dict[str, Any] = {
@@ -229,7 +228,7 @@ def test_the_command_writes_the_map(tmp_path):
     vary = ("bodies[0].mass: {values: [0.5, 1]}", "bodies[0].angular_velocity[0]: {values: [0, 1]}")
     head = "schema_version: 1\nscenario: tumbling-ball\nduration: 0.25\nvary:\n  "
     (tmp_path / "sweep.yaml").write_text(head + "\n  ".join(vary))
-    ran = CliRunner().invoke(main, ["sweep", str(tmp_path / "sweep.yaml"), "--out", str(tmp_path / "out")])
+    ran = invoke("sweep", str(tmp_path / "sweep.yaml"), "--out", str(tmp_path / "out"))
     assert ran.exit_code == 0, ran.output
     reported = words((tmp_path / "out" / "sweep.html").read_text(encoding="utf-8"))
     assert "4 cells: reference agrees 4" in reported

@@ -5,9 +5,7 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from plumbline.cli.main import main
 from plumbline.engines.registry import load_adapter
 from plumbline.execution.result_cache import DiskResultCache
 from plumbline.judging.rows import RowContext
@@ -18,6 +16,7 @@ from plumbline.scenario.loader import find_scenario_file, load_scenario
 from plumbline.storage import results_store
 from plumbline.storage.results_schema import DamagedResults
 from plumbline.storage.script_index import read_script_index
+from tests.helpers.commands import invoke
 from tests.helpers.reproduction import run_alone
 
 for name in ("mujoco", "pinocchio", "exudyn", "flint"):
@@ -67,7 +66,7 @@ def store(folder, document):
 
 def command(*arguments):
     """The command's exit code and its output; a traceback is a failure."""
-    done = CliRunner().invoke(main, [str(a) for a in arguments])
+    done = invoke(str(a) for a in arguments)
     assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
     return done.exit_code, done.output
 

@@ -5,9 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from plumbline.cli.main import main
 from plumbline.engines.engine_calls import evaluate_states
 from plumbline.execution.exit_codes import ExitCode
 from plumbline.judging.rows import RowContext
@@ -17,6 +15,7 @@ from plumbline.model.sampling import compared_states
 from plumbline.scenario.loader import catalogue, find_scenario_file, load_scenario, load_scenario_text
 from plumbline.truth.certified_state import certify_state
 from plumbline.truth.ground_truth import state_truth
+from tests.helpers.commands import invoke
 from tests.helpers.nightly_tests import slow
 
 TRUSS = """\
@@ -126,7 +125,7 @@ def test_check_names_what_cannot_move(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in ("truss", "bob on truss"):
         Path(f"{name}.yaml").write_text(TEXTS[name])
-    done = CliRunner().invoke(main, ["check", "truss.yaml", "bob on truss.yaml"])
+    done = invoke("check", "truss.yaml", "bob on truss.yaml")
     assert done.exit_code == 0
     first, second = done.output.splitlines()
     assert first.endswith("; the mechanism cannot move: its loops hold every joint")
@@ -136,7 +135,7 @@ def test_check_names_what_cannot_move(tmp_path, monkeypatch):
 def test_a_truss_with_its_bars_in_one_line_cannot_be_compared(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("flat.yaml").write_text(FLAT)
-    done = CliRunner().invoke(main, ["check", "flat.yaml", str(find_scenario_file("four-bars-2-flat"))])
+    done = invoke("check", "flat.yaml", str(find_scenario_file("four-bars-2-flat")))
     flat, dead_point = done.output.splitlines()
     assert "; nothing can be compared: every pose that the loops allow is singular" in flat
     assert "; at t = 0 the pose is singular, as at a dead point: states at other poses are" in dead_point
@@ -147,7 +146,7 @@ def test_a_truss_with_its_bars_in_one_line_is_not_compared(tmp_path, monkeypatch
     """Its rows allow a rate, but no motion: neither a false "harness failed", nor green."""
     monkeypatch.chdir(tmp_path)
     Path("flat.yaml").write_text(FLAT)
-    ran = CliRunner().invoke(main, ["run", "flat.yaml", "--engine", "mujoco", "--jobs", "1", "--out", "out"])
+    ran = invoke("run", "flat.yaml", "--engine", "mujoco", "--jobs", "1", "--out", "out")
     assert ran.exit_code == ExitCode.DISAGREEMENT, ran.output
     assert "0 independent checks: 4 are information, nothing was compared" in ran.output
     rows = json.loads(Path("out/results.json").read_text())["rows"]

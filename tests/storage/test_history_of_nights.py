@@ -15,6 +15,7 @@ from plumbline.storage import results_store
 from plumbline.storage.history_of_nights import History, last_findings, next_night_number
 from reports.earlier_runs import History as ReportHistory
 from reports.stored_results import Results
+from tests.helpers.commands import invoke
 
 KEY = "s/mujoco/state/-/acceleration"
 
@@ -171,7 +172,7 @@ def test_a_damaged_night_is_named_and_left_out(tmp_path, spoil):
     assert list(history.damaged) == ["20260102T000000Z"]
     assert SPOILED[spoil] in history.damaged["20260102T000000Z"]
     for options in ([], ["--json"]):
-        shown = CliRunner().invoke(main, ["history", str(tmp_path), *options])
+        shown = invoke("history", str(tmp_path), *options)
         assert shown.exit_code == ExitCode.BAD_USAGE
         assert "20260103" in shown.stdout and "damaged, left out: 20260102T000000Z: " in shown.stderr
 
@@ -201,13 +202,13 @@ def test_a_folder_without_nights_is_bad_usage(tmp_path, made, words):
 def test_the_command_reports_it(tmp_path):
     store_run(tmp_path / "history", 1, ["agrees"])
     store_run(tmp_path / "history", 2, ["disagrees"])
-    reported = CliRunner().invoke(main, ["history", str(tmp_path)])
+    reported = invoke("history", str(tmp_path))
     assert reported.exit_code == 0, reported.output
     name = "mujoco-acceleration-at-level-state"
     assert f"{name} new 20260102T000000Z 1 4.0 20260102T000000Z" in " ".join(reported.output.split())
-    data = CliRunner().invoke(main, ["history", str(tmp_path), "--key", "s/*", "--json"])
+    data = invoke("history", str(tmp_path), "--key", "s/*", "--json")
     assert len(json.loads(data.output)["trend"]) == 2
-    nothing = CliRunner().invoke(main, ["history", str(tmp_path / "absent")])
+    nothing = invoke("history", str(tmp_path / "absent"))
     assert nothing.exit_code == 2
 
 

@@ -11,6 +11,7 @@ from plumbline.cli.main import main
 from plumbline.judging.rows import Row
 from plumbline.storage.history_of_nights import History
 from plumbline.storage.results_store import read_results, read_table
+from tests.helpers.commands import invoke
 
 STORED = Path(__file__).with_name("version_1") / "20261122T112600Z"  # `run rest --level state`, two engines
 KEY = "rest/mujoco/state/-/acceleration"
@@ -81,5 +82,5 @@ def test_a_disagreement_of_version_1_can_be_selected(results):
         if row["key"] == KEY:
             row |= {"verdict": "disagrees", "extra": row["extra"] | {"ratio": 30.0}}
     (results / "results.json").write_text(json.dumps(document))
-    answer = CliRunner().invoke(main, ["reproduce", str(results), KEY])
+    answer = invoke("reproduce", str(results), KEY)
     assert "the engine agrees" in answer.output, answer.output

@@ -9,9 +9,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from click.testing import CliRunner
 
-from plumbline.cli.main import main
 from plumbline.model.kinematics import quaternion_rate
 from plumbline.scenario import loader as scenarios
 from plumbline.storage.results_store import DRIFT_TABLE
@@ -20,6 +18,7 @@ from plumbline.studies.drift import VARIANTS, drift_errors
 from reference_impl.euler_parameters import angular_velocity
 from reference_impl.fast.collocation import integrate_collocation
 from reference_impl.joints import constraint_rows
+from tests.helpers.commands import invoke
 from tests.helpers.random_chains import random_chain
 
 
@@ -62,13 +61,13 @@ def test_a_run_that_fails_is_a_row_with_its_reason():
 def test_the_command_writes_the_table(tmp_path, monkeypatch):
     quick = functools.partial(drift.measure_drift, times=(0.5, 1.0))
     monkeypatch.setattr(drift, "measure_drift", quick)
-    ran = CliRunner().invoke(main, ["drift", "tumbling-rod", "--rtol", "1e-6", "--out", str(tmp_path)])
+    ran = invoke("drift", "tumbling-rod", "--rtol", "1e-6", "--out", str(tmp_path))
     assert ran.exit_code == 0, ran.output
     kept = pq.read_table(tmp_path / "drift.parquet")
     assert kept.schema.names == DRIFT_TABLE.names
     assert {(row["time"], row["rtol"]) for row in kept.to_pylist()} == {(0.5, 1e-6), (1.0, 1e-6)}
     assert "baumgarte" in ran.output
-    assert CliRunner().invoke(main, ["drift", "no-such-thing", "--out", str(tmp_path)]).exit_code == 2
+    assert invoke("drift", "no-such-thing", "--out", str(tmp_path)).exit_code == 2
 
 
 def start_of(rng, rods, **options):

@@ -2,14 +2,12 @@
 
 import json
 
-from click.testing import CliRunner
-
-from plumbline.cli.main import main
 from plumbline.execution.exit_codes import ExitCode
 from plumbline.processes.exceptions import PlumblineError
 from plumbline.scenario.generator import random_mechanism
 from plumbline.scenario.loader import load_scenarios, scenario_from_dict
 from plumbline.studies.fuzz import BATCH, Corpus, _smaller, scenario_of
+from tests.helpers.commands import invoke
 
 PLANTED = """
 from dataclasses import replace
@@ -77,10 +75,10 @@ def test_a_corpus_keeps_new_combinations_up_to_its_size_and_where_a_search_ended
 
 def test_a_batch_that_is_not_finished_in_time_does_not_count_and_explain_reads_the_folder(tmp_path):
     words = ["--minutes", "0", "--corpus", str(tmp_path / "corpus"), "--out", str(tmp_path / "out")]
-    done = CliRunner().invoke(main, ["fuzz", "--engine", "reference", *words])
+    done = invoke("fuzz", "--engine", "reference", *words)
     assert done.exit_code == ExitCode.SUCCESS and "0 scenarios, 0 new findings" in done.stderr, done.output
     assert not (tmp_path / "corpus").exists()
-    explained = CliRunner().invoke(main, ["explain", "--results", str(tmp_path / "out")])
+    explained = invoke("explain", "--results", str(tmp_path / "out"))
     assert (explained.exit_code, explained.stderr) == (0, "no finding\n"), explained.output
 
 
@@ -89,10 +87,10 @@ def test_a_planted_defect_is_found_named_and_shown_by_the_smallest_mechanism(tmp
     planted, out = tmp_path / "planted.py", tmp_path / "out"
     planted.write_text(PLANTED)
     words = ["--adapter", f"{planted}:Planted", "--seed", "3", "--findings", "5", "--jobs", "1", "--json"]
-    done = CliRunner().invoke(main, ["fuzz", *words, "--minutes", "60", "--out", str(out)])
+    done = invoke("fuzz", *words, "--minutes", "60", "--out", str(out))
     assert done.exit_code == ExitCode.DISAGREEMENT, done.output
     assert {found["name"] for found in json.loads(done.stdout)} == FIVE
     smallest = load_scenarios([str(path) for path in out.glob("*.yaml")])
     assert len(smallest) == 5 and all(scenario.model.n <= 3 for scenario in smallest)
-    explained = CliRunner().invoke(main, ["explain", "--results", str(out)])
+    explained = invoke("explain", "--results", str(out))
     assert {line.split(":")[0] for line in explained.stdout.splitlines()} == FIVE

@@ -6,9 +6,7 @@ from importlib import metadata
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 
-from plumbline.cli.main import main
 from plumbline.engines import environments
 from plumbline.engines.environments import EnvironmentUnavailable, PublishedVersions
 from plumbline.studies import version_search
@@ -19,6 +17,7 @@ from plumbline.studies.version_search import (
     choose_versions,
     find_change,
 )
+from tests.helpers.commands import invoke
 
 VERSIONS = [f"1.{k}" for k in range(40)]
 INSTALLED = metadata.version("mujoco")
@@ -117,7 +116,7 @@ def test_an_end_that_cannot_be_used_is_refused_with_the_reason(published, versio
 
 
 def run(*arguments):
-    return CliRunner().invoke(main, ["bisect", *map(str, arguments)])
+    return invoke("bisect", *map(str, arguments))
 
 
 @pytest.fixture

@@ -108,29 +108,6 @@ def test_energy_momentum_and_mass_matrix_follow_their_definitions():
     assert np.array_equal(reported.mass_matrix, reported.mass_matrix.T)
 
 
-def test_power_of_gravity_equals_the_change_of_kinetic_energy():
-    """d/dt T = Σ m ṙ·r̈ + ω′·(J ω̇′) = Σ m g·ṙ + loads: the accelerations do what the energies say."""
-    model, state = random_chain(np.random.default_rng(4), [0, 1, 1], loads=True)
-    reported = certify_state(model, state).quantities
-    change = np.sum(model.mass[:, None] * state.v * reported.acceleration)
-    change += np.sum(state.omega * np.einsum("kij,kj->ki", model.inertia, reported.angular_acceleration))
-    work = np.sum(state.v * (model.mass[:, None] * model.gravity + model.force)) + np.sum(
-        state.omega * model.moment
-    )
-    assert change == pytest.approx(work, rel=1e-12)
-
-
-def test_a_rod_at_rest_hangs_by_its_weight():
-    model, _ = random_chain(np.random.default_rng(0), [1])
-    model = model.changed(proximal=np.zeros((1, 3)))
-    down = np.array([[0.0, 0.0, -1.0]])
-    state = state_from_minimal(model, np.array([[1.0, 0, 0, 0]]), np.zeros((1, 3)), down, np.zeros((1, 3)))
-    answer = certify_state(model, state)
-    weight = model.mass * 9.81
-    assert np.all(answer.quantities.acceleration == 0)
-    assert answer.quantities.joint_reaction[0] == pytest.approx([0, 0, weight[0]], rel=1e-15)
-
-
 def test_a_singular_system_is_not_certified():
     model, state = random_chain(np.random.default_rng(0), [0, 0])
     inertia = model.inertia.copy()
