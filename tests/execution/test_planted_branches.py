@@ -91,7 +91,7 @@ def test_a_defect_in_a_rare_branch_is_reported(defect):
             (state for state in states if is_altered(defect, s.model, state)), MAX_EVALUATED
         )
     )
-    assert any(reported), f"no scenario reports {defect.description}"
+    assert any(reported), f"no scenario reports {defect.name}"
 
 
 @pytest.mark.skipif(not step_formulas.HAS_EXTENDED_PRECISION, reason="no extended precision on this machine")
@@ -103,4 +103,4 @@ def test_a_step_in_a_rare_branch_is_reported(defect):
             row.verdict == "disagrees"
             for s, states in problems()
             for row in judged(adapter, integrator, s.model, states[:STEP_STATES])
-        ), f"no scenario reports {defect.description}"
+        ), f"no scenario reports {defect.name}"

@@ -37,7 +37,7 @@ from tests.helpers.planting import (
 for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
     pytest.importorskip(engine)
 
-CLEAN = Defect("clean", "nothing")
+CLEAN = Defect("clean")
 RUN = ("engine", "integrator", "mechanism", "loaded")  # what a run is beside its defect
 
 
@@ -60,7 +60,7 @@ def state_report(defect):
 
 
 def is_named(defect):
-    return any(words in diagnosis(defect) for words in defect.expected)
+    return bool(defect.expected) and defect.expected in diagnosis(defect)
 
 
 def ids(defects):
@@ -73,7 +73,7 @@ def test_each_defect_has_its_own_name():
 
 @pytest.mark.parametrize("defect", some_fast(STATE_DEFECTS, 2))
 def test_every_state_defect_is_reported(defect):
-    assert evaluated(defect)[1], f"nothing reports {defect.description}"
+    assert evaluated(defect)[1], f"nothing reports {defect.name}"
 
 
 @pytest.mark.parametrize("defect", some_fast([d for d in STATE_DEFECTS if d.expected], 8))
@@ -83,7 +83,7 @@ def test_every_state_defect_is_named(defect):
 
 @pytest.mark.parametrize("defect", fast_are(FAST_MOTIONS, (*MOTION_DEFECTS, *ELEMENT_MOTION_DEFECTS)))
 def test_every_motion_defect_is_reported(defect):
-    assert shown_by(defect), f"nothing reports {defect.description}"
+    assert shown_by(defect), f"nothing reports {defect.name}"
 
 
 def test_the_same_engine_without_defect_is_not_reported():
@@ -130,14 +130,13 @@ def noisy(_, state, a):
 
 
 UNNAMEABLE = (
-    Defect("noise", "r̈ × (1 + 1e-9 noise)", answers=answer_change("acceleration", noisy)),
-    Defect("cubed", "ω̇′ + 1e-6 ω̇′³", engine="pinocchio",
+    Defect("noise", answers=answer_change("acceleration", noisy)),
+    Defect("cubed", engine="pinocchio",
            answers=answer_change("angular_acceleration", lambda _, __, a: a + 1e-6 * a**3)),
-    Defect("three-at-once", "mass of body 1, inertia of body 2 and damping of body 1",
-           inputs=model_change(lambda m, _: {
+    Defect("three-at-once", inputs=model_change(lambda m, _: {
                "mass": m.mass * [1 + 1e-4, 1], "inertia": m.inertia * [[[1]], [[1 + 1e-4]]],
                "drag_moment": np.add(m.drag_moment, [1e-4, 0])})),
-    Defect("friction", "Coulomb friction of 1e-3 N m on every body", engine="exudyn",
+    Defect("friction", engine="exudyn",
            inputs=model_change(lambda m, s: {"moment": m.moment - 1e-3 * np.sign(s.omega)})),
 )  # fmt: skip
 

@@ -5,9 +5,7 @@ The parent process passes `prepare` as the initialiser of its workers, so that t
 
 from __future__ import annotations
 
-import ctypes
 import os
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -19,31 +17,9 @@ from adapters.mujoco_engine import Mujoco
 from plumbline.engines import registry
 from plumbline.model.datatypes import Array, Integrator, Model, State, Trajectory
 from plumbline.processes import worker_process
+from tests.helpers import faults
 
 SimulateCall = Callable[[], Trajectory]
-
-
-def segfault(run: SimulateCall) -> Trajectory:
-    ctypes.string_at(0)
-    return run()
-
-
-def abort(run: SimulateCall) -> Trajectory:
-    os.abort()
-
-
-def exit_process(run: SimulateCall) -> Trajectory:
-    os._exit(7)
-
-
-def hang(run: SimulateCall) -> Trajectory:
-    time.sleep(600)
-    return run()
-
-
-def hang_holding_gil(run: SimulateCall) -> Trajectory:
-    ctypes.PyDLL(None).sleep(600)
-    return run()
 
 
 def exhaust_memory(run: SimulateCall) -> Trajectory:
@@ -84,11 +60,11 @@ def flood_output(run: SimulateCall) -> Trajectory:
 
 # Per fault, the words that the reason of its row must contain; none where the cell is not lost.
 ERROR_BY_FAULT: dict[Callable[[SimulateCall], Trajectory], str] = {
-    segfault: "crashed: the worker died of SIGSEGV",
-    abort: "crashed: the worker died of SIGABRT",
-    exit_process: "crashed: the worker exited with code 7",
-    hang: "timeout: no answer within",
-    hang_holding_gil: "timeout: no answer within",
+    faults.segfault: "crashed: the worker died of SIGSEGV",
+    faults.abort: "crashed: the worker died of SIGABRT",
+    faults.exit_7: "crashed: the worker exited with code 7",
+    faults.hang: "timeout: no answer within",
+    faults.hang_in_c: "timeout: no answer within",
     exhaust_memory: "out of memory: over",
     return_nan: "r is not finite from t =",
     silent_reset: "is the initial state again (a silent reset)",

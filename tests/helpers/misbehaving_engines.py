@@ -5,8 +5,6 @@ Each kind has the words of its failure, `RED` where its numbers must be found wr
 
 from __future__ import annotations
 
-import contextlib
-import ctypes
 import gc
 import locale
 import os
@@ -28,19 +26,11 @@ from adapters.reference_engine import Reference
 from plumbline.engines import registry
 from plumbline.model.datatypes import EngineFailure, Model, State, StateQuantities, Unsupported
 from plumbline.processes import worker_process
+from tests.helpers import faults
 
 RED, HARMLESS, REFUSED = "red", "harmless", "refused"
 TIMEOUT = "timeout: no answer within"
 Answers = list[StateQuantities]
-
-
-class Unprintable(BaseException):
-    """Has no message, and cannot be pickled."""
-
-    def __str__(self) -> str:
-        raise RuntimeError
-
-    __repr__ = __reduce__ = __str__  # type: ignore[assignment]
 
 
 class ManyArguments(Exception):
@@ -57,37 +47,12 @@ def throw(error: BaseException | type[BaseException]) -> Callable[..., Any]:
     return act
 
 
-def leave(code: int) -> Callable[..., Any]:
-    return lambda *_: os._exit(code)
-
-
-def leave_by_c(*_: Any) -> None:
-    ctypes.CDLL(None).exit(0)
-
-
-def leave_by_thread(*_: Any) -> None:
-    threading.Thread(target=os._exit, args=(0,)).start()
-    time.sleep(600)
-
-
 def signal_itself(number: int) -> Callable[..., Any]:
     def act(*_: Any) -> Any:
         os.kill(os.getpid(), number)
         time.sleep(600)
 
     return act
-
-
-def end_its_group(*_: Any) -> None:
-    os.killpg(0, signal.SIGKILL)
-
-
-def hang(*_: Any) -> None:
-    time.sleep(600)
-
-
-def hang_in_c(*_: Any) -> None:
-    ctypes.PyDLL(None).sleep(600)
 
 
 def hang_deaf(*_: Any) -> None:
@@ -97,27 +62,12 @@ def hang_deaf(*_: Any) -> None:
         time.sleep(1)
 
 
-def segfault(*_: Any) -> None:
-    ctypes.string_at(0)
-
-
 def fill_memory(*_: Any) -> None:
     bytearray(2**34)
 
 
 def recurse(*arguments: Any) -> None:
     recurse(*arguments)
-
-
-def close_descriptors(*_: Any) -> None:
-    os.closerange(0, 4096)
-
-
-def write_everywhere(*_: Any) -> None:
-    for descriptor in range(3, 256):
-        with contextlib.suppress(OSError):
-            os.write(descriptor, b"garbage\n" * 100)
-    time.sleep(600)
 
 
 # -- what is done before the right answer ---------------------------------------------------------
@@ -221,31 +171,31 @@ INSTEAD: dict[str, tuple[Callable[..., Any], str]] = {
     "generator_exit": (throw(GeneratorExit), "GeneratorExit: no message"),
     "stop_iteration": (throw(StopIteration), "StopIteration: no message"),
     "base_exception": (throw(BaseException("base")), "BaseException: base"),
-    "unprintable": (throw(Unprintable), "Unprintable: no readable message"),
+    "unprintable": (throw(faults.Unprintable), "Unprintable: no readable message"),
     "many_arguments": (throw(ManyArguments(1, 2)), "ManyArguments: two arguments"),
     "exception_group": (throw(BaseExceptionGroup("g", [KeyboardInterrupt()])), "BaseExceptionGroup: g"),
     "memory_error": (throw(MemoryError), "out of memory"),
     "timeout_error": (throw(TimeoutError), "TimeoutError: no message"),
     "end_of_file": (throw(EOFError), "EOFError: no message"),
     "broken_pipe": (throw(BrokenPipeError), "BrokenPipeError: no message"),
-    "exit_0": (leave(0), "crashed: the worker exited with code 0"),
-    "exit_7": (leave(7), "crashed: the worker exited with code 7"),
-    "exit_by_c": (leave_by_c, "crashed: the worker exited with code 0"),
-    "exit_by_thread": (leave_by_thread, "crashed: the worker exited with code 0"),
-    "segfault": (segfault, "crashed: the worker died of SIGSEGV"),
-    "abort": (lambda *_: os.abort(), "crashed: the worker died of SIGABRT"),
-    "sigint": (signal_itself(signal.SIGINT), "KeyboardInterrupt: no message"),
+    "exit_0": (faults.exit_0, "crashed: the worker exited with code 0"),
+    "exit_7": (faults.exit_7, "crashed: the worker exited with code 7"),
+    "exit_by_c": (faults.exit_by_c, "crashed: the worker exited with code 0"),
+    "exit_by_thread": (faults.exit_by_thread, "crashed: the worker exited with code 0"),
+    "segfault": (faults.segfault, "crashed: the worker died of SIGSEGV"),
+    "abort": (faults.abort, "crashed: the worker died of SIGABRT"),
+    "sigint": (faults.interrupt_by_signal, "KeyboardInterrupt: no message"),
     "sigterm": (signal_itself(signal.SIGTERM), "crashed: the worker died of SIGTERM"),
     "sigkill": (signal_itself(signal.SIGKILL), "crashed: the worker died of SIGKILL"),
-    "sigstop": (signal_itself(signal.SIGSTOP), TIMEOUT),
-    "end_its_group": (end_its_group, "crashed: the worker died of SIGKILL"),
-    "hang": (hang, TIMEOUT),
-    "hang_in_c": (hang_in_c, TIMEOUT),
+    "sigstop": (faults.stop_itself, TIMEOUT),
+    "end_its_group": (faults.end_its_group, "crashed: the worker died of SIGKILL"),
+    "hang": (faults.hang, TIMEOUT),
+    "hang_in_c": (faults.hang_in_c, TIMEOUT),
     "hang_deaf": (hang_deaf, TIMEOUT),
     "fill_memory": (fill_memory, "out of memory"),
     "recurse": (recurse, "RecursionError"),
-    "close_descriptors": (close_descriptors, "crashed: the worker"),
-    "write_everywhere": (write_everywhere, "crashed: the worker did not reply"),
+    "close_descriptors": (faults.close_descriptors, "crashed: the worker"),
+    "write_everywhere": (faults.write_everywhere, "crashed: the worker did not reply"),
 }
 
 # -- wrong answers --------------------------------------------------------------------------------
@@ -325,7 +275,7 @@ DECLARED: dict[str, tuple[dict[str, Any], str]] = {
     "version_long": ({"version": lambda _: "1" * 100_000}, VERSION.format("a text of 100,000 characters")),
     "version_lines": ({"version": lambda _: "1\n2"}, VERSION.format("the text '1\\n2'")),
     "version_raises": ({"version": throw(KeyboardInterrupt)}, "KeyboardInterrupt: no message"),
-    "version_exits": ({"version": leave(0)}, "crashed: the worker exited with code 0"),
+    "version_exits": ({"version": faults.exit_0}, "crashed: the worker exited with code 0"),
     "version_odd": ({"version": lambda _: "new", "supported_versions": ">=1"}, "must be a PEP 440 version"),
     "title_none": ({"title": None}, "title is None, must be str"),
     "name_number": ({"name": 3}, "name is the int 3, must be str"),

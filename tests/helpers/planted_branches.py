@@ -86,86 +86,76 @@ def rod_rates_scaled(which: Callable[[State], Array], factor: float) -> Inputs:
 SMALL = 1 + 1e-6
 BRANCH_DEFECTS = (
     # the size of a rate
-    Defect("above-30", "gyroscopic term dropped above 30 rad/s", engine=M,
+    Defect("above-30", engine=M,
            inputs=when(lambda _, s: fastest_rate(s) > 30, added_moment(gyroscopic_moment))),
-    Defect("below-0.3", "rates × (1 + 1e-6) below 0.3 rad/s", engine=P,
-           inputs=when(lambda _, s: fastest_rate(s) < 0.3,
+    Defect("below-0.3", engine=P, inputs=when(lambda _, s: fastest_rate(s) < 0.3,
                        state_change(lambda _, s: {"omega": s.omega * SMALL}))),
-    Defect("one-body-at-rest", "g × (1 + 1e-6) where a body is at rest", engine=M,
+    Defect("one-body-at-rest", engine=M,
            inputs=when(lambda _, s: bool(np.any(np.all(s.omega == 0, axis=1))),
                        model_change(lambda m, _: {"gravity": m.gravity * SMALL}))),
-    Defect("component-at-rest", "ω′ × -1 of bodies with a zero component", engine=E,
-           inputs=state_change(lambda _, s: {
+    Defect("component-at-rest", engine=E, inputs=state_change(lambda _, s: {
                "omega": np.where(np.any(s.omega == 0, axis=1, keepdims=True), -s.omega, s.omega)})),
     # one body
-    Defect("third-inertia", "J of body 3 × (1 + 1e-6)", engine=M,
-           inputs=on_body(scaled("inertia", SMALL), 2)),
-    Defect("fourth-moment", "n′ of body 4 × 0", engine=P, inputs=on_body(scaled("moment", 0.0), 3)),
-    Defect("fifth-distal", "c of body 5 × (1 + 1e-6)", engine=E, inputs=on_body(scaled("distal", SMALL), 4)),
-    Defect("last-of-three-force", "F of the last of three and more × 0", engine=M,
+    Defect("third-inertia", engine=M, inputs=on_body(scaled("inertia", SMALL), 2)),
+    Defect("fourth-moment", engine=P, inputs=on_body(scaled("moment", 0.0), 3)),
+    Defect("fifth-distal", engine=E, inputs=on_body(scaled("distal", SMALL), 4)),
+    Defect("last-of-three-force", engine=M,
            inputs=when(at_least_bodies(3), on_last_body(scaled("force", 0.0)))),
-    Defect("last-force-in-body-frame", "F of the last body in body axes", engine=P,
+    Defect("last-force-in-body-frame", engine=P,
            inputs=on_last_body(lambda k: body_change(k, force=lambda m, s: to_world(s, m.force)))),
-    Defect("second-drag", "c_r of body 2 × 2", engine=M, inputs=on_body(scaled("drag_moment", 2.0), 1)),
-    Defect("third-drag-force", "c_t of body 3 × 0", engine=E, inputs=on_body(scaled("drag_force", 0.0), 2)),
-    Defect("third-drags-exchanged", "c_t and c_r of body 3 exchanged", engine=M,
+    Defect("second-drag", engine=M, inputs=on_body(scaled("drag_moment", 2.0), 1)),
+    Defect("third-drag-force", engine=E, inputs=on_body(scaled("drag_force", 0.0), 2)),
+    Defect("third-drags-exchanged", engine=M,
            inputs=on_body(lambda k: body_change(k, drag_force=lambda m, _: m.drag_moment,
                                           drag_moment=lambda m, _: m.drag_force), 2)),
-    Defect("load-and-drag-together", "F × (1 + 1e-6) of bodies with drag", engine=P, inputs=model_change(
+    Defect("load-and-drag-together", engine=P, inputs=model_change(
         lambda m, _: {"force": np.where(m.drag_force[:, None] > 0, m.force * SMALL, m.force)})),
-    Defect("moment-without-force", "n′ × 0 of bodies without F", engine=E, inputs=model_change(
+    Defect("moment-without-force", engine=E, inputs=model_change(
         lambda m, _: {"moment": np.where(np.any(m.force, axis=1, keepdims=True), m.moment, 0.0)})),
-    Defect("force-without-moment", "F × 0 of bodies without n′", engine=M, inputs=model_change(
+    Defect("force-without-moment", engine=M, inputs=model_change(
         lambda m, _: {"force": np.where(np.any(m.moment, axis=1, keepdims=True), m.force, 0.0)})),
-    Defect("drag-without-force", "drag × 0 of bodies without loads", engine=P, inputs=model_change(
-        lambda m, _: {"drag_moment": m.drag_moment * np.any(m.moment != 0, axis=1)})),
+    Defect("drag-without-force", engine=P,
+           inputs=model_change(lambda m, _: {"drag_moment": m.drag_moment * np.any(m.moment != 0, axis=1)})),
     # attitudes
-    Defect("negative-scalar", "ω′ × (1 + 1e-6) of bodies with a negative scalar part", engine=M,
+    Defect("negative-scalar", engine=M,
            inputs=state_change(lambda _, s: {"omega": np.where(s.p[:, :1] < 0, SMALL, 1.0) * s.omega})),
-    Defect("zero-scalar", "ω′ × -1 of bodies turned by half a turn", engine=P,
+    Defect("zero-scalar", engine=P,
            inputs=state_change(lambda _, s: {"omega": np.where(s.p[:, :1] == 0, -1.0, 1.0) * s.omega})),
-    Defect("identity-of-third", "ω′ of body 3 × 0 at its identity attitude", engine=M,
-           inputs=when(lambda m, s: m.n > 2 and at_identity(2)(m, s),
+    Defect("identity-of-third", engine=M, inputs=when(lambda m, s: m.n > 2 and at_identity(2)(m, s),
                        body_state_change(2, omega=lambda _, s: 0 * s.omega))),
-    Defect("identity-moment", "n′ of body 1 in world axes at the identity attitude of body 2", engine=E,
-           inputs=when(lambda m, s: m.n > 1 and at_identity(1)(m, s),
+    Defect("identity-moment", engine=E, inputs=when(lambda m, s: m.n > 1 and at_identity(1)(m, s),
                        body_change(0, moment=lambda m, s: to_body(s, m.moment)))),
-    Defect("same-attitude", "J × (1 + 1e-6) where neighbours have one attitude", engine=P,
+    Defect("same-attitude", engine=P,
            inputs=when(lambda m, s: m.n > 1 and bool(np.any(np.all(s.p[1:] == s.p[:-1], axis=1))),
                        model_change(lambda m, _: {"inertia": m.inertia * SMALL}))),
     # numbers of the model
-    Defect("equal-masses", "m of body 2 × (1 + 1e-6) where it equals that of body 1", engine=M,
-           inputs=when(lambda m, _: m.n > 1 and m.mass[0] == m.mass[1],
+    Defect("equal-masses", engine=M, inputs=when(lambda m, _: m.n > 1 and m.mass[0] == m.mass[1],
                        number_change("mass", 1, times=SMALL))),
-    Defect("mass-ratio-300", "m of body 1 × (1 + 1e-4) where neighbours differ by 300", engine=P,
+    Defect("mass-ratio-300", engine=P,
            inputs=when(lambda m, _: mass_ratio(m) > 300, number_change("mass", 0, times=1 + 1e-4))),
-    Defect("light-body", "J × (1 + 1e-6) of bodies below 20 g", engine=E, inputs=model_change(
+    Defect("light-body", engine=E, inputs=model_change(
         lambda m, _: {"inertia": m.inertia * np.where(m.mass < 0.02, SMALL, 1.0)[:, None, None]})),
-    Defect("heavy-body", "m × (1 + 1e-6) of bodies above 100 kg", engine=M, inputs=model_change(
-        lambda m, _: {"mass": m.mass * np.where(m.mass > 100, SMALL, 1.0)})),
-    Defect("symmetric-inertia", "J × (1 + 1e-6) of bodies of revolution", engine=P, inputs=model_change(
+    Defect("heavy-body", engine=M,
+           inputs=model_change(lambda m, _: {"mass": m.mass * np.where(m.mass > 100, SMALL, 1.0)})),
+    Defect("symmetric-inertia", engine=P, inputs=model_change(
         lambda m, _: {"inertia": m.inertia * np.where(is_axisymmetric(m), SMALL, 1.0)[:, None, None]})),
-    Defect("full-inertia-last", "products of inertia of the last body × (1 + 1e-5)", engine=M,
-           inputs=on_last_body(lambda k: body_change(
+    Defect("full-inertia-last", engine=M, inputs=on_last_body(lambda k: body_change(
                k, inertia=lambda m, _: m.inertia * (1 + 1e-5 * (1 - np.eye(3)))))),
-    Defect("sideways-gravity", "g × (1 + 1e-6) where it has horizontal parts", engine=E,
-           inputs=when(lambda m, _: bool(np.any(m.gravity[:2])),
+    Defect("sideways-gravity", engine=E, inputs=when(lambda m, _: bool(np.any(m.gravity[:2])),
                        model_change(lambda m, _: {"gravity": m.gravity * SMALL}))),
-    Defect("zero-offset", "the proximal offset's zero component 1e-7 m", engine=P, inputs=model_change(
-        lambda m, _: {"proximal": np.where(m.proximal == 0, 1e-7, m.proximal)})),
+    Defect("zero-offset", engine=P,
+           inputs=model_change(lambda m, _: {"proximal": np.where(m.proximal == 0, 1e-7, m.proximal)})),
     # rods
-    Defect("rod-along-axis", "u̇ × -1 of rods along a coordinate axis", engine=M,
+    Defect("rod-along-axis", engine=M,
            inputs=rod_rates_scaled(lambda s: np.max(np.abs(s.u), axis=1) == 1, -1.0)),
-    Defect("rod-straight-down", "u̇ × 0 of rods straight down", engine=P,
-           inputs=rod_rates_scaled(lambda s: s.u[:, 2] == -1, 0.0)),
-    Defect("long-rod", "ℓ × (1 + 1e-6) above 1.5 m", engine=E, inputs=model_change(
-        lambda m, _: {"length": m.length * np.where(m.length > 1.5, SMALL, 1.0)})),
-    Defect("rod-after-ball-after-rod", "ℓ of the third × (1 + 1e-6) where kinds alternate", engine=M,
+    Defect("rod-straight-down", engine=P, inputs=rod_rates_scaled(lambda s: s.u[:, 2] == -1, 0.0)),
+    Defect("long-rod", engine=E,
+           inputs=model_change(lambda m, _: {"length": m.length * np.where(m.length > 1.5, SMALL, 1.0)})),
+    Defect("rod-after-ball-after-rod", engine=M,
            inputs=when(lambda m, _: m.n > 2 and bool(m.rods[0] and not m.rods[1] and m.rods[2]),
                        lambda m, s: number_change("length", 2, times=SMALL)(m, s))),
-    Defect("rod-last-drag", "c_t × 2 of the last body on a rod", engine=P,
-           inputs=when(lambda m, _: m.n > 1 and bool(m.rods[-1]),
-                       on_last_body(scaled("drag_force", 2.0)))),
+    Defect("rod-last-drag", engine=P,
+           inputs=when(lambda m, _: m.n > 1 and bool(m.rods[-1]), on_last_body(scaled("drag_force", 2.0)))),
 )  # fmt: skip
 
 
@@ -208,30 +198,26 @@ def step_scaled(factor: float, right: Step) -> Step:
 
 
 BRANCH_STEPS = (
-    step_defect("not-power-of-two", "h × (1 + 1e-7) unless h is a power of two", M, "Euler",
-               wrong_when(lambda _, q, v, h: not is_power_of_two(h),
-                               step_scaled(1 + 1e-7, euler), euler)),
-    step_defect("not-power-of-two-rk4", "h × (1 + 1e-7) unless h is a power of two", P, "rkmk4",
-               wrong_when(lambda _, q, v, h: not is_power_of_two(h), step_scaled(1 + 1e-7, rk4), rk4)),
-    step_defect("long-steps", "explicit Euler above h = 0.02", M, "Euler",
-               wrong_when(lambda _, q, v, h: h > 0.02, stale_velocity, euler)),
-    step_defect("fast-joint", "explicit Euler above 15 rad/s", P, "semi-implicit-euler",
-               wrong_when(lambda _, q, v, h: np.max(np.abs(v)) > 15, stale_velocity, euler)),
-    step_defect("slow-joint", "exchanged halves below 0.5 rad/s", M, "Euler",
-               wrong_when(lambda _, q, v, h: np.max(np.abs(v)) < 0.5, exchanged_halves, euler)),
-    step_defect("large-turn", "p + h ṗ where a joint turns by more than 0.1 rad", M, "Euler",
-               wrong_when(lambda _, q, v, h: h * np.max(np.abs(v)) > 0.1,
-                               first_order_quaternion, euler)),
-    step_defect("negative-scalars", "explicit Euler where all joints' scalar parts are negative", P,
-               "semi-implicit-euler",
-               wrong_when(lambda s, q, v, h: bool(np.all(joint_scalar_parts(s, q) < 0)),
+    step_defect("not-power-of-two", M, "Euler",
+                wrong_when(lambda _, q, v, h: not is_power_of_two(h), step_scaled(1 + 1e-7, euler), euler)),
+    step_defect("not-power-of-two-rk4", P, "rkmk4",
+                wrong_when(lambda _, q, v, h: not is_power_of_two(h), step_scaled(1 + 1e-7, rk4), rk4)),
+    step_defect("long-steps", M, "Euler", wrong_when(lambda _, q, v, h: h > 0.02, stale_velocity, euler)),
+    step_defect("fast-joint", P, "semi-implicit-euler",
+                wrong_when(lambda _, q, v, h: np.max(np.abs(v)) > 15, stale_velocity, euler)),
+    step_defect("slow-joint", M, "Euler",
+                wrong_when(lambda _, q, v, h: np.max(np.abs(v)) < 0.5, exchanged_halves, euler)),
+    step_defect("large-turn", M, "Euler",
+                wrong_when(lambda _, q, v, h: h * np.max(np.abs(v)) > 0.1, first_order_quaternion, euler)),
+    step_defect("negative-scalars", P, "semi-implicit-euler",
+                wrong_when(lambda s, q, v, h: bool(np.all(joint_scalar_parts(s, q) < 0)),
                           stale_velocity, euler)),
-    step_defect("identity-joint", "exchanged halves where a joint is at the identity", M, "Euler",
-               wrong_when(lambda s, q, v, h: bool(np.any(np.abs(joint_scalar_parts(s, q)) == 1)),
+    step_defect("identity-joint", M, "Euler",
+                wrong_when(lambda s, q, v, h: bool(np.any(np.abs(joint_scalar_parts(s, q)) == 1)),
                           exchanged_halves, euler)),
-    step_defect("three-joints", "explicit Euler with three joints and more", M, "Euler",
-               wrong_when(lambda _, q, v, h: len(v) >= 9, stale_velocity, euler)),
-    step_defect("rk4-one-body", "θ̇ = v with one joint", M, "RK4",
-               wrong_when(lambda _, q, v, h: len(v) == 3, lambda s, q, v, h: runge_kutta(
+    step_defect("three-joints", M, "Euler",
+                wrong_when(lambda _, q, v, h: len(v) >= 9, stale_velocity, euler)),
+    step_defect("rk4-one-body", M, "RK4",
+                wrong_when(lambda _, q, v, h: len(v) == 3, lambda s, q, v, h: runge_kutta(
                    s, q, v, h, CLASSICAL, WEIGHTS, terms=0), rk4)),
 )  # fmt: skip

@@ -187,11 +187,9 @@ RK4S = ((M, "RK4"), (P, "rkmk4"))
 # -- planting ------------------------------------------------------------------------------------
 
 
-def step_defect(
-    name: str, description: str, engine: str, integrator: str, step: Step, *expected: str
-) -> Defect:
+def step_defect(name: str, engine: str, integrator: str, step: Step, expected: str = "") -> Defect:
     """A step that replaces the engine's own, on its accelerations and rotations."""
-    defect = partial(Defect, name, description, expected, engine, integrator=integrator)
+    defect = partial(Defect, name, expected, engine, integrator=integrator)
     if engine == M:
         return defect(run=_mujoco_run(step))
     steps = pinocchio_engine.FIXED_STEPS | {integrator: _pinocchio_step(step)}
@@ -199,7 +197,7 @@ def step_defect(
 
 
 def exudyn_defect(
-    name: str, description: str, integrator: str, *expected: str, solver_type: str = "",
+    name: str, integrator: str, expected: str = "", solver_type: str = "",
     mechanism: str = "balls", quadrature: Quadrature = "", **settings: Any,
 ) -> Defect:  # fmt: skip
     """Other attributes of Exudyn's generalizedAlpha, another explicit solver, or samples requadrated."""
@@ -219,7 +217,7 @@ def exudyn_defect(
 
     engine, module = (T, "exudyn_tree_engine") if solver_type else (E, "exudyn_engine")
     patch = replaced_by(f"adapters.{module}:run_solver", make)
-    return Defect(name, description, expected, engine, mechanism, integrator=integrator, patch=patch)
+    return Defect(name, expected, engine, mechanism, integrator=integrator, patch=patch)
 
 
 def _mujoco_run(step: Step) -> Callable[..., Trajectory]:
@@ -276,99 +274,79 @@ def _requadrated(how: str, samples: list[Any], h: float) -> list[Any]:
 
 STEP_DEFECTS = (
     *(
-        step_defect(f"{name}-{engine}-{integrator}", size, engine, integrator, step, words)
+        step_defect(f"{name}-{engine}-{integrator}", engine, integrator, step, words)
         for engine, integrator in EULERS if integrator != "implicit"
-        for name, size, step, words in (
-            ("exchanged-halves", "position first, then velocity", exchanged_halves,
-             "exchanged the halves of semi-implicit Euler"),
-            ("stale-velocity", "positions by the old velocity", stale_velocity,
-             "explicit Euler's step"),
-            ("mean-velocity", "positions by the mean velocity", mean_velocity,
-             "the mean of the old and the new velocity"),
-            ("first-order-quaternion", "p + h ṗ normalised", first_order_quaternion,
-             "quaternions by p + h ṗ"),
-            ("two-half-steps", "two steps of h/2", two_half_steps,
-             "2 steps of 1/2 of the size"),
-            ("last-joint-stale", "stale velocity of the last joint only", last_body_stale,
-             "the joint of body 2 by the old velocity"),
-            ("verlet", "velocity Verlet", velocity_verlet,
-             "velocity Verlet's step"),
+        for name, step, words in (
+            ("exchanged-halves", exchanged_halves, "exchanged the halves of semi-implicit Euler"),
+            ("stale-velocity", stale_velocity, "explicit Euler's step"),
+            ("mean-velocity", mean_velocity, "the mean of the old and the new velocity"),
+            ("first-order-quaternion", first_order_quaternion, "quaternions by p + h ṗ"),
+            ("two-half-steps", two_half_steps, "2 steps of 1/2 of the size"),
+            ("last-joint-stale", last_body_stale, "the joint of body 2 by the old velocity"),
+            ("verlet", velocity_verlet, "velocity Verlet's step"),
         )
     ),
     *(
-        step_defect(f"{name}-{engine}", size, engine, integrator, step, words)
+        step_defect(f"{name}-{engine}", engine, integrator, step, words)
         for engine, integrator in RK4S
-        for name, size, step, words in (
-            ("no-dexp", "θ̇ = v: order 2", no_correction,
-             "left dexp⁻¹ out"),
-            ("one-dexp-term", "θ̇ = v + θ×v/2", one_term,
-             "cut dexp⁻¹ after θ×v/2"),
-            ("third-stage-by-first", "k₃ from k₁", third_by_first,
-             "third stage by the first slope"),
-            ("reused-acceleration", "k₁ is k₄ of the step before", reused_acceleration,
+        for name, step, words in (
+            ("no-dexp", no_correction, "left dexp⁻¹ out"),
+            ("one-dexp-term", one_term, "cut dexp⁻¹ after θ×v/2"),
+            ("third-stage-by-first", third_by_first, "third stage by the first slope"),
+            ("reused-acceleration", reused_acceleration,
              "its declared step, with the last acceleration of the step before"),
-            ("three-eighths-rule", "Kutta's 3/8 rule: order 4 too", three_eighths,
-             "3/8 rule"),
-            ("weights-2.001-1.999", "weights 1, 2.001, 1.999, 1", wrong_weights,
-             "weight of stage 2 were larger by 0.000166"),
+            ("three-eighths-rule", three_eighths, "3/8 rule"),
+            ("weights-2.001-1.999", wrong_weights, "weight of stage 2 were larger by 0.000166"),
         )
     ),
     *(
-        Defect(name, size, (words,), engine, mechanism, loaded, integrator, run=run)
-        for name, size, engine, mechanism, loaded, integrator, run, words in (
-            ("implicit-is-euler", "no damping in the matrix", M, "balls", False, "implicit",
+        Defect(name, words, engine, mechanism, loaded, integrator, run=run)
+        for name, engine, mechanism, loaded, integrator, run, words in (
+            ("implicit-is-euler", M, "balls", False, "implicit",
              run_as("Euler"), "semi-implicit Euler's step, with all forces explicit"),
-            ("implicit-is-implicitfast", "D without Coriolis terms", M, "rods", True, "implicit",
+            ("implicit-is-implicitfast", M, "rods", True, "implicit",
              run_as("implicitfast"), "with the drag implicit"),
-            ("drag-explicit", "drag by the old velocity", M, "balls", True, "implicitfast",
+            ("drag-explicit", M, "balls", True, "implicitfast",
              run_as("Euler"), "with all forces explicit"),
-            ("drag-implicit", "drag by the new velocity", M, "balls", True, "Euler",
+            ("drag-implicit", M, "balls", True, "Euler",
              run_as("implicitfast"), "with the drag implicit"),
-            ("euler-is-rk4", "a better method than declared", M, "balls", False, "Euler",
+            ("euler-is-rk4", M, "balls", False, "Euler",
              run_as("RK4"), "the classical Runge–Kutta method"),
-            ("long-step-mujoco", "h (1 + 1e-9)", M, "balls", False, "RK4",
+            ("long-step-mujoco", M, "balls", False, "RK4",
              run_with_clock(1 + 1e-9), "a step 1.000000001 times as long"),
-            ("long-step-tree", "h (1 + 1e-9)", T, "balls", False, "RK44",
+            ("long-step-tree", T, "balls", False, "RK44",
              run_with_clock(1 + 1e-9), "a step 1.000000001 times as long"),
         )
     ),
-    step_defect("damping-halved", "D/2", M, "implicit", halved_damping,
+    step_defect("damping-halved", M, "implicit", halved_damping,
                 "derivatives of forces in the matrix were 0.5 times as large"),
-    step_defect("damping-symmetric", "(D + Dᵀ)/2", M, "implicit", symmetric_damping,
-                "symmetrised the derivatives"),
-    step_defect("implicit-stale", "positions by the old velocity", M, "implicit", implicit_stale,
-                "positions by the old velocity"),
-    exudyn_defect("tree-rk33", "Heun's order 3", "RK44", "Heun's method of order 3", solver_type="RK33"),
-    exudyn_defect("tree-rk67", "order 6 in place of order 4", "RK44", "Butcher's method of order 6",
-                  solver_type="RK67"),
-    exudyn_defect("tree-verlet", "velocity Verlet", "RK44",
+    step_defect("damping-symmetric", M, "implicit", symmetric_damping, "symmetrised the derivatives"),
+    step_defect("implicit-stale", M, "implicit", implicit_stale, "positions by the old velocity"),
+    exudyn_defect("tree-rk33", "RK44", "Heun's method of order 3", solver_type="RK33"),
+    exudyn_defect("tree-rk67", "RK44", "Butcher's method of order 6", solver_type="RK67"),
+    exudyn_defect("tree-verlet", "RK44",
                   "velocity Verlet's step, with the last acceleration of the step before",
                   solver_type="VelocityVerlet"),
     *(
-        exudyn_defect(f"spectral-radius-{radius:.10g}", f"ρ = {radius:.10g}", "generalized-alpha",
+        exudyn_defect(f"spectral-radius-{radius:.10g}", "generalized-alpha",
                       f"spectral radius {radius:.10g}", spectralRadius=radius)
         for radius in (0.8, 0.89, 0.900001)
     ),
-    exudyn_defect("newmark-for-alpha", "Newmark, index 3", "generalized-alpha", "the trapezoidal rule",
-                  useNewmark=True),
-    exudyn_defect("newmark-on-velocities", "Newmark, index 2", "generalized-alpha",
-                  "constraints on velocities", useNewmark=True, useIndex2Constraints=True),
-    exudyn_defect("alpha-acceleration", "a = q̈ in place of the averaged a", "generalized-alpha", "a were q̈",
-                  quadrature="a is the acceleration"),
-    exudyn_defect("alpha-m-sign", "−αm in place of αm", "generalized-alpha", "αm had the opposite sign",
+    exudyn_defect("newmark-for-alpha", "generalized-alpha", "the trapezoidal rule", useNewmark=True),
+    exudyn_defect("newmark-on-velocities", "generalized-alpha", "constraints on velocities", useNewmark=True,
+                  useIndex2Constraints=True),
+    exudyn_defect("alpha-acceleration", "generalized-alpha", "a were q̈", quadrature="a is the acceleration"),
+    exudyn_defect("alpha-m-sign", "generalized-alpha", "αm had the opposite sign",
                   quadrature="sign of alpha_m"),
-    exudyn_defect("trapezoidal-beta", "β = 1/6", "trapezoidal", "β were 0.1666", newmarkBeta=1 / 6),
-    exudyn_defect("trapezoidal-gamma", "γ = ½ + 1e-6", "trapezoidal", "γ were 0.500001",
-                  newmarkGamma=0.5 + 1e-6),
-    exudyn_defect("trapezoidal-index-3", "constraints on positions", "trapezoidal",
-                  "constraints on positions", mechanism="rods", useIndex2Constraints=False),
-    exudyn_defect("trapezoidal-is-alpha", "generalised-α 0.9", "trapezoidal",
-                  "spectral radius 0.9 with constraints on positions",
+    exudyn_defect("trapezoidal-beta", "trapezoidal", "β were 0.1666", newmarkBeta=1 / 6),
+    exudyn_defect("trapezoidal-gamma", "trapezoidal", "γ were 0.500001", newmarkGamma=0.5 + 1e-6),
+    exudyn_defect("trapezoidal-index-3", "trapezoidal", "constraints on positions", mechanism="rods",
+                  useIndex2Constraints=False),
+    exudyn_defect("trapezoidal-is-alpha", "trapezoidal", "spectral radius 0.9 with constraints on positions",
                   useNewmark=False, useIndex2Constraints=False, spectralRadius=0.9),
-    exudyn_defect("rates-by-euler", "q̇₁ = q̇₀ + h q̈₁", "trapezoidal", "γ were 1 ",
-                  quadrature="rates by Euler"),
-    exudyn_defect("first-accelerations-zero", "q̈₀ = 0", "trapezoidal", "first accelerations were 0",
-                  mechanism="rods", computeInitialAccelerations=False),
-    exudyn_defect("first-accelerations-zero-alpha", "q̈₀ = 0", "generalized-alpha",
-                  "first accelerations were 0", computeInitialAccelerations=False),
+    exudyn_defect("rates-by-euler", "trapezoidal", "γ were 1 ", quadrature="rates by Euler"),
+    exudyn_defect("first-accelerations-zero", "trapezoidal", "first accelerations were 0", mechanism="rods",
+                  computeInitialAccelerations=False),
+    exudyn_defect("first-accelerations-zero-alpha", "generalized-alpha", "first accelerations were 0",
+                  computeInitialAccelerations=False),
 )  # fmt: skip

@@ -84,10 +84,7 @@ def test_two_steps_below_one_that_is_too_coarse_cannot_disagree():
     assert "1.1 J within 100 s, which does not decide" in energy.reason
 
 
-SMALL_DRAG_DEFECT = Defect(
-    "damping-1e-7", "drag of 1e-7 N m s on every body",
-    inputs=number_change("drag_moment", ..., by=1e-7),
-)  # fmt: skip
+SMALL_DRAG_DEFECT = Defect("damping-1e-7", inputs=number_change("drag_moment", ..., by=1e-7))  # fmt: skip
 
 
 def restart_halfway(count):
@@ -103,8 +100,8 @@ OPENING_JOINTS = sample_change(lambda run: {"r": run.r + 1e-9 * run.t[:, None, N
     ("defect", "verdict", "quantities"),
     [
         (SMALL_DRAG_DEFECT, "disagrees", {"energy_drift_long"}),
-        (Defect("creep", "", run=OPENING_JOINTS), "disagrees", {"joint_gap_long"}),
-        (Defect("reset", "", run=rows_reordered(restart_halfway)), "failed", {"all_long"}),
+        (Defect("creep", run=OPENING_JOINTS), "disagrees", {"joint_gap_long"}),
+        (Defect("reset", run=rows_reordered(restart_halfway)), "failed", {"all_long"}),
         (DEFECTS["norm-1e-9"], "disagrees", {"norm_drift_long"}),
     ],
     ids=lambda x: x.name if isinstance(x, Defect) else None,

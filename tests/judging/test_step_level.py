@@ -151,10 +151,10 @@ def test_the_planting_itself_is_honest():
 
     right = partial(steps.runge_kutta, a=steps.CLASSICAL, b=steps.WEIGHTS)
     honest = [
-        replace(step_defect("rk4", "", engine, name, right), mechanism=joints)
+        replace(step_defect("rk4", engine, name, right), mechanism=joints)
         for engine, name in steps.RK4S for joints in ("balls", "rods")
     ]  # fmt: skip
-    honest += [replace(step_defect("implicit", "", "mujoco", "implicit", steps.implicit), loaded=True)]
+    honest += [replace(step_defect("implicit", "mujoco", "implicit", steps.implicit), loaded=True)]
     honest += [Defect("as-declared", engine="exudyn", integrator=i.name) for i in methods("exudyn")]
     for defect in honest:
         rows = defect_report(defect)
@@ -446,8 +446,8 @@ def loop_defects():
         )  # fmt: skip
         if is_seen or (is_step and not one.name.startswith(("first-order-quaternion", "last-joint"))):
             yield one
-    yield step_defect("explicit-for-rk4", "", "pinocchio", "rkmk4", stale_velocity)
-    yield step_defect("verlet-for-rk4", "", "pinocchio", "rkmk4", velocity_verlet)
+    yield step_defect("explicit-for-rk4", "pinocchio", "rkmk4", stale_velocity)
+    yield step_defect("verlet-for-rk4", "pinocchio", "rkmk4", velocity_verlet)
 
 
 @pytest.mark.usefixtures("shared_steps")

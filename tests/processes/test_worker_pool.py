@@ -1,14 +1,12 @@
 """Worker processes: every way to lose one costs one task and is reported."""
 
-import contextlib
-import ctypes
 import json
 import os
 import signal
 import subprocess
 import sys
 import tempfile
-import threading
+import textwrap
 import time
 from pathlib import Path
 
@@ -17,51 +15,30 @@ import pytest
 
 from plumbline.processes.isolation import remove_orphaned_folders
 from plumbline.processes.worker_pool import Limits, Outcome, ResultCache, Scheduler, Task, WorkerPool
+from tests.helpers import faults
 from tests.helpers.immediate_executor import Immediate
 
 ROOT = Path(__file__).resolve().parents[2]
+
+
+def parent_script(folder, body):
+    """A program with the names of this file, whose main part is ``body``."""
+    script = folder / "parent.py"
+    script.write_text(
+        "import json, signal, sys\n"
+        f"sys.path[:0] = {[str(ROOT), str(Path(__file__).parent)]!r}\n"
+        "from test_worker_pool import *\n"
+        "if __name__ == '__main__':\n" + textwrap.indent(textwrap.dedent(body), "    ")
+    )
+    return script
 
 
 def double(x):
     return 2 * x
 
 
-def segfault():
-    ctypes.string_at(0)
-
-
-def abort():
-    os.abort()
-
-
-def hang():
-    time.sleep(600)
-
-
-def hang_holding_gil():
-    """Native code that never returns and never releases the interpreter lock."""
-    ctypes.PyDLL(None).sleep(600)
-
-
 def exhaust_memory():
     return len(bytearray(64 * 2**30))
-
-
-def exit_process():
-    os._exit(7)
-
-
-def exit_quietly():
-    os._exit(0)
-
-
-def exit_from_c():
-    ctypes.CDLL(None).exit(0)
-
-
-def exit_from_a_thread():
-    threading.Thread(target=os._exit, args=(0,)).start()
-    time.sleep(600)
 
 
 def exit_beside_a_child():
@@ -75,26 +52,12 @@ def interrupt():
     raise KeyboardInterrupt
 
 
-def interrupt_by_signal():
-    os.kill(os.getpid(), signal.SIGINT)
-    time.sleep(600)
-
-
 def leave():
     sys.exit(0)
 
 
-class Unprintable(BaseException):
-    """Has neither a message nor a representation, and cannot be pickled."""
-
-    def __str__(self):
-        raise RuntimeError
-
-    __repr__ = __reduce__ = __str__
-
-
 def raise_unprintable():
-    raise Unprintable
+    raise faults.Unprintable
 
 
 def raise_long_text():
@@ -110,25 +73,6 @@ class Unloadable:
 
     def __reduce__(self):
         return int, ("x",)
-
-
-def write_into_every_descriptor():
-    for descriptor in range(3, 4096):  # whichever it is that the answer goes through
-        with contextlib.suppress(OSError):
-            os.write(descriptor, b"noise")
-    time.sleep(600)
-
-
-def close_every_descriptor():
-    os.closerange(0, 4096)
-
-
-def stop_itself():
-    os.kill(os.getpid(), signal.SIGSTOP)
-
-
-def end_process_group():
-    os.killpg(0, signal.SIGTERM)
 
 
 def come_back_twice():
@@ -149,51 +93,45 @@ def process_id():
 
 
 LOSSES = [
-    (segfault, "crashed: the worker died of SIGSEGV"),
-    (abort, "crashed: the worker died of SIGABRT"),
-    (exit_process, "crashed: the worker exited with code 7"),
+    (faults.segfault, "crashed: the worker died of SIGSEGV"),
+    (faults.abort, "crashed: the worker died of SIGABRT"),
+    (faults.exit_7, "crashed: the worker exited with code 7"),
     (exhaust_memory, "out of memory"),
-    (hang, "timeout: no answer within"),
-    (hang_holding_gil, "timeout: no answer within"),
-    (stop_itself, "timeout: no answer within"),
+    (faults.hang, "timeout: no answer within"),
+    (faults.hang_in_c, "timeout: no answer within"),
+    (faults.stop_itself, "timeout: no answer within"),
 ]
 
 
 # Each is noticed at once: a time limit that no test waits for.
 FAULTS = [
-    (exit_quietly, "crashed: the worker exited with code 0"),
-    (exit_from_c, "crashed: the worker exited with code 0"),
-    (exit_from_a_thread, "crashed: the worker exited with code 0"),
+    (faults.exit_0, "crashed: the worker exited with code 0"),
+    (faults.exit_by_c, "crashed: the worker exited with code 0"),
+    (faults.exit_by_thread, "crashed: the worker exited with code 0"),
     (exit_beside_a_child, "crashed: the worker exited with code 0"),
     (interrupt, "KeyboardInterrupt: no message"),
-    (interrupt_by_signal, "KeyboardInterrupt: no message"),
+    (faults.interrupt_by_signal, "KeyboardInterrupt: no message"),
     (leave, "SystemExit: 0"),
     (raise_unprintable, "Unprintable: no readable message"),
     (raise_long_text, "word  … (cut: 1,000,004 characters)"),
     (return_what_cannot_be_pickled, "Can't pickle local object"),
-    (write_into_every_descriptor, "crashed: the worker did not reply, but"),
-    (close_every_descriptor, "crashed: the worker"),
-    (end_process_group, "crashed: the worker died of SIGTERM"),
+    (faults.write_everywhere, "crashed: the worker did not reply, but"),
+    (faults.close_descriptors, "crashed: the worker"),
+    (faults.end_its_group, "crashed: the worker died of SIGKILL"),
 ]
 
 
 def test_faults_are_reported_at_once_and_change_no_other_task(tmp_path):
     """Also where the command ignores SIGINT, as a job in the background does: no worker inherits that."""
-    script = tmp_path / "parent.py"
-    script.write_text(
-        "import json, signal, sys\n"
-        f"sys.path[:0] = {[str(ROOT), str(Path(__file__).parent)]!r}\n"
-        "from test_worker_pool import FAULTS, double\n"
-        "from plumbline.processes.worker_pool import Limits, Task, WorkerPool\n"
-        "if __name__ == '__main__':\n"
-        "    signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
-        "    limits = Limits(seconds=100, gigabytes=4)\n"
-        "    tasks = [Task(fault.__name__, fault, (), limits, engine='faulty') for fault, _ in FAULTS]\n"
-        "    tasks += [Task(str(i), double, (i,), limits) for i in range(len(FAULTS))]\n"
-        "    with WorkerPool(2, limits) as workers:\n"
-        "        outcomes = {o.key: (o.failure, o.value) for o in workers.run(tasks)}\n"
-        "    json.dump(outcomes, open(sys.argv[1], 'w'))\n"
-    )
+    script = parent_script(tmp_path, """
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        limits = Limits(seconds=100, gigabytes=4)
+        tasks = [Task(fault.__name__, fault, (), limits, engine='faulty') for fault, _ in FAULTS]
+        tasks += [Task(str(i), double, (i,), limits) for i in range(len(FAULTS))]
+        with WorkerPool(2, limits) as workers:
+            outcomes = {o.key: (o.failure, o.value) for o in workers.run(tasks)}
+        json.dump(outcomes, open(sys.argv[1], 'w'))
+    """)  # fmt: skip
     found = tmp_path / "outcomes.json"
     subprocess.run([sys.executable, script, found], check=True, timeout=200)
     outcomes = json.loads(found.read_text())
@@ -210,10 +148,6 @@ def test_an_engine_that_forks_answers_once():
     assert found == {0: "twice", 1: 6}
 
 
-def abort_on(_):
-    os.abort()
-
-
 def raise_on(_):
     raise ValueError("the judge's")
 
@@ -223,7 +157,7 @@ def test_answers_that_cannot_be_loaded_are_the_engine_s_fault_and_judges_their_o
         tasks = [
             Task("unloadable", Unloadable, judge=double, engine="e"),
             Task("judge", double, (1,), judge=raise_on, engine="e"),
-            Task("judge dies", double, (1,), judge=abort_on, engine="e"),
+            Task("judge dies", double, (1,), judge=faults.abort, engine="e"),
         ]
         found = {outcome.key: outcome for outcome in workers.run(tasks)}
     assert "the answer cannot be read: ValueError" in found["unloadable"].failure
@@ -262,8 +196,8 @@ def test_an_engine_changes_neither_others_nor_judges():
 
 
 def leave_processes():
-    """A child, a child in a session of its own, a grandchild whose parent has ended."""
-    started = []
+    """This one, a child, a child in a session of its own, a grandchild whose parent has ended, a program."""
+    started = [os.getpid()]
     for make in (lambda: None, os.setsid):
         child = os.fork()
         if not child:
@@ -311,42 +245,30 @@ linux_only = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="su
 @linux_only
 def test_processes_that_an_engine_starts_end_with_the_pool(tmp_path):
     """In a process of its own: another test may have ended the warm process, which adopts what is left."""
-    script = tmp_path / "parent.py"
-    script.write_text(
-        "import sys\n"
-        f"sys.path[:0] = {[str(ROOT), str(Path(__file__).parent)]!r}\n"
-        "from test_worker_pool import leave_processes, leave_processes_and_hang, wait_until_ended\n"
-        "from plumbline.processes.worker_pool import Limits, Task, WorkerPool\n"
-        "if __name__ == '__main__':\n"
-        "    limits, path = Limits(seconds=4), sys.argv[1]\n"
-        "    hangs = Task('hangs', leave_processes_and_hang, (path,), limits, engine='e')\n"
-        "    with WorkerPool(1, limits) as workers:\n"
-        "        answered, lost = workers.run([Task('answers', leave_processes, engine='e'), hangs])\n"
-        "    started = [*answered.value, *map(int, open(path).read().split())]\n"
-        "    print(len(started), wait_until_ended(started), 'timeout' in lost.failure)\n"
-    )
+    script = parent_script(tmp_path, """
+        limits, path = Limits(seconds=4), sys.argv[1]
+        hangs = Task('hangs', leave_processes_and_hang, (path,), limits, engine='e')
+        with WorkerPool(1, limits) as workers:
+            answered, lost = workers.run([Task('answers', leave_processes, engine='e'), hangs])
+        started = [*answered.value, *map(int, open(path).read().split())]
+        print(len(started), wait_until_ended(started), 'timeout' in lost.failure)
+    """)  # fmt: skip
     done = subprocess.run(
         [sys.executable, script, tmp_path / "started"], capture_output=True, text=True, check=False
     )
-    assert done.stdout.split() == ["8", "True", "True"], done.stdout + done.stderr
+    assert done.stdout.split() == ["10", "True", "True"], done.stdout + done.stderr
 
 
 @linux_only
 def test_processes_that_an_engine_starts_end_with_a_killed_run(tmp_path):
-    script = tmp_path / "parent.py"
-    script.write_text(
-        "import sys\n"
-        f"sys.path[:0] = {[str(ROOT), str(Path(__file__).parent)]!r}\n"
-        "from test_worker_pool import hang, leave_processes\n"
-        "from plumbline.processes.worker_pool import Task, WorkerPool\n"
-        "if __name__ == '__main__':\n"
-        "    with WorkerPool(1) as workers:\n"
-        "        for outcome in workers.run([Task(0, leave_processes), Task(1, hang)]):\n"
-        "            print(*outcome.value, flush=True)\n"
-    )
+    script = parent_script(tmp_path, """
+        with WorkerPool(1) as workers:
+            for outcome in workers.run([Task(0, leave_processes), Task(1, faults.hang)]):
+                print(*outcome.value, flush=True)
+    """)  # fmt: skip
     parent = subprocess.Popen([sys.executable, script], stdout=subprocess.PIPE, text=True)
     started = [int(word) for word in parent.stdout.readline().split()]
-    assert len(started) == 4 and all(map(is_alive, started))
+    assert len(started) == 5 and all(map(is_alive, started))
     parent.send_signal(signal.SIGKILL)
     parent.wait()
     assert wait_until_ended(started)
@@ -431,7 +353,7 @@ def test_a_clock_that_is_set_neither_kills_nor_spares(monkeypatch):
         for step in (3600.0, -3600.0):
             tasks = [
                 Task("nap", sleep_for, (3.0,), Limits(seconds=60)),
-                Task("hang", hang, (), Limits(seconds=4)),
+                Task("hang", faults.hang, (), Limits(seconds=4)),
                 Task("go", sleep_for, (1.0,)),
             ]
             found = {}
@@ -470,47 +392,17 @@ def test_what_a_killed_run_leaves_is_removed_by_the_next(tmp_path, monkeypatch):
     assert not mine.exists() and remove_orphaned_folders("plumbline-") == [alive]
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the parent-death signal is Linux's")
-def test_no_orphan_is_left_when_the_parent_is_killed(tmp_path):
-    script = tmp_path / "parent.py"
-    script.write_text(
-        "import sys\n"
-        f"sys.path[:0] = {[str(Path(__file__).resolve().parents[2]), str(Path(__file__).parent)]!r}\n"
-        "from test_worker_pool import hang, process_id\n"
-        "from plumbline.processes.worker_pool import Task, WorkerPool\n"
-        "if __name__ == '__main__':\n"
-        "    with WorkerPool(1) as workers:\n"
-        "        for outcome in workers.run([Task(0, process_id), Task(1, hang)]):\n"
-        "            print(outcome.value, flush=True)\n"
-    )
-    parent = subprocess.Popen([sys.executable, script], stdout=subprocess.PIPE, text=True)
-    assert parent.stdout is not None
-    worker = int(parent.stdout.readline())
-    parent.send_signal(signal.SIGKILL)
-    parent.wait()
-    deadline = time.monotonic() + 20
-    while Path(f"/proc/{worker}").exists() and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert not Path(f"/proc/{worker}").exists()
-
-
 @pytest.mark.skipif(not hasattr(os, "killpg"), reason="no process groups")
 def test_a_run_that_is_stopped_and_continued_loses_no_task(tmp_path):
     """As Ctrl-Z and fg: the process and its workers stand still for longer than the time limit."""
-    script = tmp_path / "stopped.py"
-    script.write_text(
-        "import sys\n"
-        f"sys.path[:0] = {[str(ROOT), str(Path(__file__).parent)]!r}\n"
-        "from test_worker_pool import hang, process_id, sleep_for\n"
-        "from plumbline.processes.worker_pool import Limits, Task, WorkerPool\n"
-        "if __name__ == '__main__':\n"
-        "    limits = Limits(seconds=5)\n"
-        "    with WorkerPool(1) as workers:\n"
-        "        for tasks in ([Task(0, process_id)], [Task(1, sleep_for, (1.5,), limits)],\n"
-        "                      [Task(2, hang, (), limits)]):\n"
-        "            for outcome in workers.run(tasks):\n"
-        "                print(outcome.failure or outcome.value, flush=True)\n"
-    )
+    script = parent_script(tmp_path, """
+        limits = Limits(seconds=5)
+        with WorkerPool(1) as workers:
+            for tasks in ([Task(0, process_id)], [Task(1, sleep_for, (1.5,), limits)],
+                          [Task(2, faults.hang, (), limits)]):
+                for outcome in workers.run(tasks):
+                    print(outcome.failure or outcome.value, flush=True)
+    """)  # fmt: skip
     parent = subprocess.Popen(
         [sys.executable, script], stdout=subprocess.PIPE, text=True, start_new_session=True
     )

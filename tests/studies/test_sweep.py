@@ -136,7 +136,7 @@ def test_a_defect_that_a_run_reports_is_reported_by_a_sweep(defect):
 
 
 def test_an_engine_without_defect_agrees_in_both():
-    assert judged_by_run_and_sweep(Defect("clean", "nothing")) == ({"agrees"}, "agrees")
+    assert judged_by_run_and_sweep(Defect("clean")) == ({"agrees"}, "agrees")
 
 
 def test_an_engine_too_coarse_to_resolve_a_mistake_is_unresolved(tmp_path):
