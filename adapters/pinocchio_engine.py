@@ -60,8 +60,8 @@ from adapters.pinocchio_common import (
     translation,
 )
 from adapters.pinocchio_loops import Loops, closed_accelerations
-from adapters.pinocchio_relations import add_accelerations
-from adapters.pinocchio_surface import POSE_FUNCTIONS, add_probe_frames, pose_function, surface_answer
+from adapters.pinocchio_probes import Probed, add_probe_frames
+from adapters.pinocchio_surface import POSE_FUNCTIONS, add_surface, pose_function
 from adapters.pinocchio_variants import VARIANTS, Change, Spelling
 from adapters.pose_functions import add_pose_answers
 from plumbline.engines.integrators import dop853, rkmk4, sample_steps, semi_implicit_euler
@@ -698,9 +698,10 @@ class _SpelledTree(PinocchioChain):
     def _add_joint(self, parent: int, joint: Any, placement: pin.SE3, name: str) -> int:
         own, spelling = self.usual.joints[len(self.q)], self.spellings.get(joint.shortname(), Spelling())
         usual_q = self.usual_q[own.idx_q : own.idx_q + own.nq]
-        made, q = spelling.make(joint), spelling.coordinates(usual_q)
+        made = spelling.make(joint)
+        q = spelling.coordinates(usual_q) if spelling.angles is None else spelling.angles
         (turn, S), (turn_now, S_now) = _joint_motion(joint, usual_q), _joint_motion(made, q)
-        if spelling.at_angles:
+        if spelling.angles is not None:
             placement = placement * pin.SE3(turn @ turn_now.T, np.zeros(3))
         self.q.append(q)
         self.blocks.append(np.linalg.pinv(S_now) @ S)
@@ -779,16 +780,10 @@ def rod_quaternion(u: Float[Array, "3"]) -> Float[Array, "4"]:
     return np.asarray(p / np.linalg.norm(p))
 
 
-def _add_closed(
-    answer: dict[str, dict[Call, Array]],
-    chain: PinocchioChain,
-    frames: Sequence[int],
-    motion: tuple[Array, Array, Array],
-) -> None:
+def _add_closed(s: Probed, chain: PinocchioChain) -> None:
     """Add accelerations by all ways to close loops."""
-    for by_derivative, call, a in closed_accelerations(chain.loops(*motion[:2]), *motion[:2]):
-        suffix = "by_derivative" if by_derivative else "by_constraint_solver"
-        add_accelerations(answer, chain.pin_model, frames, motion, {call: a}, suffix)
+    for by_derivative, call, a in closed_accelerations(chain.loops(s.q, s.v), s.q, s.v):
+        s.add_accelerations(call, a, "by_derivative" if by_derivative else "by_constraint_solver")
 
 
 def _has_joint(kind: str) -> Callable[[Model], bool]:
@@ -903,11 +898,11 @@ class Pinocchio(PinocchioAdapter):
         for state in states:
             q, v = chain.coordinates(cut.state(state) if cut else state)
             motion = q, v, chain.acceleration(q, v)
-            rates = None if cut else chain.rate_map(state, q)
-            answer = surface_answer(chain.pin_model, frames, inertias, motion, rates)
+            s = Probed(chain.pin_model, frames, motion, None if cut else chain.rate_map(state, q))
+            add_surface(s, inertias)
             if cut and len(found) < CLOSED_STATES:
-                add_parts(answer, partial(_add_closed, answer, chain, frames, motion))
-            found.append(answer)
+                add_parts(s.found, partial(_add_closed, s, chain))
+            found.append(s.found)
         add_pose_answers(found, states, POSE_FUNCTIONS, pose_function)
         return found
 

@@ -13,17 +13,17 @@ by q and v, times v and v̇, are its rate; and v · ∂g/∂q v + g · v̇ is th
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
+from adapters.pinocchio_probes import Probed
 from adapters.pinocchio_relations import add_mimic, relations
 from plumbline.engines.missing_names import add_parts
-from plumbline.model.datatypes import Array, Call, Float, Model
-from plumbline.model.kinematics import rotation_matrix
-from plumbline.model.probe_frames import PROBE_ATTITUDE, probe_points
+from plumbline.model.datatypes import Array, Call
 
 SPATIAL = "spatial_acceleration"
 
@@ -56,61 +56,20 @@ POSE_FUNCTIONS = {  # adapters/pose_functions.py describes the forms
 }  # fmt: skip
 OF_MOTIONS = ("exp6", "Jexp6")  # take a pin.Motion
 ANGULAR = {"velocity": "velocity", "acceleration": "acceleration", SPATIAL: "acceleration"}
-Found = dict[str, dict[Call, Array]]
+BY_RATE, BY_DERIVATIVE = "_by_jacobian_rate", "_by_derivative"
+Reading = tuple[str, str, str, Any]  # functions, what they return, by what, and the spatial vector
 
 
-def add_probe_frames(
-    pin_model: pin.Model, joints: Sequence[int], placements: Sequence[pin.SE3], model: Model
-) -> list[int]:
-    """Add the probe frames of all bodies.
-
-    Args:
-        joints: by body the joint that carries it.
-        placements: of each body's frame in that joint's frame.
-
-    """
-    turn = rotation_matrix(PROBE_ATTITUDE)
-    return [
-        int(pin_model.addFrame(pin.Frame(f"probe {k}", j, place * pin.SE3(turn, x), pin.FrameType.OP_FRAME)))
-        for k, (j, place, x) in enumerate(zip(joints, placements, probe_points(model), strict=True))
-    ]
-
-
-def surface_answer(
-    pin_model: pin.Model,
-    frames: Sequence[int],
-    bodies: Sequence[pin.Inertia],
-    motion: tuple[Float[Array, "nq"], Float[Array, "nv"], Float[Array, "nv"]],
-    rates: Float[Array, "nv nu"] | None,
-) -> Found:
+def add_surface(s: Probed, bodies: Sequence[pin.Inertia]) -> None:
     """Evaluate all at one state.
 
     Args:
-        frames: the probe frames by body.
         bodies: inertias of the bodies, in their joints' frames.
-        motion: q, v and v̇.
-        rates: takes ν to v; None of loops, whose parts of bodies are no bodies.
 
     """
-    found: Found = defaultdict(dict)
-    joints = {pin_model.frames[f].parentJoint for f in frames}
-    has_parts = rates is None or len(joints) < len(frames)
-    add_parts(
-        found,
-        lambda: _add_frames(found, pin_model, frames, motion),
-        lambda: _add_data(found, pin_model, frames, motion),
-        lambda: _add_regressors(found, pin_model, frames, bodies, motion),
-        lambda: _add_centres(found, pin_model, frames, motion, rates is None),
-        *relations(found, pin_model, frames, motion, is_tree=rates is not None, has_parts=has_parts),
-    )
-    if rates is not None:
-        add_parts(
-            found,
-            lambda: _add_torques(found, pin_model, motion, rates),
-            lambda: _add_batch(found, pin_model, motion, rates),
-            lambda: add_mimic(found, pin_model, motion, rates),
-        )
-    return found
+    parts = _add_frames, _add_data, partial(_add_regressors, bodies=bodies), _add_centres, *relations(s)
+    of_trees = () if s.rates is None else (_add_torques, _add_batch, add_mimic)
+    add_parts(s.found, *(partial(part, s) for part in (*parts, *of_trees)))
 
 
 def pose_function(name: str, given: Sequence[Any], _: Sequence[str]) -> list[Any]:
@@ -145,438 +104,316 @@ def _plane_function(group: Any, height: float, *given: float) -> list[Any]:
     return [turn, np.array([*moved, height])][: 1 + bool(place)]
 
 
-def _product(matrix: Any, x: Array) -> Array:
-    """Multiply; Pinocchio returns a matrix of one column as a vector."""
-    return np.reshape(matrix, (-1, len(x))) @ x
-
-
-def _rate(by_q: Any, by_v: Any, v: Array, a: Array) -> Array:
-    """The rate of something whose derivatives by q and v these are."""
-    return _product(by_q, v) + _product(by_v, a)
-
-
-class _Twists:
-    """Spatial vectors at the probe frames in one reference frame: by function, what they are, algorithm."""
-
-    def __init__(self, m: pin.Model, data: pin.Data, name: str) -> None:
-        self.m, self.data, self.frame, self.name = m, data, FRAMES[name], name
-        self.reference = getattr(pin.ReferenceFrame, name)
-        self.found: dict[tuple[str, str, str], list[Array]] = defaultdict(list)
-
-    def add(
-        self, function: str, what: str, twist: Any, f: int, by: str = "", is_of_joint: bool = False
-    ) -> None:
-        """Add one of probe frame f, or of its joint, which is moved there."""
-        vector = np.array(getattr(twist, "vector", twist))
-        if is_of_joint:
-            joint, place = self.m.frames[f].parentJoint, self.m.frames[f].placement
-            if what == "acceleration":  # a classical one is moved as the spatial one
-                what, velocity = SPATIAL, pin.getVelocity(self.m, self.data, joint, self.reference)
-                vector[:3] -= np.cross(velocity.angular, velocity.linear)
-            moves = {"LOCAL": place, "WORLD": pin.SE3.Identity()}
-            aligned = pin.SE3(np.eye(3), self.data.oMi[joint].rotation @ place.translation)
-            vector = moves.get(self.name, aligned).actInv(pin.Motion(vector)).vector
-        self.found[function, what, by].append(vector)
-
-    def store(self, found: Found) -> None:
-        """Put all into the answer."""
-        frame = self.frame
-        for (function, what, by), values in self.found.items():
-            call, halves = (
-                (*function.split(), f"ReferenceFrame.{self.name}"),
-                np.split(np.array(values), 2, 1),
+def _add_frames(s: Probed) -> None:
+    data, derived = s.moved(), s.m.createData()
+    pin.computeForwardKinematicsDerivatives(s.m, derived, s.q, s.v, s.a)
+    pin.updateFramePlacements(s.m, derived)
+    pin.computeJointJacobiansTimeVariation(s.m, data, s.q, s.v)
+    pin.computeJointKinematicHessians(s.m, derived, s.q)
+    for name, frame in FRAMES.items():
+        found = defaultdict[tuple[str, str, str], list[Any]](list)
+        for f, joint in zip(s.frames, s.joints, strict=True):
+            own = [*_readings(s, name, "Frame", f, data, derived), *_computed(s, name, f)]
+            of_joint = [*_readings(s, name, "Joint", joint, data, derived), *_of_joint_alone(s, name, joint)]
+            for function, what, by, twist in (*own, *(_at_frame(s, name, f, data, x) for x in of_joint)):
+                found[function, what, by].append(twist)
+        for (function, what, by), twists in found.items():
+            of_point, of_rotation = (
+                f"frame_{what}{frame.of_point}{by}",
+                f"{ANGULAR[what]}{frame.of_rotation}{by}",
             )
-            found[f"frame_{what}{frame.of_point}{by}"][call] = halves[0]
-            found[f"frame_angular_{ANGULAR[what]}{frame.of_rotation}{by}"][call] = halves[1]
-
-
-def _add_frames(
-    found: Found, m: pin.Model, frames: Sequence[int], motion: tuple[Array, Array, Array]
-) -> None:
-    (q, v, a), data, derived, other = motion, m.createData(), m.createData(), m.createData()
-    pin.forwardKinematics(m, data, q, v, a)
-    pin.updateFramePlacements(m, data)
-    pin.computeForwardKinematicsDerivatives(m, derived, q, v, a)
-    pin.updateFramePlacements(m, derived)
-    pin.computeJointJacobiansTimeVariation(m, data, q, v)
-    pin.computeJointKinematicHessians(m, derived, q)
-    for name in FRAMES:
-        twists = _Twists(m, data, name)
-        reference, of_rate = twists.reference, twists.frame.of_rate
-        for f in frames:
-            joint = m.frames[f].parentJoint
-            _read_twists(twists, "Frame", f, f, derived, v, a)
-            _read_twists(twists, "Joint", joint, f, derived, v, a)
-            _read_hessian(twists, "Joint", joint, f, derived, v, a)
-            _read_hessian(twists, "Frame", f, f, derived, v, a)
-            J = np.array(pin.computeFrameJacobian(m, other, q, f, reference))
-            rate = _rate(pin.frameJacobianTimeVariation(m, other, q, v, f, reference), J, v, a)
-            twists.add("computeFrameJacobian", "velocity", _product(J, v), f)
-            twists.add("frameJacobianTimeVariation", of_rate, rate, f, "_by_jacobian_rate")
-            if name == "LOCAL":
-                J = pin.computeJointJacobian(m, other, q, joint)
-                twists.add("computeJointJacobian", "velocity", _product(J, v), f, is_of_joint=True)
-        twists.store(found)
+            call = *function.split(), f"ReferenceFrame.{name}"
+            s.add_halves((of_point, f"frame_angular_{of_rotation}"), call, twists)
         if name != "WORLD":
-            _add_points(found, m, derived, frames, name, v, a)
+            _add_points(s, derived, name)
 
 
-def _read_twists(
-    twists: _Twists, of: str, number: int, f: int, derived: pin.Data, v: Array, a: Array
-) -> None:
-    """Add what all functions of a frame or a joint give."""
-    is_of_joint = of == "Joint"
-    plain = "" if is_of_joint else of
+def _computed(s: Probed, name: str, f: int) -> Iterator[Reading]:
+    """What functions of frames say that need no other before."""
+    other, reference = s.m.createData(), getattr(pin.ReferenceFrame, name)
+    J = s.square(pin.computeFrameJacobian(s.m, other, s.q, f, reference))
+    rate = s.rate(pin.frameJacobianTimeVariation(s.m, other, s.q, s.v, f, reference), J)
+    yield "computeFrameJacobian", "velocity", "", J @ s.v
+    yield "frameJacobianTimeVariation", FRAMES[name].of_rate, BY_RATE, rate
 
-    def read(function: str, data: pin.Data = twists.data) -> Any:
-        return getattr(pin, function)(twists.m, data, number, twists.reference)
 
+def _of_joint_alone(s: Probed, name: str, joint: int) -> Iterator[Reading]:
+    if name == "LOCAL":
+        J = s.square(pin.computeJointJacobian(s.m, s.m.createData(), s.q, joint))
+        yield "computeJointJacobian", "velocity", "", J @ s.v
+
+
+def _at_frame(s: Probed, name: str, f: int, data: pin.Data, reading: Reading) -> Reading:
+    """Move what is said of a joint to the frame on it."""
+    function, what, by, twist = reading
+    vector, frame = np.array(getattr(twist, "vector", twist)), s.m.frames[f]
+    joint, place = frame.parentJoint, frame.placement
+    if what == "acceleration":  # a classical one is moved as the spatial one
+        velocity = pin.getVelocity(s.m, data, joint, getattr(pin.ReferenceFrame, name))
+        what, vector[:3] = SPATIAL, vector[:3] - np.cross(velocity.angular, velocity.linear)
+    aligned = pin.SE3(np.eye(3), data.oMi[joint].rotation @ place.translation)
+    move = {"LOCAL": place, "WORLD": pin.SE3.Identity()}.get(name, aligned)
+    return function, what, by, move.actInv(pin.Motion(vector))
+
+
+def _readings(
+    s: Probed, name: str, of: str, number: int, data: pin.Data, derived: pin.Data
+) -> Iterator[Reading]:
+    """What all functions of a frame or a joint return."""
+
+    def read(function: str, of_data: pin.Data = data) -> Any:
+        return getattr(pin, function)(s.m, of_data, number, getattr(pin.ReferenceFrame, name))
+
+    plain, of_rate = of.replace("Joint", ""), FRAMES[name].of_rate
     J, dJ = read(f"get{of}Jacobian"), read(f"get{of}JacobianTimeVariation")
     by_q, by_v = read(f"get{of}VelocityDerivatives", derived)[:2]
     *_, of_v, of_a = read(f"get{of}AccelerationDerivatives", derived)
-    by = "_by_derivative"
-    for function, what, twist, how in (
-        (f"get{plain}Velocity", "velocity", read(f"get{plain}Velocity"), ""),
-        (f"get{plain}Acceleration", SPATIAL, read(f"get{plain}Acceleration"), ""),
-        (f"get{of}Jacobian", "velocity", _product(J, v), ""),
-        (f"get{of}JacobianTimeVariation", twists.frame.of_rate, _rate(dJ, J, v, a), "_by_jacobian_rate"),
-        (
-            f"get{of}VelocityDerivatives computeForwardKinematicsDerivatives",
-            "velocity",
-            _product(by_v, v),
-            by,
-        ),
-        # the derivatives of vectors in the world's axes are those of spatial ones
-        (f"get{of}VelocityDerivatives", SPATIAL, _rate(by_q, by_v, v, a), by),
-        (f"get{of}AccelerationDerivatives", SPATIAL, _rate(of_v, of_a, v / 2, a), by),
-    ):
-        twists.add(function, what, twist, f, how, is_of_joint)
-    if twists.name != "WORLD":
+    yield f"get{plain}Velocity", "velocity", "", read(f"get{plain}Velocity").copy()
+    yield f"get{plain}Acceleration", SPATIAL, "", read(f"get{plain}Acceleration").copy()
+    yield f"get{of}Jacobian", "velocity", "", s.square(J) @ s.v
+    yield f"get{of}JacobianTimeVariation", of_rate, BY_RATE, s.rate(dJ, J)
+    function = f"get{of}VelocityDerivatives"
+    yield f"{function} computeForwardKinematicsDerivatives", "velocity", BY_DERIVATIVE, s.square(by_v) @ s.v
+    # the derivatives of vectors in the world's axes are those of spatial ones
+    yield function, SPATIAL, BY_DERIVATIVE, s.rate(by_q, by_v)
+    yield f"get{of}AccelerationDerivatives", SPATIAL, BY_DERIVATIVE, s.rate(of_v, of_a, s.v / 2)
+    if name != "WORLD":
         function = f"get{plain}ClassicalAcceleration"
-        twists.add(function, "acceleration", read(function), f, "", is_of_joint)
+        yield function, "acceleration", "", read(function).copy()
+    # in C++'s order: docs/surface/pinocchio_kinematic_hessians.py
+    H = np.array(read(f"get{of}KinematicHessian", derived))
+    rate = s.rate(H.ravel().reshape(H.shape, order="F") @ s.v, J)
+    yield f"get{of}KinematicHessian computeJointKinematicHessians", of_rate, BY_RATE, rate
 
 
-def _read_hessian(
-    twists: _Twists, of: str, number: int, f: int, derived: pin.Data, v: Array, a: Array
-) -> None:
-    """Add J̇ v + J v̇ with J̇ by the Hessian, whose numbers come in C++'s order.
-
-    docs/surface/pinocchio_kinematic_hessians.py shows that order.
-    """
-    is_of_joint, given = of == "Joint", (twists.m, twists.data, number, twists.reference)
-    J = getattr(pin, f"get{of}Jacobian")(*given)
-    H = np.array(getattr(pin, f"get{of}KinematicHessian")(twists.m, derived, number, twists.reference))
-    H = H.ravel().reshape(H.shape, order="F")
-    function, what = f"get{of}KinematicHessian computeJointKinematicHessians", twists.frame.of_rate
-    twists.add(function, what, _rate(H @ v, J, v, a), f, "_by_jacobian_rate", is_of_joint)
-
-
-def _add_points(
-    found: Found, m: pin.Model, derived: pin.Data, frames: Sequence[int], name: str, v: Array, a: Array
-) -> None:
+def _add_points(s: Probed, derived: pin.Data, name: str) -> None:
     """Add what derivatives of points' velocities and accelerations say; points have no angular part."""
-    frame, reference = FRAMES[name], getattr(pin.ReferenceFrame, name)
-    rows = defaultdict[tuple[str, str], list[Array]](list)
-    for f in frames:
-        place = m.frames[f].parentJoint, m.frames[f].placement, reference
-        by_q, by_v = pin.getPointVelocityDerivatives(m, derived, *place)
-        *_, of_v, of_a = pin.getPointClassicAccelerationDerivatives(m, derived, *place)
-        function = "getPointVelocityDerivatives"
-        rows["velocity", function].append(_product(by_v, v))
-        what = "spatial_acceleration" if name == "LOCAL" else "acceleration"
-        rows[what, function].append(_rate(by_q, by_v, v, a))
-        acceleration = _rate(of_v, of_a, v / 2, a)
-        rows["acceleration", "getPointClassicAccelerationDerivatives"].append(acceleration)
+    reference, rows = getattr(pin.ReferenceFrame, name), defaultdict[tuple[str, str], list[Array]](list)
+    what = SPATIAL if name == "LOCAL" else "acceleration"
+    for place in zip(s.joints, s.places, strict=True):
+        by_q, by_v = pin.getPointVelocityDerivatives(s.m, derived, *place, reference)
+        *_, of_v, of_a = pin.getPointClassicAccelerationDerivatives(s.m, derived, *place, reference)
+        rows["velocity", "getPointVelocityDerivatives"].append(s.square(by_v) @ s.v)
+        rows[what, "getPointVelocityDerivatives"].append(s.rate(by_q, by_v))
+        rows["acceleration", "getPointClassicAccelerationDerivatives"].append(s.rate(of_v, of_a, s.v / 2))
     for (what, function), values in rows.items():
-        found[f"frame_{what}{frame.of_point}_by_derivative"][function,] = np.array(values)
+        s.add(f"frame_{what}{FRAMES[name].of_point}_by_derivative", (function,), values)
 
 
-def _add_data(found: Found, m: pin.Model, frames: Sequence[int], motion: tuple[Array, Array, Array]) -> None:
+def _add_data(s: Probed) -> None:
     """Add what algorithms leave in their data, joint by joint."""
-    (q, v, a), data, derived = motion, m.createData(), m.createData()
-    pin.rnea(m, data, q, v, a)
-    pin.computeRNEADerivatives(m, derived, q, v, a)
-    pin.forwardKinematics(m, data, q, v, a)
+    m, data, derived = s.m, s.m.createData(), s.m.createData()
+    pin.rnea(m, data, s.q, s.v, s.a)
+    pin.computeRNEADerivatives(m, derived, s.q, s.v, s.a)
+    pin.forwardKinematics(m, data, s.q, s.v, s.a)
     pin.updateFramePlacements(m, data)
-    pin.computeJointJacobiansTimeVariation(m, data, q, v)
+    pin.computeJointJacobiansTimeVariation(m, data, s.q, s.v)
     pin.updateGlobalPlacements(m, data)
     chained = [pin.SE3.Identity()]
     for joint in range(1, m.njoints):
         chained.append(chained[m.parents[joint]] * data.liMi[joint])
-    spatial, places = (
-        "spatial_acceleration",
-        [(m.frames[f].parentJoint, m.frames[f].placement) for f in frames],
-    )
-    poses = {
-        ("forwardKinematics", "Data.oMi"): [data.oMi[j] * place for j, place in places],
-        ("Data.liMi",): [chained[j] * place for j, place in places],
-        ("updateFramePlacements", "Data.oMf"): [data.oMf[f].copy() for f in frames],
-        ("updateFramePlacement",): [pin.updateFramePlacement(m, data, f).copy() for f in frames],
-        ("updateGlobalPlacements",): [data.oMi[j] * place for j, place in places],
-    }
-    for call, found_poses in poses.items():
-        found["frame_position"][call] = np.array([pose.translation for pose in found_poses])
-        found["frame_axes"][call] = np.concatenate([pose.rotation.T for pose in found_poses])
+    places = list(zip(s.joints, s.places, strict=True))
+    s.add_poses(("forwardKinematics", "Data.oMi"), [data.oMi[j] * place for j, place in places])
+    s.add_poses(("Data.liMi",), [chained[j] * place for j, place in places])
+    s.add_poses(("updateFramePlacements", "Data.oMf"), [data.oMf[f] for f in s.frames])
+    s.add_poses(("updateFramePlacement",), [pin.updateFramePlacement(m, data, f).copy() for f in s.frames])
+    s.add_poses(("updateGlobalPlacements",), [data.oMi[j] * place for j, place in places])
     weight = pin.Motion(m.gravity.linear, np.zeros(3))
     for what, at, by, values in (
         ("velocity", "_local", ("forwardKinematics", "Data.v"), data.v),
-        (spatial, "_local", ("forwardKinematics", "Data.a"), data.a),
-        (spatial, "_local", ("rnea", "Data.a_gf"),
+        (SPATIAL, "_local", ("forwardKinematics", "Data.a"), data.a),
+        (SPATIAL, "_local", ("rnea", "Data.a_gf"),
          [x + pose.actInv(weight) for x, pose in zip(data.a_gf, data.oMi, strict=True)]),
         ("velocity", "_at_origin", ("computeRNEADerivatives", "Data.ov"), derived.ov),
-        (spatial, "_at_origin", ("computeRNEADerivatives", "Data.oa"), derived.oa),
-        (spatial, "_at_origin", ("computeRNEADerivatives", "Data.oa_gf"),
+        (SPATIAL, "_at_origin", ("computeRNEADerivatives", "Data.oa"), derived.oa),
+        (SPATIAL, "_at_origin", ("computeRNEADerivatives", "Data.oa_gf"),
          [x + weight for x in derived.oa_gf]),
     ):  # fmt: skip
-        twists = [place.actInv(values[j]) if at == "_local" else values[j] for j, place in places]
-        found[f"frame_{what}{at}"][by] = np.array([twist.linear for twist in twists])
-        turn = "_local" if at == "_local" else ""
-        found[f"frame_angular_{ANGULAR[what]}{turn}"][by] = np.array([twist.angular for twist in twists])
-    J, dJ = (np.reshape(x, (6, m.nv)) for x in (data.J, data.dJ))
-    columns = [
-        np.concatenate([np.arange(m.idx_vs[i], m.idx_vs[i] + m.nvs[i]) for i in m.supports[j]]).astype(int)
-        for j, _ in places
-    ]
-    velocity = np.array([J[:, own] @ v[own] for own in columns])
-    rate = np.array([dJ[:, own] @ v[own] + J[:, own] @ a[own] for own in columns])
-    found["frame_velocity_at_origin"]["computeJointJacobians", "Data.J"] = velocity[:, :3]
+        is_local = at == "_local"
+        twists = [place.actInv(values[j]) if is_local else values[j].copy() for j, place in places]
+        turning = f"frame_angular_{ANGULAR[what]}{'_local' * is_local}"
+        s.add_halves((f"frame_{what}{at}", turning), by, twists)
+    J, dJ = s.square(data.J), s.square(data.dJ)
+    columns = [s.columns(j) for j in s.joints]
+    velocity = [J[:3, own] @ s.v[own] for own in columns]
+    rate = [dJ[:3, own] @ s.v[own] + J[:3, own] @ s.a[own] for own in columns]
+    s.add("frame_velocity_at_origin", ("computeJointJacobians", "Data.J"), velocity)
     by = "computeJointJacobiansTimeVariation", "Data.dJ"
-    found["frame_spatial_acceleration_at_origin_by_jacobian_rate"][by] = rate[:, :3]
+    s.add("frame_spatial_acceleration_at_origin_by_jacobian_rate", by, rate)
 
 
-def _add_centres(
-    found: Found, m: pin.Model, frames: Sequence[int], motion: tuple[Array, Array, Array], has_parts: bool
-) -> None:
-    (q, v, a), data, derived = motion, m.createData(), m.createData()
-    found["total_mass"]["computeTotalMass",] = np.array([[pin.computeTotalMass(m)]])
+def _add_centres(s: Probed) -> None:
+    m, (q, v, a), data, derived = s.m, s.motion, s.m.createData(), s.m.createData()
+    s.add("total_mass", ("computeTotalMass",), pin.computeTotalMass(m))
     pin.centerOfMass(m, data, q, v, a)
     for quantity, name in (("", "com"), ("_velocity", "vcom"), ("_acceleration", "acom")):
-        values = getattr(data, name)
-        found[f"centre_of_mass{quantity}"]["centerOfMass", f"Data.{name}"] = values[0][None].copy()
-    jacobian = np.reshape(pin.jacobianCenterOfMass(m, data, q), (3, -1)).copy()
-    found["centre_of_mass_velocity"]["jacobianCenterOfMass", "Data.Jcom"] = _product(data.Jcom, v)[None]
+        s.add(f"centre_of_mass{quantity}", ("centerOfMass", f"Data.{name}"), getattr(data, name)[0])
+    jacobian = s.square(pin.jacobianCenterOfMass(m, data, q))
+    s.add("centre_of_mass_velocity", ("jacobianCenterOfMass", "Data.Jcom"), s.square(data.Jcom) @ v)
     pin.computeForwardKinematicsDerivatives(m, derived, q, v, a)
     pin.centerOfMass(m, derived, q, v)
-    rate = _rate(pin.getCenterOfMassVelocityDerivatives(m, derived), jacobian, v, a)
-    found["centre_of_mass_acceleration_by_derivative"]["getCenterOfMassVelocityDerivatives",] = rate[None]
-    joints = [m.frames[f].parentJoint for f in frames]
-    if not has_parts and len(set(joints)) == len(joints):  # no joint carries two bodies
-        _add_subtrees(found, m, joints, motion)
-    momenta = {
-        ("computeCentroidalMomentum", "Data.hg"): pin.computeCentroidalMomentum(m, data, q, v).vector.copy(),
-        ("computeCentroidalMap", "Data.Ag"): _product(pin.computeCentroidalMap(m, data, q), v),
-        ("ccrba",): _product(pin.ccrba(m, data, q, v), v),
-    }
-    variation = pin.computeCentroidalMomentumTimeVariation(m, data, q, v, a).vector.copy()
-    rates = {("computeCentroidalMomentumTimeVariation", "Data.dhg"): variation}
-    dAg = np.array(pin.computeCentroidalMapTimeVariation(m, data, q, v))
-    by_map = {
-        ("computeCentroidalMapTimeVariation", "Data.dAg"): _rate(dAg, data.Ag, v, a),
-        ("dccrba",): _rate(pin.dccrba(m, data, q, v), data.Ag, v, a),
-    }
-    pin.computeCentroidalDynamicsDerivatives(m, derived, q, v, a)
-    by_derivative = dict[Call, Array]()
-    again = m.createData()
-    pin.computeRNEADerivatives(m, again, q, v, a)
+    function = "getCenterOfMassVelocityDerivatives"
+    rate = s.rate(getattr(pin, function)(m, derived), jacobian)
+    s.add("centre_of_mass_acceleration_by_derivative", (function,), rate)
+    if s.rates is not None and len(set(s.joints)) == len(s.joints):  # no joint carries two bodies
+        _add_subtrees(s)
+    momentum = pin.computeCentroidalMomentum(m, data, q, v).copy()
+    s.add_momentum(("computeCentroidalMomentum", "Data.hg"), momentum)
+    by_map = s.square(pin.computeCentroidalMap(m, data, q)) @ v
+    s.add_momentum(("computeCentroidalMap", "Data.Ag"), by_map)
+    s.add_momentum(("ccrba",), s.square(pin.ccrba(m, data, q, v)) @ v)
+    variation = pin.computeCentroidalMomentumTimeVariation(m, data, q, v, a).copy()
+    s.add_momentum(("computeCentroidalMomentumTimeVariation", "Data.dhg"), variation, "_rate")
+    rate = s.rate(np.array(pin.computeCentroidalMapTimeVariation(m, data, q, v)), data.Ag)
+    s.add_momentum(("computeCentroidalMapTimeVariation", "Data.dAg"), rate, "_rate_by_map_rate")
+    s.add_momentum(("dccrba",), s.rate(pin.dccrba(m, data, q, v), data.Ag), "_rate_by_map_rate")
+    pin.computeRNEADerivatives(m, data, q, v, a)
     for name, (h_q, _, of_v, of_a) in (
         ("compute", pin.computeCentroidalDynamicsDerivatives(m, derived, q, v, a)),
-        ("get", pin.getCentroidalDynamicsDerivatives(m, again)),
+        ("get", pin.getCentroidalDynamicsDerivatives(m, data)),
     ):
-        by_derivative[f"{name}CentroidalDynamicsDerivatives",] = (
-            _rate(h_q, of_a, v, a) + _rate(of_v, of_a, v / 2, a)
-        ) / 2
-    for suffix, twists in (
-        ("", momenta), ("_rate", rates), ("_rate_by_map_rate", by_map),
-        ("_rate_by_derivative", by_derivative),
-    ):  # fmt: skip
-        for call, twist in twists.items():
-            found[f"momentum{suffix}"][call] = twist[None, :3].copy()
-            found[f"centroidal_angular_momentum{suffix}"][call] = twist[None, 3:].copy()
+        rate = (s.rate(h_q, of_a) + s.rate(of_v, of_a, v / 2)) / 2
+        s.add_momentum((f"{name}CentroidalDynamicsDerivatives",), rate, "_rate_by_derivative")
 
 
-def _add_subtrees(
-    found: Found, m: pin.Model, joints: Sequence[int], motion: tuple[Array, Array, Array]
-) -> None:
-    (q, v, a), data, other = motion, m.createData(), m.createData()
+def _add_subtrees(s: Probed) -> None:
+    m, (q, v, a), data, other = s.m, s.motion, s.m.createData(), s.m.createData()
     pin.centerOfMass(m, data, q, v, a, True)
-    poses = [data.oMi[j] for j in joints]
-    centres = [pose.act(data.com[j]) for j, pose in zip(joints, poses, strict=True)]
-    found["subtree_centre"]["centerOfMass",] = np.array(centres)
+    poses = [(j, data.oMi[j].copy()) for j in s.joints]
+    s.add("subtree_centre", ("centerOfMass",), [pose.act(data.com[j]) for j, pose in poses])
     for quantity, values in (("velocity", data.vcom), ("acceleration", data.acom)):
-        turned = [pose.rotation @ values[j] for j, pose in zip(joints, poses, strict=True)]
-        found[f"subtree_{quantity}"]["centerOfMass",] = np.array(turned)
+        s.add(f"subtree_{quantity}", ("centerOfMass",), [pose.rotation @ values[j] for j, pose in poses])
     pin.computeSubtreeMasses(m, data)
-    found["subtree_mass"]["computeSubtreeMasses", "Data.mass"] = np.array([[data.mass[j]] for j in joints])
-    velocities = [_product(pin.jacobianSubtreeCenterOfMass(m, other, q, j), v) for j in joints]
-    found["subtree_velocity"]["jacobianSubtreeCenterOfMass",] = np.array(velocities)
+    s.add("subtree_mass", ("computeSubtreeMasses", "Data.mass"), [[data.mass[j]] for j in s.joints])
+    velocities = [s.square(pin.jacobianSubtreeCenterOfMass(m, other, q, j)) @ v for j in s.joints]
+    s.add("subtree_velocity", ("jacobianSubtreeCenterOfMass",), velocities)
     pin.jacobianCenterOfMass(m, other, q)
-    velocities = [_product(pin.getJacobianSubtreeCenterOfMass(m, other, j), v) for j in joints]
-    found["subtree_velocity"]["getJacobianSubtreeCenterOfMass",] = np.array(velocities)
+    velocities = [s.square(pin.getJacobianSubtreeCenterOfMass(m, other, j)) @ v for j in s.joints]
+    s.add("subtree_velocity", ("getJacobianSubtreeCenterOfMass",), velocities)
     pin.crba(m, other, q, pin.Convention.LOCAL)
-    centres = [pose.act(other.Ycrb[j].lever) for j, pose in zip(joints, poses, strict=True)]
-    found["subtree_centre"]["Data.Ycrb",] = np.array(centres)
+    s.add("subtree_centre", ("Data.Ycrb",), [pose.act(other.Ycrb[j].lever) for j, pose in poses])
     pin.ccrba(m, other, q, v)
-    found["subtree_centre"]["Data.oYcrb",] = np.array([other.oYcrb[j].lever for j in joints])
+    s.add("subtree_centre", ("Data.oYcrb",), [other.oYcrb[j].lever.copy() for j in s.joints])
 
 
-def _add_regressors(
-    found: Found, m: pin.Model, frames: Sequence[int], bodies: Sequence[pin.Inertia],
-    motion: tuple[Array, Array, Array],
-) -> None:  # fmt: skip
-    (q, v, a), data = motion, m.createData()
-    pin.rnea(m, data, q, v, a)
-    forces = defaultdict[str, list[pin.Force]](list)
+def _add_regressors(s: Probed, bodies: Sequence[pin.Inertia]) -> None:
+    m, data, moved, local = s.m, s.m.createData(), s.moved(), pin.ReferenceFrame.LOCAL
+    pin.rnea(m, data, s.q, s.v, s.a)
     pin.updateFramePlacements(m, data)
-    for f, inertia in zip(frames, bodies, strict=True):
-        j, place = m.frames[f].parentJoint, m.frames[f].placement
-        own, here = inertia.toDynamicParameters(), place.actInv(inertia).toDynamicParameters()
-        forces["bodyRegressor"].append(
-            place.actInv(pin.Force(pin.bodyRegressor(data.v[j], data.a_gf[j]) @ own))
-        )
-        forces["jointBodyRegressor"].append(place.actInv(pin.Force(pin.jointBodyRegressor(m, data, j) @ own)))
-        forces["frameBodyRegressor"].append(pin.Force(pin.frameBodyRegressor(m, data, f) @ here))
-    for function, values in forces.items():
-        found["body_force_local"][function,] = np.array([force.linear for force in values])
-        found["body_moment_local"][function,] = np.array([force.angular for force in values])
-    pin.forwardKinematics(m, data, q, v)
+    forces, velocities = (defaultdict[str, list[Any]](list) for _ in range(2))
     own_twists = [
-        (m.jointPlacements[j].inverse() * data.liMi[j]).act(
-            data.v[j] - data.liMi[j].actInv(data.v[m.parents[j]])
+        (m.jointPlacements[j].inverse() * moved.liMi[j]).act(
+            moved.v[j] - moved.liMi[j].actInv(moved.v[m.parents[j]])
         )
         for j in range(1, m.njoints)
     ]
     turns = np.concatenate([twist.vector for twist in own_twists])
-    velocities = {
-        "computeJointKinematicRegressor": [
-            pin.computeJointKinematicRegressor(
-                m, data, m.frames[f].parentJoint, pin.ReferenceFrame.LOCAL, m.frames[f].placement
-            ) @ turns
-            for f in frames
-        ],
-        "computeFrameKinematicRegressor": [
-            pin.computeFrameKinematicRegressor(m, data, f, pin.ReferenceFrame.LOCAL) @ turns for f in frames
-        ],
-    }  # fmt: skip
-    for function, twists in velocities.items():
-        found["frame_velocity_local"][function,] = np.array([twist[:3] for twist in twists])
-        found["frame_angular_velocity_local"][function,] = np.array([twist[3:] for twist in twists])
+    for f, j, place, inertia in zip(s.frames, s.joints, s.places, bodies, strict=True):
+        own, here = inertia.toDynamicParameters(), place.actInv(inertia).toDynamicParameters()
+        of_body = pin.bodyRegressor(data.v[j], data.a_gf[j]) @ own
+        forces["bodyRegressor"].append(place.actInv(pin.Force(of_body)))
+        forces["jointBodyRegressor"].append(place.actInv(pin.Force(pin.jointBodyRegressor(m, data, j) @ own)))
+        forces["frameBodyRegressor"].append(pin.frameBodyRegressor(m, data, f) @ here)
+        of_joint = pin.computeJointKinematicRegressor(m, moved, j, local, place) @ turns
+        velocities["computeJointKinematicRegressor"].append(of_joint)
+        of_frame = pin.computeFrameKinematicRegressor(m, moved, f, local) @ turns
+        velocities["computeFrameKinematicRegressor"].append(of_frame)
+    for function, values in forces.items():
+        s.add_halves(("body_force_local", "body_moment_local"), (function,), values)
+    for function, values in velocities.items():
+        s.add_halves(("frame_velocity_local", "frame_angular_velocity_local"), (function,), values)
 
 
-def _add_torques(found: Found, m: pin.Model, motion: tuple[Array, Array, Array], rates: Array) -> None:
-    (q, v, a), data, zero, terms = motion, m.createData(), np.zeros(m.nv), m.createData()
+def _add_torques(s: Probed) -> None:
+    m, (q, v, a), data = s.m, s.motion, s.m.createData()
+    terms, derived, zero = m.createData(), m.createData(), np.zeros(m.nv)
     pin.computeAllTerms(m, terms, q, v)
-    M = _add_products(found, m, motion, terms, rates)
-    none = pin.StdVec_Force()
+    M, none = _add_products(s, terms), pin.StdVec_Force()
     none.extend([pin.Force.Zero()] * m.njoints)
-    gravity: dict[Call, Array] = {
-        ("computeGeneralizedGravity", "Data.g"): pin.computeGeneralizedGravity(m, data, q).copy(),
-        ("computeStaticTorque",): pin.computeStaticTorque(m, data, q, none).copy(),
-    }
+    g = pin.computeGeneralizedGravity(m, data, q).copy()
+    static: dict[Call, Array] = {("computeStaticTorque",): pin.computeStaticTorque(m, data, q, none).copy()}
+    s.add_forces("generalized_gravity", {("computeGeneralizedGravity", "Data.g"): g} | static)
     tau, rotors = pin.rnea(m, data, q, v, a).copy(), m.armature * a
     parameters = np.concatenate([inertia.toDynamicParameters() for inertia in m.inertias[1:]])
-    rest = pin.rnea(m, data, q, zero, a)  # without the terms of velocities
-    coriolis = _product(pin.computeCoriolisMatrix(m, data, q, v), v) + rest
-    derived = m.createData()
+    _add_energies(s, parameters, g, none)
+    rest = pin.rnea(m, data, q, zero, a).copy()  # without the terms of velocities
+    coriolis = s.square(pin.computeCoriolisMatrix(m, data, q, v)) @ v + rest
     _, of_v, of_a = pin.computeRNEADerivatives(m, derived, q, v, a)
-    by_regressor = _product(pin.computeJointTorqueRegressor(m, data, q, v, a), parameters)
-    dynamics = {  # with the rotors
-        ("rnea", "Data.tau"): tau,
-        ("nonLinearEffects",): pin.nonLinearEffects(m, data, q, v) + M @ a,
-        ("nle", "Data.nle"): pin.nle(m, data, q, v) + M @ a,
-        ("computeAllTerms", "Data.nle"): terms.nle + M @ a,
-        ("computeJointTorqueRegressor", "Data.jointTorqueRegressor"): by_regressor + rotors,
-    }
-    derivative = _rate(of_v, of_a, v / 2, a) + gravity["computeGeneralizedGravity", "Data.g"]
+    by_regressor = np.reshape(pin.computeJointTorqueRegressor(m, data, q, v, a), (-1, len(parameters)))
     again = pin.rnea(m, data, q, v, pin.aba(m, data, q, v, tau).copy())
-    _add_energies(found, m, parameters, motion, none)
-    found["generalized_gravity"] |= _on_rates(gravity, rates)
-    for by, values in (
-        ("", dynamics),
-        ("_by_derivative", {("computeRNEADerivatives", "Data.dtau_dv"): derivative}),
-        ("_by_aba", {("aba", "Data.ddq"): again}),
-        (
-            "_by_coriolis_matrix",
-            {
-                ("computeCoriolisMatrix", "Data.C"): coriolis,
-                ("getCoriolisMatrix",): _product(pin.getCoriolisMatrix(m, derived), v) + rest,
-            },
-        ),
-    ):
-        own = {call: value - rotors for call, value in values.items()}
-        found[f"inverse_dynamics{by}"] |= _on_rates(own, rates)
+    dynamics: dict[str, dict[Call, Array]] = {  # with the rotors
+        "": {
+            ("rnea", "Data.tau"): tau,
+            ("nonLinearEffects",): pin.nonLinearEffects(m, data, q, v) + M @ a,
+            ("nle", "Data.nle"): pin.nle(m, data, q, v) + M @ a,
+            ("computeAllTerms", "Data.nle"): terms.nle + M @ a,
+            ("computeJointTorqueRegressor", "Data.jointTorqueRegressor"): by_regressor @ parameters + rotors,
+        },
+        "_by_derivative": {("computeRNEADerivatives", "Data.dtau_dv"): s.rate(of_v, of_a, v / 2) + g},
+        "_by_aba": {("aba", "Data.ddq"): again},
+        "_by_coriolis_matrix": {
+            ("computeCoriolisMatrix", "Data.C"): coriolis,
+            ("getCoriolisMatrix",): s.square(pin.getCoriolisMatrix(m, derived)) @ v + rest,
+        },
+    }
+    for by, values in dynamics.items():
+        s.add_forces(f"inverse_dynamics{by}", {call: value - rotors for call, value in values.items()})
 
 
-def _add_batch(found: Found, m: pin.Model, motion: tuple[Array, Array, Array], rates: Array) -> None:
+def _add_batch(s: Probed) -> None:
     """Add what batched calls return, which the wheels of some versions lack."""
-    tau = np.ravel(pin.rneaInParallel(1, pin.ModelPool(m, 1), *(x[:, None] for x in motion)))
-    own: dict[Call, Array] = {("rneaInParallel", "ModelPool"): tau - m.armature * motion[2]}
-    found["inverse_dynamics"] |= _on_rates(own, rates)
+    tau = np.ravel(pin.rneaInParallel(1, pin.ModelPool(s.m, 1), *(x[:, None] for x in s.motion)))
+    s.add_forces("inverse_dynamics", {("rneaInParallel", "ModelPool"): tau - s.m.armature * s.a})
 
 
-def _on_rates(forces: dict[Call, Array], rates: Array) -> dict[Call, Array]:
-    """Forces on ν in place of those on v."""
-    return {call: (rates.T @ value)[:, None] for call, value in forces.items()}
-
-
-def _add_products(
-    found: Found, m: pin.Model, motion: tuple[Array, Array, Array], terms: pin.Data, rates: Array
-) -> Array:
+def _add_products(s: Probed, terms: pin.Data) -> Array:
     """Add products with the mass matrix, its factors and its inverse; return the matrix."""
-    (q, v, _), data = motion, m.createData()
-    M = np.reshape(pin.crba(m, data, q), (m.nv, m.nv)).copy()
+    m, q, v, data = s.m, s.q, s.v, s.m.createData()
+    M = s.square(pin.crba(m, data, q))
     momentum = M @ v
     pin.cholesky.decompose(m, data)
-    U, D, upper = np.reshape(data.U, M.shape), np.ravel(data.D), np.triu(np.reshape(terms.M, M.shape))
-    world = np.reshape(pin.crba(m, m.createData(), q, pin.Convention.WORLD), M.shape)
-    momenta = {
+    U, D, upper = s.square(data.U), np.ravel(data.D), np.triu(s.square(terms.M))
+    world = s.square(pin.crba(m, m.createData(), q, pin.Convention.WORLD))
+    momenta: dict[Call, Array] = {
         ("crba", "Data.M"): momentum,
         ("crba", "Convention", "Convention.WORLD"): world @ v,
         ("cholesky.decompose", "Data.U", "Data.D"): U @ (D * (U.T @ v)),
         ("computeAllTerms", "Data.M"): upper @ v + np.triu(upper, 1).T @ v,
     }
-    through = {
+    through: dict[Call, Array] = {
         ("cholesky.decompose", "cholesky.solve"): M @ np.ravel(pin.cholesky.solve(m, data, momentum)),
-        ("cholesky.computeMinv",): M @ _product(pin.cholesky.computeMinv(m, data), momentum),
+        ("cholesky.computeMinv",): M @ (s.square(pin.cholesky.computeMinv(m, data)) @ momentum),
     }
-    by_aba: dict[Call, Array] = {
-        ("computeMinverse", "Data.Minv"): M @ _product(pin.computeMinverse(m, data, q), momentum)
-    }
-    found["generalized_momentum"] |= _on_rates(momenta, rates)
-    found["momentum_through_inverse"] |= _on_rates(through, rates)
-    found["momentum_through_inverse_by_aba"] |= _on_rates(by_aba, rates)
+    by_aba = M @ (s.square(pin.computeMinverse(m, data, q)) @ momentum)
+    s.add_forces("generalized_momentum", momenta)
+    s.add_forces("momentum_through_inverse", through)
+    s.add_forces("momentum_through_inverse_by_aba", {("computeMinverse", "Data.Minv"): by_aba})
     return M
 
 
-def _add_energies(
-    found: Found, m: pin.Model, parameters: Array, motion: tuple[Array, Array, Array], none: pin.StdVec_Force
-) -> None:
-    (q, v, a), data, terms = motion, m.createData(), m.createData()
-    of_rotors = float(m.armature @ v**2) / 2
-    kinetic = {
-        ("computeKineticEnergy", "Data.kinetic_energy"): pin.computeKineticEnergy(m, data, q, v),
-        ("computeKineticEnergyRegressor", "Data.kineticEnergyRegressor"): of_rotors
-        + float(pin.computeKineticEnergyRegressor(m, data, q, v) @ parameters),
-    }
-    gravity = {
-        ("computePotentialEnergy", "Data.potential_energy"): pin.computePotentialEnergy(m, data, q),
-        ("computePotentialEnergyRegressor", "Data.potentialEnergyRegressor"): float(
-            pin.computePotentialEnergyRegressor(m, data, q) @ parameters
+def _add_energies(s: Probed, parameters: Array, g: Array, none: pin.StdVec_Force) -> None:
+    m, (q, v, a), data, zero = s.m, s.motion, s.m.createData(), np.zeros(s.m.nv)
+    kinetic = pin.computeKineticEnergyRegressor(m, data, q, v) @ parameters + m.armature @ v**2 / 2
+    gravity = pin.computePotentialEnergyRegressor(m, data, q) @ parameters
+    both = pin.computeMechanicalEnergy(m, data, q, v)
+    by_gravity = pin.computeGeneralizedGravityDerivatives(m, data, q).copy()
+    by_torque = pin.computeStaticTorqueDerivatives(m, data, q, none).copy()
+    by_rnea = pin.computeRNEADerivatives(m, data, q, zero, zero)[0].copy()
+    for quantity, call, value in (
+        ("kinetic_energy", ("computeKineticEnergy", "Data.kinetic_energy"),
+         pin.computeKineticEnergy(m, data, q, v)),
+        ("kinetic_energy", ("computeKineticEnergyRegressor", "Data.kineticEnergyRegressor"), kinetic),
+        ("gravity_energy", ("computePotentialEnergy", "Data.potential_energy"),
+         pin.computePotentialEnergy(m, data, q)),
+        ("gravity_energy", ("computePotentialEnergyRegressor", "Data.potentialEnergyRegressor"), gravity),
+        ("mechanical_energy", ("computeMechanicalEnergy", "Data.mechanical_energy"), both),
+        *(
+            ("gravity_energy_second_rate", call, v @ s.square(matrix) @ v + g @ a)
+            for call, matrix in (
+                (("computeGeneralizedGravityDerivatives",), by_gravity),
+                (("computeStaticTorqueDerivatives",), by_torque),
+                (("computeRNEADerivatives", "Data.dtau_dq"), by_rnea),
+            )
         ),
-    }
-    both = {("computeMechanicalEnergy", "Data.mechanical_energy"): pin.computeMechanicalEnergy(m, data, q, v)}
-    g = pin.computeGeneralizedGravity(m, terms, q).copy()
-    second = {
-        ("computeGeneralizedGravityDerivatives",): pin.computeGeneralizedGravityDerivatives(
-            m, terms, q
-        ).copy(),
-        ("computeStaticTorqueDerivatives",): pin.computeStaticTorqueDerivatives(m, terms, q, none).copy(),
-        ("computeRNEADerivatives", "Data.dtau_dq"): pin.computeRNEADerivatives(m, terms, q, 0 * v, 0 * v)[
-            0
-        ].copy(),
-    }
-    rates = {call: float(v @ _product(matrix, v) + g @ a) for call, matrix in second.items()}
-    for quantity, values in (
-        ("kinetic_energy", kinetic), ("gravity_energy", gravity), ("mechanical_energy", both),
-        ("gravity_energy_second_rate", rates),
     ):  # fmt: skip
-        found[quantity] |= {call: np.array([[value]]) for call, value in values.items()}
+        s.add(quantity, call, value)

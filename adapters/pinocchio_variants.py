@@ -19,8 +19,8 @@ import numpy as np
 import pinocchio as pin
 
 from adapters.pinocchio_common import composite
-from plumbline.engines.variants import Variant
-from plumbline.model.datatypes import Array, Call, Float, Model
+from plumbline.engines.variants import Variant, variants_of
+from plumbline.model.datatypes import Array, Float, Model
 
 LIMITS = (
     "damping", "effortLimit", "friction", "lowerDryFrictionLimit", "lowerEffortLimit", "lowerPositionLimit",
@@ -36,7 +36,7 @@ class Spelling:
 
     make: Callable[[Any], Any] = lambda joint: joint  # the usual one → this one
     coordinates: Callable[[Array], Array] = np.array  # q of the usual one → q
-    at_angles: bool = False  # whether its coordinates are `ANGLES`, and its frame is turned
+    angles: Array | None = None  # q of one whose frame is turned so that it is this
     has_own_rates: bool = False  # whether its rates are others, of which elements would be matrices
 
 
@@ -47,6 +47,14 @@ class Change:
     algorithm: str = ""
     remake: Callable[[pin.Model], pin.Model] = lambda model: model
     joints: Mapping[str, Spelling] = field(default_factory=dict)  # by the short name of the usual joint
+
+
+def _is_tree(model: Model) -> bool:
+    return not model.has_loops
+
+
+_option = variants_of("option", Change, _is_tree)
+_spelling = variants_of("spelling", Change, _is_tree)
 
 
 def _axis(joint: Any) -> Float[Array, "3"]:
@@ -72,10 +80,15 @@ def _universal(joint: Any) -> Any:
     return pin.JointModelUniversal(*map(_axis, parts)) if is_meant else joint
 
 
-def _about_axes(*kinds: str) -> Any:
-    """Three turns; screws are given a pitch of 0, which is arbitrary by default."""
-    given = {kind: (0.0,) if kind.startswith("H") else () for kind in kinds}
-    return composite(*(getattr(pin, f"JointModel{kind}")(*pitch) for kind, pitch in given.items()))
+def _made(*kinds: str) -> Callable[[Any], Any]:
+    """A joint of this kind, or of several in turn; pitches and radii are 0, and arbitrary by default."""
+
+    def make(_: Any) -> Any:
+        sizes = [(0.0,) * (3 if kind == "Ellipsoid" else kind.startswith("H")) for kind in kinds]
+        parts = [getattr(pin, f"JointModel{kind}")(*own) for kind, own in zip(kinds, sizes, strict=True)]
+        return composite(*parts) if len(parts) > 1 else parts[0]
+
+    return make
 
 
 def _planar(joint: Any) -> Any:
@@ -92,17 +105,17 @@ def _unbounded(q: Array) -> Array:
     return np.array([*q[:-1], np.cos(q[-1]), np.sin(q[-1])])
 
 
-def _names(*models: str) -> Call:
-    """The names of joint models and of their data."""
-    return tuple(f"Joint{what}{model}" for model in models for what in ("Model", "Data"))
+def _spelled(
+    kinds: str, joints: Mapping[str, Spelling], is_meant: Callable[[Model], bool], names: str = ""
+) -> Variant:
+    """Describe joints by models of these kinds, whose names and those of their data are the engine's."""
 
-
-def _spelled(names: Call, joints: Mapping[str, Spelling], is_meant: Callable[[Model], bool]) -> Variant:
     def suits(model: Model) -> bool:
         has_own_rates = any(spelling.has_own_rates for spelling in joints.values())
-        return not (model.has_loops or (has_own_rates and model.has_elements)) and is_meant(model)
+        return _is_tree(model) and not (has_own_rates and model.has_elements) and is_meant(model)
 
-    return Variant("spelling", names, Change(joints=joints), suits)
+    every = [f"Joint{what}{kind}" for kind in kinds.split() for what in ("Model", "Data")]
+    return _spelling(names or " ".join(every), suits, joints=joints)
 
 
 def _moves(*motions: str) -> Callable[[Model], bool]:
@@ -112,8 +125,8 @@ def _moves(*motions: str) -> Callable[[Model], bool]:
     )
 
 
-def _is_tree(model: Model) -> bool:
-    return not model.has_loops
+def _has_free_body(model: Model) -> bool:
+    return bool(np.any(model.free))
 
 
 def _saved(form: str, end: str) -> Callable[[pin.Model], pin.Model]:
@@ -186,18 +199,9 @@ def _as_frames(model: pin.Model) -> pin.Model:
     return other
 
 
-def _constant(q: Array) -> Callable[[Array], Array]:
-    """The same coordinates whatever the usual ones are."""
-    return lambda _: q
-
-
 def _cosines(q: Array) -> Array:
     """Give angles by their cosines and sines."""
     return np.stack([np.cos(q), np.sin(q)], axis=1).ravel()
-
-
-def _of_all_trees(names: Call, **change: Any) -> Variant:
-    return Variant("option", names, Change(**change), _is_tree)
 
 
 def _is_short(model: Model) -> bool:
@@ -206,99 +210,70 @@ def _is_short(model: Model) -> bool:
 
 
 VARIANTS = (
-    _of_all_trees(("cholesky.solve",), algorithm="cholesky"),
-    _of_all_trees(("forwardDynamics",), algorithm="forwardDynamics"),
-    _of_all_trees(("constraintDynamics", "initConstraintDynamics"), algorithm="constraintDynamics"),
-    Variant("option", ("aba", "Convention.LOCAL"), Change("aba"), _is_short),
-    _of_all_trees(("Model.copy",), remake=lambda model: model.copy()),
-    _of_all_trees(("Model",), remake=lambda model: pickle.loads(pickle.dumps(model))),
+    _option("cholesky.solve", algorithm="cholesky"),
+    _option("forwardDynamics", algorithm="forwardDynamics"),
+    _option("constraintDynamics initConstraintDynamics", algorithm="constraintDynamics"),
+    _option("aba Convention.LOCAL", _is_short, algorithm="aba"),
+    _option("Model.copy", remake=lambda model: model.copy()),
+    _option("Model", remake=lambda model: pickle.loads(pickle.dumps(model))),
     *(
-        _of_all_trees((f"Model.saveTo{form}", f"Model.loadFrom{form}"), remake=_saved(form, end))
+        _option(f"Model.saveTo{form} Model.loadFrom{form}", remake=_saved(form, end))
         for form, end in (("XML", ".xml"), ("Text", ".txt"), ("String", ""), ("Binary", ".bin"))
     ),
-    _of_all_trees(("buildReducedModel", "Model.addJointFrame"), remake=_with_locked_joint),
-    _of_all_trees(("appendModel",), remake=_appended),
-    _of_all_trees(
-        (*(f"Model.{name}" for name in LIMITS), "Model.referenceConfigurations"), remake=_with_limits
-    ),
-    Variant("spelling", ("PseudoInertia", "Symmetric3"), Change(remake=_with_other_inertias), _is_tree),
-    Variant(
-        "spelling",
-        (
-            "Model.addBodyFrame",
-            *(f"FrameType.{kind}" for kind in ("BODY", "JOINT", "FIXED_JOINT", "SENSOR")),
-        ),
-        Change(remake=_as_frames),
-        _is_tree,
+    _option("buildReducedModel Model.addJointFrame", remake=_with_locked_joint),
+    _option("appendModel", remake=_appended),
+    _option(" ".join(f"Model.{name}" for name in (*LIMITS, "referenceConfigurations")), remake=_with_limits),
+    _spelling("PseudoInertia Symmetric3", remake=_with_other_inertias),
+    _spelling(
+        "Model.addBodyFrame FrameType.BODY FrameType.JOINT FrameType.FIXED_JOINT FrameType.SENSOR",
+        remake=_as_frames,
     ),
     _spelled(
-        _names("RevoluteUnaligned"),
+        "RevoluteUnaligned",
         _of_axes("R", Spelling(lambda joint: pin.JointModelRevoluteUnaligned(_axis(joint)))),
         _moves("turn"),
     ),
+    _spelled("RUBZ", {"JointModelRZ": Spelling(_made("RUBZ"), _unbounded)}, _moves("turn")),
     _spelled(
-        _names("RUBZ"), {"JointModelRZ": Spelling(lambda _: pin.JointModelRUBZ(), _unbounded)}, _moves("turn")
-    ),
-    _spelled(
-        _names("PrismaticUnaligned"),
+        "PrismaticUnaligned",
         _of_axes("P", Spelling(lambda joint: pin.JointModelPrismaticUnaligned(_axis(joint)))),
         _moves("slide"),
     ),
     _spelled(
-        _names("HelicalUnaligned"),
+        "HelicalUnaligned",
         _of_axes("H", Spelling(lambda joint: pin.JointModelHelicalUnaligned(_axis(joint), joint.pitch))),
         lambda model: any(kind.has_pitch for kind in model.kinds),
     ),
+    _spelled("Universal", {"JointModelComposite": Spelling(_universal)}, _moves("turn", "turn")),
     _spelled(
-        _names("Universal"), {"JointModelComposite": Spelling(_universal)}, _moves("turn", "turn")
-    ),
-    _spelled(
-        _names("Planar"),
+        "Planar",
         {"JointModelComposite": Spelling(_planar, _planar_coordinates, has_own_rates=True)},
         _moves("slide", "slide", "turn"),
     ),
     _spelled(
-        _names("Composite"),
+        "Composite",
         _of_axes("RP", Spelling(lambda joint: composite(joint))),
         lambda model: _moves("turn")(model) or _moves("slide")(model),
     ),
-    _spelled(
-        _names("PX", "PY"),
-        {
-            "JointModelFreeFlyer": Spelling(
-                lambda _: composite(
-                    pin.JointModelPX(), pin.JointModelPY(), pin.JointModelPZ(), pin.JointModelSpherical()
-                )
-            )
-        },
-        lambda model: bool(np.any(model.free)),
-    ),
-    _spelled(
-        _names("Translation"),
-        {
-            "JointModelFreeFlyer": Spelling(
-                lambda _: composite(pin.JointModelTranslation(), pin.JointModelSpherical())
-            )
-        },
-        lambda model: bool(np.any(model.free)),
+    *(
+        _spelled(names, {"JointModelFreeFlyer": Spelling(_made(*parts, "Spherical"))}, _has_free_body)
+        for names, parts in (("PX PY", ("PX", "PY", "PZ")), ("Translation", ("Translation",)))
     ),
     *(
         _spelled(
-            names,
-            {"JointModelSpherical": Spelling(make, _constant(q), at_angles=True, has_own_rates=True)},
+            kinds,
+            {"JointModelSpherical": Spelling(_made(*parts.split()), angles=q, has_own_rates=True)},
             lambda model: any(kind.holds_no_turn for kind in model.kinds),
+            names,
         )
-        for names, make, q in (
-            (_names("SphericalZYX"), lambda _: pin.JointModelSphericalZYX(), ANGLES),
-            (_names("Ellipsoid"), lambda _: pin.JointModelEllipsoid(0.0, 0.0, 0.0), ANGLES),
-            (_names("RX", "RY"), lambda _: _about_axes("RX", "RY", "RZ"), ANGLES),
-            (_names("HX", "HY", "HZ"), lambda _: _about_axes("HX", "HY", "HZ"), ANGLES),
-            (_names("RUBX", "RUBY"), lambda _: _about_axes("RUBX", "RUBY", "RUBZ"), _cosines(ANGLES)),
-            (
-                ("JointModelRevoluteUnboundedUnaligned", "JointDataRevoluteUnboundedUnalignedTpl"),
-                lambda _: _about_axes("RevoluteUnboundedUnaligned", "RUBY", "RUBZ"),
-                _cosines(ANGLES),
-            ),
+        for kinds, parts, q, names in (
+            ("SphericalZYX", "SphericalZYX", ANGLES, ""),
+            ("Ellipsoid", "Ellipsoid", ANGLES, ""),
+            ("RX RY", "RX RY RZ", ANGLES, ""),
+            ("HX HY HZ", "HX HY HZ", ANGLES, ""),
+            ("RUBX RUBY", "RUBX RUBY RUBZ", _cosines(ANGLES), ""),
+            ("", "RevoluteUnboundedUnaligned RUBY RUBZ", _cosines(ANGLES),
+             "JointModelRevoluteUnboundedUnaligned JointDataRevoluteUnboundedUnalignedTpl"),
         )
     ),
 )  # fmt: skip

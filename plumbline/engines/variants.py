@@ -15,6 +15,7 @@ from typing import Any, Literal
 from plumbline.model.datatypes import Call, Model
 
 VariantKind = Literal["option", "spelling", "vectors"]
+Suits = Callable[[Model], bool]
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,22 @@ class Variant:
     kind: VariantKind
     names: Call  # of the engine, that only this one uses
     change: Any  # what the adapter's build does otherwise
-    suits: Callable[[Model], bool]  # the mechanisms that it is compared on
+    suits: Suits  # the mechanisms that it is compared on
+
+
+def variants_of(kind: VariantKind, change: Callable[..., Any], usual: Suits) -> Callable[..., Variant]:
+    """Return what makes the entries of a table: of names in one text, the mechanisms, and what is changed.
+
+    Args:
+        change: makes the adapter's own record of that.
+        usual: the mechanisms of entries that say nothing else.
+
+    """
+
+    def make(names: str, suits: Suits = usual, **changed: Any) -> Variant:
+        return Variant(kind, tuple(names.split()), change(**changed), suits)
+
+    return make
 
 
 @dataclass(frozen=True)

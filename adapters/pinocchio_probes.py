@@ -1,0 +1,118 @@
+"""A tree of Pinocchio at a state with probe frames on its bodies, and what is found of it."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from adapters.pinocchio_common import WORLD_ALIGNED
+from plumbline.model.datatypes import Array, Call, Float, Model
+from plumbline.model.kinematics import rotation_matrix
+from plumbline.model.probe_frames import PROBE_ATTITUDE, probe_points
+
+
+def add_probe_frames(
+    pin_model: pin.Model, joints: Sequence[int], placements: Sequence[pin.SE3], model: Model
+) -> list[int]:
+    """Add the probe frames of all bodies.
+
+    Args:
+        joints: by body the joint that carries it.
+        placements: of each body's frame in that joint's frame.
+
+    """
+    turn = rotation_matrix(PROBE_ATTITUDE)
+    return [
+        int(pin_model.addFrame(pin.Frame(f"probe {k}", j, place * pin.SE3(turn, x), pin.FrameType.OP_FRAME)))
+        for k, (j, place, x) in enumerate(zip(joints, placements, probe_points(model), strict=True))
+    ]
+
+
+class Probed:
+    """The tree at q, v and v̇; ``rates`` takes ν to v, None of loops, whose parts of bodies are no bodies."""
+
+    def __init__(
+        self,
+        m: pin.Model,
+        frames: Sequence[int],
+        motion: tuple[Float[Array, "nq"], Float[Array, "nv"], Float[Array, "nv"]],
+        rates: Float[Array, "nv nu"] | None,
+    ) -> None:
+        self.m, self.frames, self.rates = m, frames, rates
+        self.motion = self.q, self.v, self.a = motion
+        self.found = defaultdict[str, dict[Call, Array]](dict)
+        self.joints = [m.frames[f].parentJoint for f in frames]
+        self.places = [m.frames[f].placement.copy() for f in frames]
+
+    @property
+    def has_parts(self) -> bool:
+        """Whether a joint carries several bodies, or parts of one."""
+        return self.rates is None or len(set(self.joints)) < len(self.joints)
+
+    def moved(self, a: Array | None = None) -> pin.Data:
+        """Data with the motion, or one with another v̇, and the frames."""
+        data = self.m.createData()
+        pin.forwardKinematics(self.m, data, self.q, self.v, self.a if a is None else np.ravel(a))
+        pin.updateFramePlacements(self.m, data)
+        return data
+
+    def columns(self, joint: int) -> list[int]:
+        """The velocities that move a joint."""
+        own = [range(self.m.idx_vs[k], self.m.idx_vs[k] + self.m.nvs[k]) for k in self.m.supports[joint]]
+        return [i for some in own for i in some]
+
+    def square(self, matrix: Any) -> Float[Array, "rows nv"]:
+        """A matrix with a column per velocity; Pinocchio returns one of one column as a vector."""
+        return np.reshape(matrix, (-1, self.m.nv)).copy()
+
+    def rate(self, by_q: Any, by_v: Any, v: Array | None = None) -> Array:
+        """The rate of something whose derivatives by q and v these are."""
+        return self.square(by_q) @ (self.v if v is None else v) + self.square(by_v) @ self.a
+
+    def add(self, quantity: str, call: Call, value: Any) -> None:
+        """Add rows: of all bodies, or one of the mechanism."""
+        self.found[quantity][call] = np.array(np.atleast_2d(value), float)
+
+    def add_poses(self, call: Call, poses: Iterable[pin.SE3]) -> None:
+        """Add those of the probe frames."""
+        own = [(pose.translation.copy(), pose.rotation.T.copy()) for pose in poses]
+        self.add("frame_position", call, [place for place, _ in own])
+        self.add("frame_axes", call, np.concatenate([axes for _, axes in own]))
+
+    def add_halves(self, quantities: tuple[str, str], call: Call, twists: Any) -> None:
+        """Add the linear and the angular parts of spatial vectors."""
+        vectors = np.atleast_2d([getattr(twist, "vector", twist) for twist in twists])
+        for quantity, half in zip(quantities, np.split(vectors, 2, 1), strict=True):
+            self.add(quantity, call, half)
+
+    def add_velocities(self, velocities: Mapping[Call, Any]) -> None:
+        """Add the velocities of the probe frames by other v."""
+        data = self.m.createData()
+        for call, v in velocities.items():
+            pin.forwardKinematics(self.m, data, self.q, v)
+            pin.updateFramePlacements(self.m, data)
+            twists = [pin.getFrameVelocity(self.m, data, f, WORLD_ALIGNED).copy() for f in self.frames]
+            self.add_halves(("frame_velocity", "frame_angular_velocity"), call, twists)
+
+    def add_accelerations(self, call: Call, a: Any, suffix: str = "by_derivative") -> None:
+        """Add the accelerations of the probe frames by another v̇."""
+        data = self.moved(a)
+        quantities = f"frame_acceleration_{suffix}", f"frame_angular_acceleration_{suffix}"
+        classical = pin.getFrameClassicalAcceleration
+        twists = [classical(self.m, data, f, WORLD_ALIGNED).copy() for f in self.frames]
+        self.add_halves(quantities, call, twists)
+
+    def add_momentum(self, call: Call, twist: Any, suffix: str = "") -> None:
+        """Add the momentum of the mechanism about its centre of mass, or its rate."""
+        names = f"momentum{suffix}", f"centroidal_angular_momentum{suffix}"
+        self.add_halves(names, call, [twist])
+
+    def add_forces(self, quantity: str, forces: dict[Call, Array]) -> None:
+        """Add forces on ν in place of those on v."""
+        assert self.rates is not None
+        for call, force in forces.items():
+            self.add(quantity, call, (self.rates.T @ force)[:, None])
