@@ -78,13 +78,16 @@ from plumbline.model.datatypes import (
     Trajectory,
 )
 from plumbline.model.kinematics import (
+    cross_matrix,
     elastic_energy,
+    minimal_rates,
     own_rates,
     quaternion_conjugate,
     quaternion_product,
     quaternion_rate,
     rotation_matrix,
     rotation_vector,
+    turn_of_z,
     velocity_jacobian,
 )
 from plumbline.model.loops import STABILISATION, cut_open
@@ -95,11 +98,6 @@ ROD_AXIAL_INERTIA = 1 / 3  # of a rod about its own axis, over the trace of the 
 # Of constraintDynamics: accuracy, damping (any from 1e-12 to 1e-3 does), largest number of steps.
 PROXIMAL_SETTINGS = 1e-15, 1e-8, 50
 MAX_DENSE_JOINTS = 10  # joints up to which their 3 × 3 blocks are solved faster as one matrix
-JOINT_MODELS = {
-    "turn": (pin.JointModelRX, pin.JointModelRY, pin.JointModelRZ),
-    "slide": (pin.JointModelPX, pin.JointModelPY, pin.JointModelPZ),
-}
-HELICAL_MODELS = pin.JointModelHX, pin.JointModelHY, pin.JointModelHZ
 USUAL_NAMES = (
     "Data", "Data.f", "Force", "Frame", "FrameType", "FrameType.OP_FRAME", "Inertia", "JointData",
     "JointModel", "Model", "Model.addFrame", "Model.addJoint", "Model.appendBodyToJoint", "Model.armature",
@@ -162,6 +160,8 @@ class PinocchioChain:
         self.data = self.pin_model.createData()
         self.joint_count = self.pin_model.njoints - 1
         self.body_rows = [joint - 1 for joint in self.body_joints]  # of the bodies among the joints
+        moved = [k for k, kind in enumerate(model.kinds) if not kind.is_rigid]
+        self.body_of_row = {self.body_rows[k]: k for k in moved}
         self.rod_rows = [j for j in range(self.joint_count) if j not in self.body_rows]
         self.parent_rows = [int(parent) - 1 for parent in self.pin_model.parents][1:]
         self.joints = list(self.pin_model.joints)[1:]
@@ -201,9 +201,10 @@ class PinocchioChain:
             self.placements.append(hang * far * place)
             return parent
         self.placements.append(place)
-        joints = [JOINT_MODELS[what][axis]() for what, axis in kind.motions]
-        if kind.has_pitch:
-            joints = [HELICAL_MODELS[axis](model.length[k]) for _, axis in kind.motions]
+        pitch = (model.length[k],) if kind.has_pitch else ()
+        letters = ["H" if kind.has_pitch else {"turn": "R", "slide": "P"}[what] for what, _ in kind.motions]
+        names = [f"JointModel{x}{'XYZ'[axis]}" for x, (_, axis) in zip(letters, kind.motions, strict=True)]
+        joints = [getattr(pin, name)(*pitch) for name in names]
         joint = joints[0] if len(joints) == 1 else composite(*joints)
         return self._add_joint(parent, joint, hang * far, f"body {k}")
 
@@ -278,48 +279,57 @@ class PinocchioChain:
         self, state: State
     ) -> tuple[Float[Array, "quaternion_entries"], Float[Array, "angle_entries"]]:
         """Map a state to Pinocchio's coordinates q and v."""
-        model = self.source_model
-        attitude, spin = np.zeros((self.joint_count, 4)), np.zeros((self.joint_count, 3))
-        for k, row in enumerate(self.body_rows):
-            if model.kinds[k].is_rigid:
-                continue
-            attitude[row], spin[row] = state.p[k], state.omega[k]
-            if not model.kinds[k].has_attitude:
-                attitude[row] = quaternion_product(state.p[k], model.turn[k, 1])
-                spin[row] = self.placements[k].rotation @ state.omega[k]
-        for row, k in zip(self.rod_rows, np.flatnonzero(model.rods).tolist(), strict=True):
-            attitude[row] = rod_quaternion(state.u[k])
-            spin[row] = rotation_matrix(attitude[row]).T @ np.cross(state.u[k], state.udot[k])
-            spin[row, 2] = 0.0  # the rod does not spin about itself; here it is a rounding of zero
-        relative, v = attitude.copy(), spin.copy()
+        q, T = self._motion(state)
+        return q, T @ minimal_rates(self.source_model, state)
+
+    def _frames(self, state: State) -> tuple[Array, Array]:
+        """Return the joints' frames, quaternions (nj, 4) scalar first, and S (nj, 3, nu) of their ω = S ν."""
+        model, of_rods = self.source_model, np.flatnonzero(self.source_model.rods).tolist()
+        jacobian = velocity_jacobian(model, state).reshape(model.n, 6, -1)
+        frames, S = np.zeros((self.joint_count, 4)), np.zeros((self.joint_count, 3, jacobian.shape[-1]))
+        for k, (kind, row) in enumerate(zip(model.kinds, self.body_rows, strict=True)):
+            if not kind.is_rigid:
+                p, turn = state.p[k], model.turn[k, 1]
+                frames[row] = p if kind.has_attitude else quaternion_product(p, turn)
+                S[row] = self.placements[k].rotation @ jacobian[k, 3:]
+        for i, (row, k) in enumerate(zip(self.rod_rows, of_rods, strict=True)):
+            frames[row] = turn_of_z(state.u[k]) / np.linalg.norm(turn_of_z(state.u[k]))
+            spin = rotation_matrix(frames[row]).T @ cross_matrix(state.u[k])
+            S[row, :2, 3 * i : 3 * i + 3] = spin[:2]  # no rod spins about itself
+        return frames, S
+
+    def _motion(self, state: State) -> tuple[Array, Array]:
+        """Return q, and T of v = T ν, ν = (udot of rods, ω′ of bodies or rates of joints)."""
+        model, (frames, S) = self.source_model, self._frames(state)
         up = np.array(self.parent_rows)
         own = np.flatnonzero(up >= 0)
         up = up[own]
-        relative[own] = quaternion_product(quaternion_conjugate(attitude[up]), attitude[own])
-        v[own] -= np.matvec(rotation_matrix(relative[own]).mT, spin[up])
-        return self._pack(state, np.roll(relative, -1, axis=1), v)
-
-    def _pack(self, state: State, relative: Array, spin: Array) -> tuple[Array, Array]:
-        """Put the coordinates of all joints into q and v: of balls and rods ``relative`` and ``spin``."""
-        model = self.source_model
-        q, v = pin.neutral(self.pin_model), np.zeros(self.pin_model.nv)
-        bodies = {j: k for k, j in enumerate(self.body_rows) if not model.kinds[k].is_rigid}
+        relative = frames.copy()
+        relative[own] = quaternion_product(quaternion_conjugate(frames[up]), frames[own])
+        spin = S.copy()
+        spin[own] -= rotation_matrix(relative[own]).mT @ S[up]
+        q, T = pin.neutral(self.pin_model), np.zeros((self.pin_model.nv, S.shape[-1]))
+        rates = own_rates(model)
         for j, joint in enumerate(self.joints):
-            k = bodies.get(j)
+            k = self.body_of_row.get(j, -1)
             at, to = slice(joint.idx_q, joint.idx_q + joint.nq), slice(joint.idx_v, joint.idx_v + joint.nv)
-            if k is None or model.kinds[k].holds_no_turn:
-                q[at], v[to] = relative[j], spin[j]
+            if k < 0 or model.kinds[k].holds_no_turn:
+                q[at], T[to] = np.roll(relative[j], -1), spin[j]
             elif model.free[k]:
                 q[at] = *state.r[k], *np.roll(state.p[k], -1)
-                v[to] = *(rotation_matrix(state.p[k]).T @ state.v[k]), *state.omega[k]
+                T[to, rates[k]] = block_diag(rotation_matrix(state.p[k]).T, np.eye(3))
             else:
-                q[at], v[to] = state.x[k, : joint.nq], state.xdot[k, : joint.nv]
-        return q, v
+                q[at], T[to, rates[k]] = state.x[k, : joint.nq], np.eye(joint.nv)
+        return q, T
+
+    def rate_map(self, state: State) -> Float[Array, "nv nu"]:
+        """Map ν to the engine's velocity."""
+        return self._motion(state)[1]
 
     def _absolute_attitudes(self, q: Array) -> Array:
         """Return the attitudes (T, nj, 4) of the joints' frames, scalar first, at q (T, nq)."""
         model, frames = self.source_model, np.empty((len(q), self.joint_count, 4))
-        bodies = {row: k for k, row in enumerate(self.body_rows) if not model.kinds[k].is_rigid}
+        bodies = self.body_of_row
         for j, joint in enumerate(self.joints):
             is_jointed = j in bodies and bool(model.kinds[bodies[j]].motions)
             turn = np.roll(q[:, joint.idx_q : joint.idx_q + joint.nq][:, -4:], 1, axis=1)
@@ -511,7 +521,7 @@ class PinocchioChain:
         wrench = self._joint_wrenches()
         reaction = [r @ f.linear for r, f in zip(turn, wrench, strict=True)]
         moment = [r @ f.angular for r, f in zip(turn, wrench, strict=True)]
-        rates = self.rate_map(state, q)
+        rates = self.rate_map(state)
         return StateQuantities(
             acceleration=np.array(acceleration),
             angular_acceleration=np.array(angular),
@@ -542,7 +552,7 @@ class PinocchioChain:
         fields = {"gravity": model.gravity, "q": q, "v": v, "armature": engine.armature.copy()}
         fields |= {f"link_{name}": getattr(model, name) for name in loads}
         fields |= {name: getattr(self, name) for name in ("effort", "damping", "stiffness", "rest")}
-        fields |= {"of_q": self.scalars[0], "of_v": self.scalars[1], "joint_rates": self.rate_map(state, q)}
+        fields |= {"of_q": self.scalars[0], "of_v": self.scalars[1], "joint_rates": self.rate_map(state)}
         fields["elastic"] = np.array(elastic_energy(model, state))
         place = np.arange(len(model.kind))
         settings: dict[str, Any] = {"proximal": PROXIMAL_SETTINGS, "algorithm": self.algorithm}
@@ -559,48 +569,6 @@ class PinocchioChain:
         if any(kind.is_rigid for kind in model.kinds):
             settings["missing"] = dict.fromkeys(("joint_reaction", "joint_moment"), reason)
         return parts | settings | {"fields": fields | {"bodies": place[: model.n], "joints": place}}
-
-    def rate_map(self, state: State, q: Float[Array, "nq"]) -> Float[Array, "nv nu"]:
-        """Map ν = (udot of rods, ω′ of bodies or rates of joints) to the engine's velocity.
-
-        It is T S: v = T W takes absolute rates W to joint rates, W = S ν takes ν to absolute rates.
-
-        Args:
-            q: configuration, in Pinocchio's convention.
-
-        """
-        model, nj = self.source_model, self.joint_count
-        jacobian, rods = (
-            velocity_jacobian(model, state).reshape(model.n, 6, -1),
-            np.flatnonzero(model.rods).tolist(),
-        )
-        spin = np.zeros((nj, 3, jacobian.shape[-1]))  # angular velocities of the joints' frames on ν
-        for i, (j, k) in enumerate(zip(self.rod_rows, rods, strict=True)):
-            spin[j, :, 3 * i : 3 * i + 3] = rotation_matrix(rod_quaternion(state.u[k])).T @ pin.skew(
-                state.u[k]
-            )
-        for k, row in enumerate(self.body_rows):
-            if not model.kinds[k].is_rigid:
-                spin[row] = self.placements[k].rotation @ jacobian[k, 3:]
-        t = np.eye(3 * nj)  # takes absolute rates to those of spherical joints
-        spherical = [j for j, joint in enumerate(self.joints) if joint.shortname() == "JointModelSpherical"]
-        for j in spherical:
-            at, up = self.joints[j].idx_q, self.parent_rows[j]
-            if up >= 0:
-                relative = rotation_matrix(np.roll(q[at : at + 4], 1))
-                t[3 * j : 3 * j + 3, 3 * up : 3 * up + 3] = -relative.T
-        relative_spin = (t @ spin.reshape(3 * nj, -1)).reshape(nj, 3, -1)
-        rates = np.zeros((self.pin_model.nv, jacobian.shape[-1]))
-        for row in spherical:
-            rates[self.joints[row].idx_v :][:3] = relative_spin[row]
-        for k, own in enumerate(own_rates(model)):
-            kind, joint = model.kinds[k], self.joints[self.body_rows[k]]
-            if kind.holds_nothing:
-                rates[joint.idx_v :][:3, own][:, :3] = rotation_matrix(state.p[k]).T
-                rates[joint.idx_v + 3 :][:3, own][:, 3:] = np.eye(3)
-            elif kind.motions:
-                rates[joint.idx_v : joint.idx_v + joint.nv, own] = np.eye(joint.nv)
-        return rates
 
     def _joint_wrenches(self) -> list[pin.Force]:
         """Return each body's joint wrench after `rnea`, in its joint's axes and about its near point.
@@ -716,9 +684,9 @@ class _SpelledTree(PinocchioChain):
         torque = self.usual.joint_torque(self.usual_q, self.usual_v)
         return np.linalg.solve(block_diag(*self.blocks).T, torque)
 
-    def rate_map(self, state: State, q: Array) -> Array:
+    def rate_map(self, state: State) -> Array:
         """Map ν to the velocity at its state."""
-        return np.asarray(block_diag(*self.blocks) @ self.usual.rate_map(state, self.usual_q))
+        return np.asarray(block_diag(*self.blocks) @ self.usual.rate_map(state))
 
 
 def _joint_motion(joint: Any, q: Array) -> tuple[Array, Array]:
@@ -761,25 +729,6 @@ def _joint_turns(model: Model, k: int, x: Array) -> Array:
     return turn
 
 
-def rod_quaternion(u: Float[Array, "3"]) -> Float[Array, "4"]:
-    """Choose an attitude for a rod: half a turn about e_z + u, which takes e_z to u.
-
-    Where u points down it is the shortest turn from -e_z after half a turn about x, to stay away from 0/0.
-
-    Args:
-        u: unit vector, world frame.
-
-    Returns:
-        A unit quaternion, scalar first, that turns e_z into u.
-
-    """
-    if u[2] >= 0:
-        p = np.array([1 + u[2], -u[1], u[0], 0.0])
-    else:
-        p = quaternion_product(np.array([1 - u[2], u[1], -u[0], 0.0]), np.array([0.0, 1.0, 0.0, 0.0]))
-    return np.asarray(p / np.linalg.norm(p))
-
-
 def _add_closed(s: Probed, chain: PinocchioChain) -> None:
     """Add accelerations by all ways to close loops."""
     for by_derivative, call, a in closed_accelerations(chain.loops(s.q, s.v), s.q, s.v):
@@ -796,25 +745,13 @@ def _has_joint(kind: str) -> Callable[[Model], bool]:
     return has
 
 
+USUAL_JOINTS = tuple(f"{kind}{axis}" for kind in "RPH" for axis in "XYZ")
 COLUMN_NAMES = (
     (USUAL_NAMES, lambda _: True),
     (NAMES_OF_LOOPS, lambda model: model.has_loops),
     *(
         ((f"JointModel{kind}", f"JointData{kind}"), _has_joint(kind))
-        for kind in (
-            "RX",
-            "RY",
-            "RZ",
-            "PX",
-            "PY",
-            "PZ",
-            "HX",
-            "HY",
-            "HZ",
-            "Spherical",
-            "FreeFlyer",
-            "Composite",
-        )
+        for kind in (*USUAL_JOINTS, "Spherical", "FreeFlyer", "Composite")
     ),
 )
 
@@ -898,7 +835,7 @@ class Pinocchio(PinocchioAdapter):
         for state in states:
             q, v = chain.coordinates(cut.state(state) if cut else state)
             motion = q, v, chain.acceleration(q, v)
-            s = Probed(chain.pin_model, frames, motion, None if cut else chain.rate_map(state, q))
+            s = Probed(chain.pin_model, frames, motion, None if cut else chain.rate_map(state))
             add_surface(s, inertias)
             if cut and len(found) < CLOSED_STATES:
                 add_parts(s.found, partial(_add_closed, s, chain))
