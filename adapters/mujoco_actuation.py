@@ -11,11 +11,20 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from plumbline.model.datatypes import Array, Float
+from adapters.mujoco_common import (
+    DOFS,
+    add_actuator,
+    add_sensor,
+    dense_rows,
+    member,
+    named_joints,
+    set_attributes,
+    through_inverse,
+)
+from plumbline.model.datatypes import Array
 from plumbline.model.kinematics import rotation_matrix
 
 J = mujoco.mjtJoint
-DOFS = {J.mjJNT_FREE: 6, J.mjJNT_BALL: 3, J.mjJNT_HINGE: 1, J.mjJNT_SLIDE: 1}
 GEAR, COEFFICIENT = -2.0, 0.5  # of actuators; of joints in fixed tendons
 # By way of an effort what its actuators have besides a gear.
 STATELESS: Mapping[str, Mapping[str, str]] = {
@@ -34,35 +43,26 @@ PID: Mapping[str, Mapping[str, str]] = {"pid": {"gaintype": "mjtGain.mjGAIN_PID"
 PID_GAINS = np.array([3.0, 2.0, 4.0])  # of position, velocity and integral
 CALLBACKS = ("set_mjcb_act_gain", "set_mjcb_act_bias", "set_mjcb_act_dyn")
 SERVO: Mapping[str, Mapping[str, str]] = {"servo": {"biastype": "mjtBias.mjBIAS_AFFINE"}, "motor": {}}
+GROUP_OFF = 3  # of actuators that are off
 FAR = 1e6  # of limits that are never reached [rad, m, N or N m]
-
-
-def _named_joints(spec: Any) -> list[Any]:
-    joints = [joint for body in spec.bodies for joint in body.joints]
-    for j, joint in enumerate(joints):
-        joint.name = joint.name or f"joint {j}"
-    return joints
 
 
 def with_actuators(ways: Mapping[str, Mapping[str, str]]) -> Callable[[Any], Any]:
     """Add to every rate of every joint an actuator of each way, without a force so far."""
 
     def describe(spec: Any) -> Any:
-        for joint in _named_joints(spec):
+        for joint in named_joints(spec):
             for way, members in ways.items():
                 for i in range(DOFS[joint.type]):
-                    actuator = spec.add_actuator()
-                    actuator.name, actuator.target = f"{way} of {joint.name} {i}", joint.name
-                    actuator.trntype, actuator.gear = mujoco.mjtTrn.mjTRN_JOINT, GEAR * np.eye(6)[i]
+                    actuator = add_actuator(
+                        spec, f"{way} of {joint.name} {i}", "JOINT", joint.name, GEAR * np.eye(6)[i]
+                    )
                     actuator.gainprm[0], actuator.dynprm[0] = 1.0, 0.1
-                    for name, member in members.items():
-                        enumeration, _, entry = member.partition(".")
-                        setattr(actuator, name, getattr(getattr(mujoco, enumeration), entry))
+                    set_attributes(actuator, **{name: member(one) for name, one in members.items()})
                     if way == "pid":
                         inputs = mujoco.mjtCtrlInput
-                        spec_of_input = inputs.mjINPUT_POS, inputs.mjINPUT_VEL, inputs.mjINPUT_FF
+                        total = sum(map(int, (inputs.mjINPUT_POS, inputs.mjINPUT_VEL, inputs.mjINPUT_FF)))
                         kp, kv, ki = PID_GAINS
-                        total = sum(int(one) for one in spec_of_input)
                         actuator.set_to_pid(kp=kp, kv=kv, ki=ki, ctrlspec=total)
                     if actuator.dyntype == mujoco.mjtDyn.mjDYN_USER:
                         actuator.actdim = 1
@@ -84,9 +84,7 @@ def _add_sensors(spec: Any) -> None:
             if not hasattr(mujoco.mjtSensor, f"mjSENS_{kind}"):
                 continue
             one.name = one.name or f"{of} {i}"
-            sensor = spec.add_sensor()
-            sensor.name, sensor.type = f"{kind} {one.name}", getattr(mujoco.mjtSensor, f"mjSENS_{kind}")
-            sensor.objtype, sensor.objname = getattr(mujoco.mjtObj, f"mjOBJ_{of}"), one.name
+            add_sensor(spec, kind, of, one.name)
 
 
 def _actuators(m: Any, way: str) -> Iterator[tuple[int, int, int]]:
@@ -188,21 +186,10 @@ def _accelerate_by_sensors(m: Any, d: Any, kind: str) -> None:
             if DOFS[J(m.jnt_type[j])] == 1:
                 force[m.jnt_dofadr[j]] = d.sensor(f"{kind} {m.joint(j).name}").data[0]
     else:
-        moment = dense_moment(m, d)
+        moment = dense_rows(d.actuator_moment, d, "moment", m.nv)
         exerted = np.array([d.sensor(f"{kind} {m.actuator(a).name}").data[0] for a in range(len(moment))])
         force = exerted @ moment
-    total = d.qfrc_smooth - d.qfrc_actuator + force
-    mujoco.mj_solveM(m, d, d.qacc[None], total[None])
-
-
-def dense_moment(m: Any, d: Any) -> Float[Array, "nu nv"]:
-    """Moments of all actuators; older versions hold them so."""
-    if d.actuator_moment.ndim == 2:
-        return np.asarray(d.actuator_moment)
-    dense = np.zeros((len(d.moment_rownnz), m.nv))
-    for row, at, count in zip(dense, d.moment_rowadr, d.moment_rownnz, strict=True):
-        row[d.moment_colind[at : at + count]] = d.actuator_moment[at : at + count]
-    return dense
+    d.qacc[:] = through_inverse(m, d, d.qfrc_smooth - d.qfrc_actuator + force)
 
 
 def forward_by_callbacks(m: Any, d: Any) -> None:
@@ -228,14 +215,12 @@ def forward_by_callbacks(m: Any, d: Any) -> None:
 
 def with_fixed_tendons(spec: Any) -> Any:
     """Add a tendon on every hinge and slide, with a motor."""
-    for joint in _named_joints(spec):
+    for joint in named_joints(spec):
         if DOFS[joint.type] == 1:
             tendon = spec.add_tendon()
             tendon.name = f"of {joint.name}"
             tendon.wrap_joint(joint.name, COEFFICIENT)
-            actuator = spec.add_actuator()
-            actuator.name = actuator.target = tendon.name
-            actuator.trntype, actuator.gear = mujoco.mjtTrn.mjTRN_TENDON, GEAR * np.eye(6)[0]
+            add_actuator(spec, tendon.name, "TENDON", tendon.name, GEAR * np.eye(6)[0])
     _add_sensors(spec)
     return spec
 
@@ -276,10 +261,9 @@ def forward_by_tendons(m: Any, d: Any) -> None:
     for j, t in _tendons(m):
         rate, sensor = m.jnt_dofadr[j], d.sensor(f"TENDONACTFRC {m.tendon(t).name}")
         total[rate] += COEFFICIENT * GEAR * sensor.data[0] - effort[rate]
-    mujoco.mj_solveM(m, d, d.qacc[None], total[None])
+    d.qacc[:] = through_inverse(m, d, total)
     mujoco.mj_inverse(m, d)
-    total = d.qfrc_inverse + d.qfrc_passive - d.qfrc_bias
-    mujoco.mj_solveM(m, d, d.qacc[None], total[None])
+    d.qacc[:] = through_inverse(m, d, d.qfrc_inverse + d.qfrc_passive - d.qfrc_bias)
     d.qfrc_applied[:] = effort
 
 
@@ -288,26 +272,18 @@ def forward_by_tendons(m: Any, d: Any) -> None:
 
 def with_far_limits(spec: Any) -> Any:
     """Limit joints, controls and forces where nothing reaches, and add motors that are switched off."""
-    for joint in _named_joints(spec):
+    for joint in named_joints(spec):
         if joint.type != J.mjJNT_FREE:
             joint.limited, joint.range = mujoco.mjtLimited.mjLIMITED_TRUE, [-FAR, FAR]
         if joint.type == J.mjJNT_BALL:
             joint.range = [0.0, FAR]
         if DOFS[joint.type] == 1:
             joint.actfrclimited, joint.actfrcrange = mujoco.mjtLimited.mjLIMITED_TRUE, [-FAR, FAR]
-        actuator = spec.add_actuator()
-        actuator.name, actuator.target, actuator.group = f"off {joint.name}", joint.name, 3
-        actuator.trntype = mujoco.mjtTrn.mjTRN_JOINT
+        add_actuator(spec, f"off {joint.name}", "JOINT", joint.name, np.eye(6)[0], group=GROUP_OFF)
     for actuator in spec.actuators:
         actuator.forcelimited = actuator.ctrllimited = mujoco.mjtLimited.mjLIMITED_TRUE
         actuator.forcerange = actuator.ctrlrange = [-FAR, FAR]
     return spec
-
-
-def without_group(m: Any, d: Any) -> tuple[Any, Any]:
-    """Switch a group of actuators off."""
-    m.opt.disableactuator = 1 << 3
-    return m, d
 
 
 def forward_with_group_off(m: Any, d: Any) -> None:

@@ -58,6 +58,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from adapters.mujoco_common import full_mass_matrix, member, set_attributes, warnings_to
 from adapters.mujoco_surface import POSE_FUNCTIONS, add_probes, pose_function, surface_answer
 from adapters.mujoco_variants import (
     COLUMN_NAMES,
@@ -299,7 +300,7 @@ class Mujoco(MetamorphicHooks):
         self, chain: _MujocoChain, state: State, times: Array, integrator: Integrator, resolution: float
     ) -> Trajectory:
         chain.m.opt.timestep = resolution
-        chain.m.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.name.upper()}")
+        chain.m.opt.integrator = member(f"mjtIntegrator.mjINT_{integrator.name.upper()}")
         chain.set_state(state)
         counts = np.round(times / resolution).astype(int)
         t, rows = [0.0], [(*chain.sample(), *chain.joint_sample())]
@@ -417,10 +418,10 @@ class _MujocoChain:
             link = self._add_body(parent, pos, one.mass, *_principal_inertia(one.inertia), quat=quat)
             if kind.holds_nothing:
                 for joint in self.change.free_joints:
-                    _set_attributes(link.add_joint(), **joint)
+                    set_attributes(link.add_joint(), **joint)
             for what, axis in kind.motions:
                 along = kinematics.rotation_matrix(q_near)[:, axis]
-                _set_attributes(link.add_joint(), type=JOINT_TYPES[what], pos=near, axis=along)
+                set_attributes(link.add_joint(), type=JOINT_TYPES[what], pos=near, axis=along)
         self.link_ids.append(len(self.mass) - 1)
         for piece in pieces if len(pieces) > 1 else ():  # before the next link: ids go depth first
             self._add_body(link, piece.centre, piece.mass, *_principal_inertia(piece.inertia))
@@ -437,7 +438,7 @@ class _MujocoChain:
         quat: Array = IDENTITY_QUATERNION,
     ) -> Any:
         """Add a body on a ball joint, or on none; of unit mass until ``mass`` and ``inertia`` are set."""
-        body = _set_attributes(
+        body = set_attributes(
             parent.add_body(),
             pos=pos, quat=quat, mass=1.0, inertia=np.ones(3), ipos=np.zeros(3), iquat=axes,
             explicitinertial=True,
@@ -446,10 +447,10 @@ class _MujocoChain:
             turn = kinematics.rotation_matrix(axes)
             J = turn * inertia @ turn.T
             full = J[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-            _set_attributes(body, mass=mass, inertia=np.zeros(3), iquat=IDENTITY_QUATERNION, fullinertia=full)
+            set_attributes(body, mass=mass, inertia=np.zeros(3), iquat=IDENTITY_QUATERNION, fullinertia=full)
         if joint is not None:
             for one in self.change.ball_joints:
-                _set_attributes(body.add_joint(), pos=joint, **one)
+                set_attributes(body.add_joint(), pos=joint, **one)
             self.ball_ids.append(len(self.mass))
         self.mass.append(mass)
         self.inertia.append(inertia)
@@ -538,11 +539,11 @@ class _MujocoChain:
         """Evaluate the engine's forward dynamics, then declare its loads as applied ones; returns T."""
         m, d, link = self.m, self.d, self.link_ids
         T = self.set_state(state)
-        m.opt.enableflags = mujoco.mjtEnableBit.mjENBL_ENERGY
+        m.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
         self.change.forward(m, d)
         mujoco.mj_subtreeVel(m, d)
         if self.use_dense_solve:
-            d.qacc = np.linalg.solve(_full_mass_matrix(m, d), d.qfrc_smooth + d.qfrc_constraint)
+            d.qacc = np.linalg.solve(full_mass_matrix(m, d), d.qfrc_smooth + d.qfrc_constraint)
         velocity = self._spatial_motion(mujoco.mj_objectVelocity, d)
         d.xfrc_applied[link, :3] -= self.model.drag_force[:, None] * velocity[:, 3:]
         moment = np.matvec(d.xmat[link].reshape(-1, 3, 3), self.model.moment)
@@ -554,7 +555,7 @@ class _MujocoChain:
         """Evaluate all state quantities at one state."""
         m, d, link = self.m, self.d, self.link_ids
         T = self.evaluate_forward(state)
-        M = _full_mass_matrix(m, d)
+        M = full_mass_matrix(m, d)
         acceleration = self._spatial_motion(mujoco.mj_objectAcceleration, d)
         com, momentum = d.subtree_com[0], m.body_subtreemass[0] * d.subtree_linvel[0]
         return StateQuantities(
@@ -766,12 +767,12 @@ def _extrapolated(soft: _SoftMechanism, state: State, there: State, largest: flo
 
 def _add_load_actuators(spec: Any, body: Any, k: int, model: Model) -> None:
     """Add n′ − c_r ω′ and −c_t ṙ of body k where they act: force = bias + rate · velocity along each axis."""
-    _set_attributes(body.add_site(), name=f"com{k}")
+    set_attributes(body.add_site(), name=f"com{k}")
     biases = np.concatenate([np.zeros(3), model.moment[k]])
     rates = -np.repeat([model.drag_force[k], model.drag_moment[k]], 3)
     for gear, bias, rate in zip(np.eye(6), biases, rates, strict=True):
         if bias or rate:
-            _set_attributes(
+            set_attributes(
                 spec.add_actuator(),
                 trntype=mujoco.mjtTrn.mjTRN_SITE,
                 target=f"com{k}",
@@ -789,10 +790,10 @@ def _add_tendons(spec: Any, links: list[Any], model: Model) -> None:
 
 
 def _add_tendon(spec: Any, links: list[Any], name: str, bodies: NDArray[np.intp], points: Array) -> None:
-    tendon = _set_attributes(spec.add_tendon(), name=name)
+    tendon = set_attributes(spec.add_tendon(), name=name)
     for side, (body, point) in enumerate(zip(bodies, points, strict=True)):
         owner = links[body] if body >= 0 else spec.worldbody
-        _set_attributes(owner.add_site(), name=f"{name} {side}", pos=point)
+        set_attributes(owner.add_site(), name=f"{name} {side}", pos=point)
         tendon.wrap_site(f"{name} {side}")
 
 
@@ -803,9 +804,9 @@ def _add_equalities(spec: Any, links: list[Any], constraints: _Constraints) -> N
         _add_equality(spec, "TENDON", f"tie {i}")
     for k, motions in enumerate(constraints.held):
         for i in motions:
-            joint = _set_attributes(links[k].joints[i], name=f"held {k} {i}")
+            joint = set_attributes(links[k].joints[i], name=f"held {k} {i}")
             if pitch := constraints.pitches[k]:  # slide = pitch × hinge
-                turn = _set_attributes(links[k].joints[1 - i], name=f"turn {k}")
+                turn = set_attributes(links[k].joints[1 - i], name=f"turn {k}")
                 equality = _add_equality(spec, "JOINT", joint.name, turn.name)
                 equality.data[:5] = 0.0, pitch, 0.0, 0.0, 0.0
             else:
@@ -813,17 +814,16 @@ def _add_equalities(spec: Any, links: list[Any], constraints: _Constraints) -> N
     for loop, pair in enumerate(constraints.ends):
         names = [f"end {loop} {side}" for side in (1, 2)]
         for k, name in zip(pair, names, strict=True):
-            _set_attributes(links[k].add_site(), name=name)
+            set_attributes(links[k].add_site(), name=name)
         _add_equality(spec, "WELD", *names)
 
 
 def _add_equality(spec: Any, kind: Literal["TENDON", "JOINT", "WELD"], name: str, other: str = "") -> Any:
     """Add a constraint at zero, as hard as MuJoCo accepts; of an other element only where there is one."""
     of = {"WELD": "SITE"}.get(kind, kind)
-    return _set_attributes(
-        spec.add_equality(), type=getattr(mujoco.mjtEq, f"mjEQ_{kind}"),
-        objtype=getattr(mujoco.mjtObj, f"mjOBJ_{of}"), name1=name, name2=other,
-        solref=[0.0, 0.0], solimp=[*[MAX_IMPEDANCE] * 2, 1, 0.5, 2],
+    return set_attributes(
+        spec.add_equality(), type=member(f"mjtEq.mjEQ_{kind}"), objtype=member(f"mjtObj.mjOBJ_{of}"),
+        name1=name, name2=other, solref=[0.0, 0.0], solimp=[*[MAX_IMPEDANCE] * 2, 1, 0.5, 2],
     )  # fmt: skip
 
 
@@ -850,12 +850,8 @@ def _to_body_frame(xmat: Array, vector: Array) -> Array:
 def _raise_on_warnings(d: Any) -> Iterator[None]:
     """Raise EngineFailure for any warning that MuJoCo counts, with its text, which no log file gets."""
     texts: list[str] = []
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(texts.append)
-    try:
+    with warnings_to(texts.append):
         yield
-    finally:
-        mujoco.set_mju_user_warning(before)
     if texts or any(warning.number for warning in d.warning):
         raise EngineFailure(f"MuJoCo warned by t = {d.time:g} s: {texts[0] if texts else 'no text'}")
 
@@ -892,20 +888,3 @@ def _compiler_options(spec: Any) -> Any:
 def _autoreset_flag() -> int:
     """Return the flag that disables resets; 3.2.0 always resets, which the contract's checks report."""
     return int(getattr(mujoco.mjtDisableBit, "mjDSBL_AUTORESET", 0))
-
-
-def _full_mass_matrix(m: Any, d: Any) -> Array:
-    """Return the dense mass matrix (nv, nv); `mj_fullM` of older versions (3.4 among them) takes others."""
-    M = np.zeros((m.nv, m.nv))
-    try:
-        mujoco.mj_fullM(m, d, M)
-    except TypeError:
-        mujoco.mj_fullM(m, M, d.qM)
-    return M
-
-
-def _set_attributes(element: Any, **attributes: Any) -> Any:
-    """Set attributes of an element of a spec; only later versions take them as arguments."""
-    for name, value in attributes.items():
-        setattr(element, name, value)
-    return element

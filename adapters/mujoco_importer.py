@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from functools import cached_property
 from typing import Any
 
@@ -25,6 +24,7 @@ import mujoco
 import numpy as np
 
 from adapters.importer_common import Layout, LoadingImporter, Refused, free_joint_name, make_joint, pose
+from adapters.mujoco_common import full_mass_matrix, warnings_to
 from plumbline.importers.importer import ModelFile
 from plumbline.importers.neutral_model import (
     CanonicalState,
@@ -33,7 +33,6 @@ from plumbline.importers.neutral_model import (
     ModelQuantities,
     NeutralBody,
 )
-from plumbline.model.datatypes import Array
 from plumbline.model.kinematics import rotation_matrix
 
 KINDS: dict[int, JointKind] = {
@@ -79,7 +78,7 @@ class _Layout(Layout):
         mujoco.mj_energyVel(m, d)
         return ModelQuantities(
             poses=poses,
-            mass_matrix=_full_mass_matrix(m, d),
+            mass_matrix=full_mass_matrix(m, d),
             bias_force=np.array(d.qfrc_bias),
             gravity_force=gravity_force,
             passive_force=np.array(d.qfrc_passive),
@@ -100,7 +99,7 @@ class MujocoImporter(LoadingImporter):
     layout = _Layout
 
     def _load(self, file: ModelFile) -> Any:
-        with _printed_warnings():
+        with warnings_to(_print):
             try:
                 return _compiled(file)
             except ValueError as error:
@@ -108,19 +107,12 @@ class MujocoImporter(LoadingImporter):
 
     def evaluate(self, file: ModelFile, states: Sequence[CanonicalState]) -> list[ModelQuantities]:
         """Compute the quantities, with MuJoCo's warnings printed."""
-        with _printed_warnings():
+        with warnings_to(_print):
             return super().evaluate(file, states)
 
 
-@contextmanager
-def _printed_warnings() -> Iterator[None]:
-    """Print MuJoCo's warnings, which it would write to a log file in the current folder."""
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda text: print(text, file=sys.stderr, flush=True))
-    try:
-        yield
-    finally:
-        mujoco.set_mju_user_warning(before)
+def _print(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
 
 
 def _compiled(file: ModelFile) -> Any:
@@ -186,12 +178,3 @@ def _gravity_potential(m: Any, d: Any) -> float:
     mujoco.mj_energyPos(m, d)
     m.jnt_stiffness[:] = kept
     return float(d.energy[0])
-
-
-def _full_mass_matrix(m: Any, d: Any) -> Array:
-    M = np.zeros((m.nv, m.nv))
-    try:
-        mujoco.mj_fullM(m, d, M)
-    except TypeError:  # 3.4 and older take other arguments
-        mujoco.mj_fullM(m, M, d.qM)
-    return M

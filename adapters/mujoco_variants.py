@@ -20,36 +20,22 @@ import numpy as np
 
 from adapters import mujoco_actuation as actuation
 from adapters import mujoco_shapes as shapes
-from adapters.pose_functions import xyz_angles
-from plumbline.engines.variants import Variant, VariantKind
-from plumbline.model.datatypes import Array, Call, Float, Model
+from adapters.mujoco_common import dense_rows, member, through_inverse
+from adapters.pose_functions import FIXED_PLACE, Pose, rate_maps
+from plumbline.engines.variants import Variant, variants_of
+from plumbline.model.datatypes import Array, Call, Model
 from plumbline.model.kinematics import quaternion_conjugate, quaternion_product, rotation_matrix
+from plumbline.model.probe_frames import PROBE_ATTITUDE
 
 HINGE_ANGLES = np.array([0.4, -0.7, 1.1])  # rad, about x, y, z in turn: far from singular ones
 # Of principal moments that MuJoCo finds by itself: of 1,500 random inertias of 1e-9 … 1e3 kg m² they were
 # off by 2.4e-14 at most.
 ROUNDING = 1e-12
-FRAME_POINT, FRAME_TURN = np.array([0.3, -0.2, 0.5]), np.array([1.0, 2.0, 3.0, 4.0]) / np.sqrt(30.0)
-
-
-def _turns() -> list[Array]:
-    halves = HINGE_ANGLES / 2
-    return [np.append(np.cos(h), np.sin(h) * e) for h, e in zip(halves, np.eye(3), strict=True)]
-
-
-_X, _Y, _Z = _turns()
-HINGE_TURN = quaternion_product(quaternion_product(_X, _Y), _Z)
+HINGE_TURN = np.array([1.0, 0.0, 0.0, 0.0])
+for _half, _axis in zip(HINGE_ANGLES / 2, np.eye(3), strict=True):
+    HINGE_TURN = quaternion_product(HINGE_TURN, np.append(np.cos(_half), np.sin(_half) * _axis))
 # ω of the body in its own axes = HINGE_RATES (rates of the three hinges)
-HINGE_RATES = np.stack(
-    [
-        rotation_matrix(quaternion_product(_Y, _Z)).T @ np.eye(3)[0],
-        rotation_matrix(_Z).T @ np.eye(3)[1],
-        np.eye(3)[2],
-    ],
-    axis=1,
-)
-
-
+HINGE_RATES = rate_maps(Pose(np.zeros(3), HINGE_TURN))["xyzdot"]
 BALL = ({"type": mujoco.mjtJoint.mjJNT_BALL},)
 HINGES, SLIDES = (
     tuple({"type": getattr(mujoco.mjtJoint, f"mjJNT_{kind}"), "axis": axis} for axis in np.eye(3))
@@ -71,12 +57,11 @@ NEEDLESS = tuple(  # flags of what no free mechanism without elements has
     )
 )  # fmt: skip
 BIAS = "mj_rne"
-MOTORS = ("mjtDyn.mjDYN_NONE", "mjtBias.mjBIAS_NONE", "mjtObj.mjOBJ_ACTUATOR")
+MOTORS = "mjtDyn.mjDYN_NONE mjtBias.mjBIAS_NONE mjtObj.mjOBJ_ACTUATOR"
 SHAPES = (
-    "mjtInertiaFromGeom",
-    "MjsGeom", "MjsMesh", "mjtGeom", "mjtMeshInertia", "mjtGeomInertia", "mjtGeomInertia.mjINERTIA_VOLUME",
-    "mjtGeomInertia.mjINERTIA_SHELL",
-)  # fmt: skip
+    "mjtInertiaFromGeom MjsGeom MjsMesh mjtGeom mjtMeshInertia mjtGeomInertia "
+    "mjtGeomInertia.mjINERTIA_VOLUME mjtGeomInertia.mjINERTIA_SHELL"
+)
 LAST_STAGES = ("mj_fwdActuation", "mj_fwdAcceleration", "mj_fwdConstraint")
 STAGES = ("mj_fwdPosition", "mj_energyPos", "mj_fwdVelocity", "mj_energyVel", *LAST_STAGES)
 PARTS = (  # the functions that the stages of positions and velocities call
@@ -84,10 +69,7 @@ PARTS = (  # the functions that the stages of positions and velocities call
     "mj_projectConstraint", "mj_transmission", "mj_energyPos", "mj_fwdVelocity", "mj_comVel", "mj_passive",
     "mj_referenceConstraint", BIAS, "mj_energyVel", *LAST_STAGES,
 )  # fmt: skip
-OTHER_PARTS = (
-    "mj_fwdKinematics",
-    *PARTS[3:],
-)
+OTHER_PARTS = ("mj_fwdKinematics", *PARTS[3:])
 
 
 @dataclass(frozen=True)
@@ -103,24 +85,18 @@ class Change:
     free_joints: Sequence[Mapping[str, Any]] = ({"type": mujoco.mjtJoint.mjJNT_FREE},)
 
 
-def _options(
-    iterations: int = 100,
-    tolerance: float = 0.0,
-    suits: Callable[[Model], bool] = lambda model: is_constrained(model),
-    **members: str,
-) -> Variant:
-    """Set fields of `MjOption` to members of their enumerations; they concern constraints, of loops."""
+def _set_options(**values: Any) -> Callable[[Any, Any], tuple[Any, Any]]:
+    """Set fields of `MjOption` before data are made: numbers, members, flags besides those that are set."""
 
     def remake(m: Any, d: Any) -> tuple[Any, Any]:
-        m.opt.iterations, m.opt.tolerance = iterations, tolerance
-        for name, member in members.items():
-            enumeration, _, entry = member.partition(".")
-            value = getattr(getattr(mujoco, enumeration), entry)
-            before = m.opt.disableflags if name == "disableflags" else 0
-            setattr(m.opt, name, int(value) | before)
-        return m, d
+        for name, value in values.items():
+            given = value
+            if isinstance(value, str):
+                given = int(member(value)) | (getattr(m.opt, name) if name.endswith("flags") else 0)
+            setattr(m.opt, name, given)
+        return m, mujoco.MjData(m)
 
-    return Variant("option", tuple(members.values()), Change(remake=remake), suits)
+    return remake
 
 
 def is_constrained(model: Model) -> bool:
@@ -299,30 +275,19 @@ def _default_options(m: Any, d: Any) -> tuple[Any, Any]:
     return m, d
 
 
-def _sparse_rows(d: Any, name: str, width: int) -> Array:
-    """A sparse matrix of constraints as a dense one; old versions hold it so."""
-    values, counts = getattr(d, name), getattr(d, f"{name}_rownnz")
-    if values.size == len(counts) * width and not np.any(counts):
-        return np.reshape(values, (-1, width))
-    dense = np.zeros((len(counts), width))
-    for row, at, count in zip(dense, getattr(d, f"{name}_rowadr"), counts, strict=True):
-        row[getattr(d, f"{name}_colind")[at : at + count]] = values[at : at + count]
-    return dense
-
-
 def _forward_by_constraint_matrix(m: Any, d: Any) -> None:
     """Solve for the forces of constraints by their matrix, that of dual solvers, and by its root."""
     mujoco.mj_forward(m, d)
-    root = _sparse_rows(d, "efc_Y", m.nv)
-    matrices = _sparse_rows(d, "efc_AR", len(d.efc_b)), root @ root.T + np.diag(d.efc_R)
+    root = dense_rows(d.efc_Y, d, "efc_Y", m.nv)
+    matrices = dense_rows(d.efc_AR, d, "efc_AR", len(d.efc_b)), root @ root.T + np.diag(d.efc_R)
     d.efc_force[:] = -sum(np.linalg.solve(matrix, d.efc_b) for matrix in matrices) / 2
     mujoco.mj_mulJacTVec(m, d, d.qfrc_constraint, d.efc_force)
-    mujoco.mj_solveM(m, d, d.qacc[None], (d.qfrc_smooth + d.qfrc_constraint)[None])
+    d.qacc[:] = through_inverse(m, d, d.qfrc_smooth + d.qfrc_constraint)
 
 
 def _constraint_forces(m: Any, d: Any, softness: Array, reference: Array) -> Array:
     """Solve for the forces of constraints by their Jacobian."""
-    rows = _sparse_rows(d, "efc_J", m.nv)
+    rows = dense_rows(d.efc_J, d, "efc_J", m.nv)
     through, product = np.zeros_like(rows), np.zeros(len(rows))
     mujoco.mj_solveM(m, d, through, rows)
     mujoco.mj_mulJacVec(m, d, product, d.qacc_smooth)
@@ -335,7 +300,7 @@ def _forward_by_constraint_rows(m: Any, d: Any) -> None:
     impedance = np.reshape(d.efc_KBIP, (-1, 4))[:, 2]
     force = _constraint_forces(m, d, d.efc_diagA * (1 - impedance) / impedance, d.efc_aref)
     mujoco.mj_constraintUpdate(m, d, -force / d.efc_D, None, 0)
-    mujoco.mj_solveM(m, d, d.qacc[None], (d.qfrc_smooth + d.qfrc_constraint)[None])
+    d.qacc[:] = through_inverse(m, d, d.qfrc_smooth + d.qfrc_constraint)
 
 
 def _forward_by_islands(m: Any, d: Any) -> None:
@@ -345,15 +310,12 @@ def _forward_by_islands(m: Any, d: Any) -> None:
     softness, reference, own = np.ones((3, size))
     softness[rows], reference[rows], own[rows] = d.iefc_R, d.iefc_aref, d.iefc_force
     d.efc_force[:] = (own + _constraint_forces(m, d, softness, reference)) / 2
-    total, of_forces, smooth, change = d.qfrc_smooth.copy(), *np.zeros((3, m.nv))
+    total, of_forces, smooth = d.qfrc_smooth.copy(), *np.zeros((2, m.nv))
     total[dofs] = d.ifrc_smooth + d.ifrc_constraint
-    mujoco.mj_solveM(m, d, of_forces[None], total[None])
-    mujoco.mj_mulJacTVec(m, d, total, own)
-    mujoco.mj_solveM(m, d, change[None], total[None])
-    smooth[:] = d.qacc_smooth
-    d.qacc[:] = smooth
+    mujoco.mj_mulJacTVec(m, d, of_forces, own)
+    d.qacc[:] = smooth[:] = d.qacc_smooth
     smooth[dofs], d.qacc[dofs] = d.iacc_smooth, d.iacc
-    d.qacc[:] = (d.qacc + of_forces + smooth + change) / 3
+    d.qacc[:] = (d.qacc + through_inverse(m, d, total) + smooth + through_inverse(m, d, of_forces)) / 3
 
 
 def _forward_by_switched_welds(m: Any, d: Any) -> None:
@@ -368,15 +330,6 @@ def _switched_off(spec: Any) -> Any:
     return spec
 
 
-def _forward_with_flags(*members: str) -> Callable[[Any, Any], None]:
-    def forward(m: Any, d: Any) -> None:
-        for member in members:
-            m.opt.enableflags |= int(getattr(mujoco.mjtEnableBit, member.partition(".")[2]))
-        mujoco.mj_forward(m, d)
-
-    return forward
-
-
 def _never_asleep(spec: Any) -> Any:
     for body in _bodies(spec):
         if body.parent.name == "world":
@@ -384,34 +337,10 @@ def _never_asleep(spec: Any) -> Any:
     return spec
 
 
-def _with_sleep(m: Any, d: Any) -> tuple[Any, Any]:
-    """Allow sleep before the data are made; of what may sleep, all is slow enough."""
-    m.opt.sleep_tolerance = 1e9
-    m.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
-    return m, mujoco.MjData(m)
-
-
-def _line_search(m: Any, d: Any) -> tuple[Any, Any]:
-    m.opt.iterations, m.opt.tolerance, m.opt.ls_iterations, m.opt.ls_tolerance = 3, 0.0, 7, 1e-3
-    return m, d
-
-
-def _set_options(**values: str | int) -> Callable[[Any, Any], tuple[Any, Any]]:
-    def remake(m: Any, d: Any) -> tuple[Any, Any]:
-        m.opt.iterations, m.opt.tolerance = 3, 0.0
-        for name, value in values.items():
-            enumeration, _, entry = str(value).partition(".")
-            given = int(getattr(getattr(mujoco, enumeration), entry))
-            setattr(m.opt, name, given | (m.opt.enableflags if name == "enableflags" else 0))
-        return m, d
-
-    return remake
-
-
-def _flags(m: Any, d: Any) -> tuple[Any, Any]:
+def _without_needless(m: Any, d: Any) -> tuple[Any, Any]:
     """Disable what the mechanism has none of."""
     for flag in NEEDLESS:
-        m.opt.disableflags |= int(getattr(mujoco.mjtDisableBit, flag.partition(".")[2]))
+        m.opt.disableflags |= int(member(flag))
     return m, d
 
 
@@ -426,40 +355,28 @@ def _bodies(spec: Any) -> list[Any]:
 def _in_frames(spec: Any) -> Any:
     """Put every body in two frames, one in the other."""
     for body in _bodies(spec):
-        back = quaternion_conjugate(FRAME_TURN)
-        outer = body.parent.add_frame(pos=FRAME_POINT, quat=FRAME_TURN)
-        inner = body.parent.add_frame(pos=-rotation_matrix(back) @ FRAME_POINT, quat=back)
+        back = quaternion_conjugate(PROBE_ATTITUDE)
+        outer = body.parent.add_frame(pos=FIXED_PLACE, quat=PROBE_ATTITUDE)
+        inner = body.parent.add_frame(pos=-rotation_matrix(back) @ FIXED_PLACE, quat=back)
         inner.set_frame(outer)
         body.set_frame(inner)
     return spec
 
 
-def _oriented(kind: str, field: str, convert: Callable[[Array], Array]) -> Callable[[Any], Any]:
+def _oriented(kind: str, convert: Callable[[Pose], Array]) -> Variant:
     """Give the attitudes of bodies and of their inertias in another form than as quaternions."""
 
     def describe(spec: Any) -> Any:
         spec.compiler.degree, spec.compiler.eulerseq = False, list("xyz")
         for body in _bodies(spec):
             for orientation, quat in ((body.alt, body.quat), (body.ialt, body.iquat)):
-                orientation.type = getattr(mujoco.mjtOrientation, f"mjORIENTATION_{kind}")
-                setattr(orientation, field, convert(np.array(quat)))
+                orientation.type = member(f"mjtOrientation.mjORIENTATION_{kind}")
+                pose = Pose(np.zeros(3), np.array(quat) / np.linalg.norm(quat))
+                setattr(orientation, kind.lower(), convert(pose))
         return spec
 
-    return describe
-
-
-def _euler_angles(q: Float[Array, "4"]) -> Float[Array, "3"]:
-    return xyz_angles(rotation_matrix(q / np.linalg.norm(q)))
-
-
-def _axis_angle(q: Float[Array, "4"]) -> Float[Array, "4"]:
-    size = np.linalg.norm(q[1:])
-    axis = q[1:] / size if size else np.array([0.0, 0.0, 1.0])
-    return np.append(axis, 2 * np.arctan2(size, q[0]))
-
-
-def _xy_axes(q: Float[Array, "4"]) -> Float[Array, "6"]:
-    return rotation_matrix(q / np.linalg.norm(q))[:, :2].T.ravel()
+    more = " MjsOrientation" if kind == "EULER" else ""
+    return _spelling(f"mjtOrientation.mjORIENTATION_{kind}{more}", describe=describe)
 
 
 def _has_free_balls(model: Model) -> bool:
@@ -480,9 +397,8 @@ def _has_free_bodies(model: Model) -> bool:
     return _is_free(model) and bool(np.any(model.free))
 
 
-def _free(kind: VariantKind, names: Call, **change: Any) -> Variant:
-    """Describe a variant of all mechanisms without constraints."""
-    return Variant(kind, names, Change(**change), _is_free)
+_option = variants_of("option", Change, _is_free)
+_spelling = variants_of("spelling", Change, _is_free)
 
 
 def _has_elements(*names: str) -> Callable[[Model], bool]:
@@ -490,234 +406,174 @@ def _has_elements(*names: str) -> Callable[[Model], bool]:
     return lambda model: _is_free(model) and any(np.any(getattr(model, name)) for name in names)
 
 
+def _options(suits: Callable[[Model], bool] = is_constrained, **values: Any) -> Variant:
+    """Set options that concern constraints; the texts among them are its names."""
+    names = " ".join(value for value in values.values() if isinstance(value, str))
+    return _option(names, suits, remake=_set_options(**{"iterations": 100, "tolerance": 0.0} | values))
+
+
 def _of_shapes(by: str, describe: Callable[[Any], Any], suits: Callable[[Model], bool]) -> Variant:
     """Describe bodies of geoms."""
-    names = f"mjtInertiaFromGeom.mjINERTIAFROMGEOM_{by}", *SHAPES
-    change = Change(has_own_inertia=True, describe=describe)
-    return Variant("spelling", names, change, lambda model: _has_inertia(model) and suits(model))
+    names = f"mjtInertiaFromGeom.mjINERTIAFROMGEOM_{by} {SHAPES}"
+    both: Callable[[Model], bool] = lambda model: _has_inertia(model) and suits(model)  # noqa: E731
+    return _spelling(names, both, has_own_inertia=True, describe=describe)
 
 
-def _actuated(ways: Mapping[str, Mapping[str, str]], read: str = "") -> Variant:
-    """Describe efforts that actuators exert."""
-    names = *actuation.names_of(ways), *((f"mjtSensor.mjSENS_{read}", *MOTORS) if read else ("mjtDyn",))
-    place = "MjData.ctrl" if read else "MjData.act"
-    change = Change(
-        describe=actuation.with_actuators(ways), forward=actuation.forward_by_actuators(ways, read)
-    )
-    return Variant("spelling", (*names, place, "mjtTrn.mjTRN_JOINT"), change, _has_elements("effort"))
+def _actuated(
+    ways: Mapping[str, Mapping[str, str]],
+    read: str = "",
+    names: str = "",
+    suits: Callable[[Model], bool] = _has_elements("effort"),  # noqa: B008
+) -> Variant:
+    """Let actuators exert what the joints have."""
+    own = " ".join(actuation.names_of(ways))
+    of_motors = f"mjtSensor.mjSENS_{read} {MOTORS} MjData.ctrl" if read else "mjtDyn MjData.act"
+    describe, forward = actuation.with_actuators(ways), actuation.forward_by_actuators(ways, read)
+    every = names or f"{own} {of_motors} mjtTrn.mjTRN_JOINT"
+    return _spelling(every, suits, describe=describe, forward=forward)
+
+
+# Of Newton's method, on a linear problem: the second and third remove rounding, more can add some.
+THREE: dict[str, Any] = {"iterations": 3, "tolerance": 0.0}
+SPARSE: dict[str, Any] = {"jacobian": "mjtJacobian.mjJAC_SPARSE"}
+
+
+def _has_loops(model: Model) -> bool:
+    return model.has_loops
+
+
+def _has_nothing_else(model: Model) -> bool:
+    return _is_free(model) and not model.has_elements
+
+
+def _every(_: Model) -> bool:
+    return True
 
 
 VARIANTS = (
-    _free("option", STAGES, forward=_forward_by(*STAGES)),
-    Variant("option", PARTS, Change(forward=_forward_by(*PARTS)), lambda _: True),
-    _free("option", ("mj_forwardSkip", "mjtStage"), forward=_forward_with_skips),
-    _free("option", ("mj_step1",), forward=_forward_by("mj_step1", *LAST_STAGES)),
-    _free(
-        "option",
-        ("mj_getState", "mj_setState", "mj_stateSize", "mj_resetData", "mjtState"),
-        forward=_forward_after_set_state,
+    _option(" ".join(STAGES), forward=_forward_by(*STAGES)),
+    _option(" ".join(PARTS), _every, forward=_forward_by(*PARTS)),
+    _option("mj_forwardSkip mjtStage", forward=_forward_with_skips),
+    _option("mj_step1", forward=_forward_by("mj_step1", *LAST_STAGES)),
+    _option("mj_getState mj_setState mj_stateSize mj_resetData mjtState", forward=_forward_after_set_state),
+    _option(" ".join(OTHER_PARTS), _every, forward=_forward_by(*OTHER_PARTS)),
+    _option("mj_copyState mj_extractState", forward=_forward_after_copied_state),
+    _option(
+        "mj_setKeyframe mj_resetDataKeyframe MjsKey", describe=_with_key, forward=_forward_after_keyframe
     ),
-    Variant("option", OTHER_PARTS, Change(forward=_forward_by(*OTHER_PARTS)), lambda _: True),
-    _free("option", ("mj_copyState", "mj_extractState"), forward=_forward_after_copied_state),
-    _free(
-        "option",
-        ("mj_setKeyframe", "mj_resetDataKeyframe", "MjsKey"),
-        describe=_with_key,
-        forward=_forward_after_keyframe,
-    ),
-    _free("option", ("mj_differentiatePos", "mj_integratePos"), forward=_forward_from_reference),
-    _free("option", ("mj_Euler",), forward=_forward_by_step("mj_forward", "mj_Euler")),
-    _free(
-        "option",
-        ("mj_step", "mjtIntegrator", "mjtIntegrator.mjINT_EULER", "MjOption.integrator", "MjOption.timestep"),
+    _option("mj_differentiatePos mj_integratePos", forward=_forward_from_reference),
+    _option("mj_Euler", forward=_forward_by_step("mj_forward", "mj_Euler")),
+    _option(
+        "mj_step mjtIntegrator mjtIntegrator.mjINT_EULER MjOption.integrator MjOption.timestep",
         forward=_forward_by_step("mj_step"),
     ),
-    _free("option", ("mj_step2",), forward=_forward_by_step("mj_step1", "mj_step2")),
-    _free("option", ("set_mjcb_passive",), forward=_forward_by_callback("passive")),
-    _free("option", ("set_mjcb_control",), forward=_forward_by_callback("control")),
-    Variant(
-        "option", NEEDLESS, Change(remake=_flags), lambda model: _is_free(model) and not model.has_elements
-    ),
-    _free("option", ("MjData",), reset=_keep),
-    _free("option", ("mj_copyData",), remake=_copied_data),
-    _free("option", ("MjModel",), remake=lambda m, d: pickle.loads(pickle.dumps((m, d)))),
-    _free("option", ("MjModel", "MjData"), remake=lambda m, d: (copy(m), copy(d))),
-    _free("option", ("mj_saveModel",), remake=_binary),
-    _free("option", ("rollout.rollout",), forward=_forward_by_rollout),
-    Variant(
-        "option",
-        ("mj_normalizeQuat", "mj_checkPos", "mj_checkVel", "mj_checkAcc"),
-        Change(forward=_forward_with_checks),
-        _is_free,
-    ),
-    _free("option", ("mj_defaultOption",), remake=_default_options),
-    Variant(
-        "option",
-        ("mj_mulJacTVec", "MjData.efc_AR", "MjData.efc_b", "MjData.efc_Y", "MjData.efc_R"),
-        Change(
-            remake=_set_options(jacobian="mjtJacobian.mjJAC_SPARSE", solver="mjtSolver.mjSOL_PGS"),
-            forward=_forward_by_constraint_matrix,
-        ),
+    _option("mj_step2", forward=_forward_by_step("mj_step1", "mj_step2")),
+    _option("set_mjcb_passive", forward=_forward_by_callback("passive")),
+    _option("set_mjcb_control", forward=_forward_by_callback("control")),
+    _option(" ".join(NEEDLESS), _has_nothing_else, remake=_without_needless),
+    _option("MjData", reset=_keep),
+    _option("mj_copyData", remake=_copied_data),
+    _option("MjModel", remake=lambda m, d: pickle.loads(pickle.dumps((m, d)))),
+    _option("MjModel MjData", remake=lambda m, d: (copy(m), copy(d))),
+    _option("mj_saveModel", remake=_binary),
+    _option("rollout.rollout", forward=_forward_by_rollout),
+    _option("mj_normalizeQuat mj_checkPos mj_checkVel mj_checkAcc", forward=_forward_with_checks),
+    _option("mj_defaultOption", remake=_default_options),
+    _option(
+        "mj_mulJacTVec MjData.efc_AR MjData.efc_b MjData.efc_Y MjData.efc_R",
         is_constrained,
+        remake=_set_options(**THREE, **SPARSE, solver="mjtSolver.mjSOL_PGS"),
+        forward=_forward_by_constraint_matrix,
     ),
-    Variant(
-        "option",
-        (
-            "mj_mulJacVec",
-            "mj_constraintUpdate",
-            "MjData.efc_J",
-            "MjData.efc_aref",
-            "MjData.efc_D",
-            "MjData.efc_diagA",
-            "MjData.efc_KBIP",
-        ),
-        Change(remake=_set_options(jacobian="mjtJacobian.mjJAC_SPARSE"), forward=_forward_by_constraint_rows),
+    _option(
+        "mj_mulJacVec mj_constraintUpdate MjData.efc_J MjData.efc_aref MjData.efc_D MjData.efc_diagA "
+        "MjData.efc_KBIP",
         is_constrained,
+        remake=_set_options(**THREE, **SPARSE),
+        forward=_forward_by_constraint_rows,
     ),
-    Variant(
-        "option",
-        (
-            "mj_island",
-            "MjData.iacc",
-            "MjData.iefc_force",
-            "MjData.iacc_smooth",
-            "MjData.ifrc_smooth",
-            "MjData.ifrc_constraint",
-            "MjData.iefc_R",
-            "MjData.iefc_aref",
-        ),
-        Change(remake=_set_options(jacobian="mjtJacobian.mjJAC_SPARSE"), forward=_forward_by_islands),
-        lambda model: model.has_loops,
+    _option(
+        "mj_island MjData.iacc MjData.iefc_force MjData.iacc_smooth MjData.ifrc_smooth "
+        "MjData.ifrc_constraint MjData.iefc_R MjData.iefc_aref",
+        _has_loops,
+        remake=_set_options(**THREE, **SPARSE),
+        forward=_forward_by_islands,
     ),
-    Variant(
-        "option",
-        ("MjData.eq_active",),
-        Change(describe=_switched_off, forward=_forward_by_switched_welds),
-        lambda model: model.has_loops,
+    _option(
+        "MjData.eq_active", _has_loops, describe=_switched_off, forward=_forward_by_switched_welds
     ),
-    Variant(
-        "option",
-        ("MjOption.ls_iterations", "MjOption.ls_tolerance"),
-        Change(remake=_line_search),
-        lambda model: model.has_loops,
+    _option(
+        "MjOption.ls_iterations MjOption.ls_tolerance",
+        _has_loops,
+        remake=_set_options(**THREE, ls_iterations=7, ls_tolerance=1e-3),
     ),
-    _free(
-        "option",
-        ("mjtEnableBit.mjENBL_SLEEP", "mjtSleepPolicy", "MjOption.sleep_tolerance"),
+    _option(
+        "mjtEnableBit.mjENBL_SLEEP mjtSleepPolicy MjOption.sleep_tolerance",
         describe=_never_asleep,
-        remake=_with_sleep,
-        forward=_forward_with_flags("mjtEnableBit.mjENBL_SLEEP"),
+        # of what may sleep, all is slow enough
+        remake=_set_options(sleep_tolerance=1e9, enableflags="mjtEnableBit.mjENBL_SLEEP"),
     ),
-    # Of Newton's method, on a linear problem: the second and third remove rounding, more can add some.
-    _options(3, jacobian="mjtJacobian.mjJAC_SPARSE"),
-    _options(
-        jacobian="mjtJacobian.mjJAC_SPARSE",
-        solver="mjtSolver.mjSOL_CG",
-        disableflags="mjtDisableBit.mjDSBL_WARMSTART",
-    ),
+    _options(iterations=3, **SPARSE),
+    _options(**SPARSE, solver="mjtSolver.mjSOL_CG", disableflags="mjtDisableBit.mjDSBL_WARMSTART"),
     # Its error falls as that of Gauss and Seidel's method, by 1 − 3e-4 an iteration at a state of
     # flyball-governor; it stops where an iteration changes little.
-    _options(400_000, 1e-34, _has_few_constraints, solver="mjtSolver.mjSOL_PGS"),
+    _options(_has_few_constraints, iterations=400_000, tolerance=1e-34, solver="mjtSolver.mjSOL_PGS"),
     _options(jacobian="mjtJacobian.mjJAC_DENSE", disableflags="mjtDisableBit.mjDSBL_ISLAND"),
     _actuated(actuation.STATELESS, "ACTUATORFRC"),
     _actuated(actuation.WITH_STATE),
-    Variant(
-        "spelling",
-        ("mjtGain.mjGAIN_FIXED", "mjtBias.mjBIAS_AFFINE", "mjtSensor.mjSENS_JOINTACTFRC"),
-        Change(
-            describe=actuation.with_actuators(actuation.SERVO),
-            forward=actuation.forward_by_actuators(actuation.SERVO, "JOINTACTFRC"),
-        ),
+    _actuated(
+        actuation.SERVO,
+        "JOINTACTFRC",
+        "mjtGain.mjGAIN_FIXED mjtBias.mjBIAS_AFFINE mjtSensor.mjSENS_JOINTACTFRC",
         _has_elements("stiffness", "damping"),
     ),
-    Variant(
-        "spelling",
-        ("mjtGain.mjGAIN_PID", "mjtDyn.mjDYN_PID", "mjtCtrlInput"),
-        Change(
-            describe=actuation.with_actuators(actuation.PID),
-            forward=actuation.forward_by_actuators(actuation.PID),
-        ),
+    _actuated(actuation.PID, names="mjtGain.mjGAIN_PID mjtDyn.mjDYN_PID mjtCtrlInput"),
+    _spelling(
+        " ".join((*actuation.CALLBACKS, *actuation.names_of(actuation.BY_CALLBACK))),
         _has_elements("effort"),
+        describe=actuation.with_actuators(actuation.BY_CALLBACK),
+        forward=actuation.forward_by_callbacks,
     ),
-    Variant(
-        "spelling",
-        (*actuation.CALLBACKS, *actuation.names_of(actuation.BY_CALLBACK)),
-        Change(
-            describe=actuation.with_actuators(actuation.BY_CALLBACK), forward=actuation.forward_by_callbacks
-        ),
-        _has_elements("effort"),
-    ),
-    Variant(
-        "spelling",
-        (
-            "mjtWrap.mjWRAP_JOINT",
-            "mjtTendon",
-            "mjtObj.mjOBJ_TENDON",
-            "mjtSensor.mjSENS_TENDONACTFRC",
-            "mjtTrn.mjTRN_TENDON",
-        ),
-        Change(
-            describe=actuation.with_fixed_tendons,
-            remake=actuation.elements_on_tendons,
-            forward=actuation.forward_by_tendons,
-        ),
+    _spelling(
+        "mjtWrap.mjWRAP_JOINT mjtTendon mjtObj.mjOBJ_TENDON mjtSensor.mjSENS_TENDONACTFRC "
+        "mjtTrn.mjTRN_TENDON",
         lambda model: (
             _has_elements("effort", "stiffness", "damping", "armature")(model)
             and any(kind.motions for kind in model.kinds)
         ),
+        describe=actuation.with_fixed_tendons,
+        remake=actuation.elements_on_tendons,
+        forward=actuation.forward_by_tendons,
     ),
-    _free(
-        "option",
-        ("MjOption.disableactuator", "mjtLimited"),
+    _option(
+        "MjOption.disableactuator mjtLimited",
         describe=actuation.with_far_limits,
-        remake=actuation.without_group,
+        remake=_set_options(disableactuator=1 << actuation.GROUP_OFF),
         forward=actuation.forward_with_group_off,
     ),
-    _free(
-        "spelling",
-        ("MjData.qfrc_gravcomp",),
-        describe=actuation.with_gravcomp,
-        forward=actuation.forward_without_gravity,
+    _spelling(
+        "MjData.qfrc_gravcomp", describe=actuation.with_gravcomp, forward=actuation.forward_without_gravity
     ),
-    _free("option", ("mjtDisableBit.mjDSBL_GRAVITY",), forward=actuation.forward_without_gravity),
-    _free("spelling", ("MjSpec",), describe=lambda spec: spec.copy()),
-    _free("spelling", ("MjsFrame",), describe=_in_frames),
-    _free(
-        "spelling",
-        ("mjtOrientation.mjORIENTATION_EULER", "MjsOrientation"),
-        describe=_oriented("EULER", "euler", _euler_angles),
-    ),
-    _free(
-        "spelling",
-        ("mjtOrientation.mjORIENTATION_AXISANGLE",),
-        describe=_oriented("AXISANGLE", "axisangle", _axis_angle),
-    ),
-    _free(
-        "spelling", ("mjtOrientation.mjORIENTATION_XYAXES",), describe=_oriented("XYAXES", "xyaxes", _xy_axes)
-    ),
-    _free(
-        "spelling",
-        ("mjtOrientation.mjORIENTATION_ZAXIS",),
-        describe=shapes.in_z_frames,
-    ),
-    _free("spelling", ("MjsDefault",), describe=shapes.attached),
-    Variant(
-        "spelling",
-        ("MjsBody", "mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE"),
-        Change(has_own_inertia=True, describe=shapes.without_shapes),
+    _option("mjtDisableBit.mjDSBL_GRAVITY", forward=actuation.forward_without_gravity),
+    _spelling("MjSpec", describe=lambda spec: spec.copy()),
+    _spelling("MjsFrame", describe=_in_frames),
+    _oriented("EULER", lambda pose: pose.forms["xyz"]),
+    _oriented("AXISANGLE", lambda pose: np.append(pose.forms["axis"], pose.forms["angle"])),
+    _oriented("XYAXES", lambda pose: pose.R[:, :2].T.ravel()),
+    _spelling("mjtOrientation.mjORIENTATION_ZAXIS", describe=shapes.in_z_frames),
+    _spelling("MjsDefault", describe=shapes.attached),
+    _spelling(
+        "MjsBody mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE",
         _has_inertia,
+        has_own_inertia=True,
+        describe=shapes.without_shapes,
     ),
     _of_shapes("AUTO", shapes.of_shapes, lambda model: bool(np.any(model.rods))),
     _of_shapes("TRUE", shapes.of_shapes_only, lambda model: not np.any(model.rods)),
-    Variant(
-        "spelling",
-        ("mjtEq.mjEQ_CONNECT",),
-        Change(describe=shapes.welds_as_points),
-        lambda model: model.has_loops,
-    ),
-    Variant("spelling", ("mjtJoint.mjJNT_HINGE",), Change(ball_joints=HINGES), _has_free_balls),
-    Variant("spelling", ("mjtJoint.mjJNT_SLIDE",), Change(free_joints=(*SLIDES, *BALL)), _has_free_bodies),
-)
+    _spelling("mjtEq.mjEQ_CONNECT", _has_loops, describe=shapes.welds_as_points),
+    _spelling("mjtJoint.mjJNT_HINGE", _has_free_balls, ball_joints=HINGES),
+    _spelling("mjtJoint.mjJNT_SLIDE", _has_free_bodies, free_joints=(*SLIDES, *BALL)),
+)  # fmt: skip
 
 
 def _has_kind(*kinds: str) -> Callable[[Model], bool]:

@@ -188,7 +188,7 @@ def _add_body_forces(s: Probed) -> None:
     for j, place in zip(s.joints, s.places, strict=True):
         force = data.oMi[j].act(m.inertias[j]) * data.oa_gf[j] + pin.Force(own[j] @ data.ov[j].vector)
         forces.append((data.oMi[j] * place).actInv(force))
-    s.add_halves(("body_force_local", "body_moment_local"), ("computeCoriolisMatrix", "Data.B"), forces)
+    s.add_twists(("body_force_local", "body_moment_local"), ("computeCoriolisMatrix", "Data.B"), forces)
 
 
 def add_mimic(s: Probed) -> None:

@@ -123,7 +123,7 @@ def _add_frames(s: Probed) -> None:
                 f"{ANGULAR[what]}{frame.of_rotation}{by}",
             )
             call = *function.split(), f"ReferenceFrame.{name}"
-            s.add_halves((of_point, f"frame_angular_{of_rotation}"), call, twists)
+            s.add_twists((of_point, f"frame_angular_{of_rotation}"), call, twists)
         if name != "WORLD":
             _add_points(s, derived, name)
 
@@ -232,7 +232,7 @@ def _add_data(s: Probed) -> None:
         is_local = at == "_local"
         twists = [place.actInv(values[j]) if is_local else values[j].copy() for j, place in places]
         turning = f"frame_angular_{ANGULAR[what]}{'_local' * is_local}"
-        s.add_halves((f"frame_{what}{at}", turning), by, twists)
+        s.add_twists((f"frame_{what}{at}", turning), by, twists)
     J, dJ = s.square(data.J), s.square(data.dJ)
     columns = [s.columns(j) for j in s.joints]
     velocity = [J[:3, own] @ s.v[own] for own in columns]
@@ -319,9 +319,9 @@ def _add_regressors(s: Probed, bodies: Sequence[pin.Inertia]) -> None:
         of_frame = pin.computeFrameKinematicRegressor(m, moved, f, local) @ turns
         velocities["computeFrameKinematicRegressor"].append(of_frame)
     for function, values in forces.items():
-        s.add_halves(("body_force_local", "body_moment_local"), (function,), values)
+        s.add_twists(("body_force_local", "body_moment_local"), (function,), values)
     for function, values in velocities.items():
-        s.add_halves(("frame_velocity_local", "frame_angular_velocity_local"), (function,), values)
+        s.add_twists(("frame_velocity_local", "frame_angular_velocity_local"), (function,), values)
 
 
 def _add_torques(s: Probed) -> None:

@@ -36,7 +36,7 @@ class Spelling:
 
     make: Callable[[Any], Any] = lambda joint: joint  # the usual one → this one
     coordinates: Callable[[Array], Array] = np.array  # q of the usual one → q
-    angles: Array | None = None  # q of one whose frame is turned so that it is this
+    angles: Float[Array, "nq"] | None = None  # q of one whose frame is turned so that it is this
     has_own_rates: bool = False  # whether its rates are others, of which elements would be matrices
 
 

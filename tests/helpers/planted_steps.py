@@ -47,7 +47,7 @@ class MujocoSystem:
 
     def mass_matrix(self) -> Array:
         """M (nv, nv) at the last configuration."""
-        return mujoco_engine._full_mass_matrix(self.m, self.d)
+        return mujoco_engine.full_mass_matrix(self.m, self.d)
 
     def quaternions(self, q: Array) -> Array:
         """The joints' quaternions (nj, 4), scalar first."""

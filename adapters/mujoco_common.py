@@ -1,0 +1,111 @@
+"""What the files about MuJoCo share: elements of specs, products with matrices, sparse rows, warnings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from plumbline.model.datatypes import Array, Float
+
+DOFS = {
+    mujoco.mjtJoint.mjJNT_FREE: 6, mujoco.mjtJoint.mjJNT_BALL: 3,
+    mujoco.mjtJoint.mjJNT_HINGE: 1, mujoco.mjtJoint.mjJNT_SLIDE: 1,
+}  # fmt: skip
+
+
+def member(name: str) -> Any:
+    """A member of an enumeration, as mjtSolver.mjSOL_CG."""
+    enumeration, _, entry = name.partition(".")
+    return getattr(getattr(mujoco, enumeration), entry)
+
+
+def set_attributes(element: Any, **attributes: Any) -> Any:
+    """Set attributes of an element of a spec; only later versions take them as arguments."""
+    for name, value in attributes.items():
+        setattr(element, name, value)
+    return element
+
+
+def add_sensor(spec: Any, kind: str, of: str, target: str, name: str = "") -> Any:
+    """Add a sensor to an element, named by its kind and the element unless it has a name."""
+    return set_attributes(
+        spec.add_sensor(), name=name or f"{kind} {target}", type=member(f"mjtSensor.mjSENS_{kind}"),
+        objtype=member(f"mjtObj.mjOBJ_{of}"), objname=target,
+    )  # fmt: skip
+
+
+def add_actuator(
+    spec: Any, name: str, transmission: str, target: str, gear: Float[Array, "6"], **attributes: Any
+) -> Any:
+    """Add one that is named and drives an element."""
+    trntype = member(f"mjtTrn.mjTRN_{transmission}")
+    given = {"name": name, "target": target, "trntype": trntype, "gear": gear}
+    return set_attributes(spec.add_actuator(), **given, **attributes)
+
+
+def named_joints(spec: Any) -> list[Any]:
+    """The joints of a spec; those without a name are given one."""
+    joints = [joint for body in spec.bodies for joint in body.joints]
+    for j, joint in enumerate(joints):
+        joint.name = joint.name or f"joint {j}"
+    return joints
+
+
+def data_like(m: Any, d: Any, *names: str) -> Any:
+    """Other data with the positions and the velocities of some, and more arrays."""
+    other = mujoco.MjData(m)
+    for name in ("qpos", "qvel", *names):
+        getattr(other, name)[:] = getattr(d, name)
+    return other
+
+
+def times_mass(m: Any, d: Any, v: Float[Array, "nv"]) -> Float[Array, "nv"]:
+    """Return M v."""
+    product = np.zeros(m.nv)
+    mujoco.mj_mulM(m, d, product, np.array(v))
+    return product
+
+
+def through_inverse(m: Any, d: Any, force: Float[Array, "nv"]) -> Float[Array, "nv"]:
+    """Return M⁻¹ f."""
+    found = np.zeros((1, m.nv))
+    mujoco.mj_solveM(m, d, found, np.array(force)[None])
+    return np.asarray(found[0])
+
+
+def dense_rows(values: Float[Array, "*stored"], of: Any, name: str, width: int) -> Float[Array, "rows width"]:
+    """A sparse matrix as a dense one; old versions hold it so."""
+    if values.ndim == 2:
+        return values
+    counts, starts, columns = (getattr(of, f"{name}_{x}") for x in ("rownnz", "rowadr", "colind"))
+    if values.size == len(counts) * width and not np.any(counts):
+        return np.reshape(values, (-1, width))
+    dense = np.zeros((len(counts), width))
+    for row, start, count in zip(dense, starts, counts, strict=True):
+        row[columns[start : start + count]] = values[start : start + count]
+    return dense
+
+
+def full_mass_matrix(m: Any, d: Any) -> Float[Array, "nv nv"]:
+    """Return the dense mass matrix; `mj_fullM` of older versions (3.4 among them) takes others."""
+    M = np.zeros((m.nv, m.nv))
+    try:
+        mujoco.mj_fullM(m, d, M)
+    except TypeError:
+        mujoco.mj_fullM(m, M, d.qM)
+    return M
+
+
+@contextmanager
+def warnings_to(receive: Callable[[str], Any]) -> Iterator[None]:
+    """Give MuJoCo's warnings to a function; else they go to a log file in the current folder."""
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(receive)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)

@@ -1,0 +1,38 @@
+"""What the files about engines' surfaces share: the answer of one state, to which functions add rows."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from plumbline.model.datatypes import Array, Call, Float
+
+
+class SurfaceRecord:
+    """By quantity and call the rows found; ``rates`` takes ν to the engine's velocities, if it has any."""
+
+    def __init__(self, rates: Float[Array, "nv nu"] | None = None) -> None:
+        self.found = defaultdict[str, dict[Call, Array]](dict)
+        self.rates = rates
+
+    def add(self, quantity: str, call: Call, value: Any) -> None:
+        """Add rows: of all bodies, or one of the mechanism."""
+        self.found[quantity][call] = np.array(np.atleast_2d(value), float)
+
+    def add_halves(self, quantities: tuple[str, str], call: Call, vectors: Any) -> None:
+        """Add the two halves of spatial vectors."""
+        for quantity, half in zip(quantities, np.split(np.atleast_2d(vectors), 2, 1), strict=True):
+            self.add(quantity, call, half)
+
+    def add_axes(self, call: Call, turns: Any) -> None:
+        """Add the axes of the probe frames, of attitudes as matrices."""
+        self.add("frame_axes", call, np.reshape(np.array(turns).mT, (-1, 3)))
+
+    def add_forces(self, quantity: str, forces: Mapping[Call, Array]) -> None:
+        """Add forces on ν in place of those on the engine's velocities."""
+        assert self.rates is not None
+        for call, force in forces.items():
+            self.add(quantity, call, (self.rates.T @ force)[:, None])
