@@ -7,71 +7,50 @@ point.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from plumbline.engines.missing_names import add_parts
-from plumbline.model.datatypes import Array, Call, Float
+from adapters.mujoco_probes import Probed
+from plumbline.model.datatypes import Array, Float
 from plumbline.model.kinematics import quaternion_exponential, quaternion_product, rotation_matrix
 from plumbline.model.probe_frames import PROBE_ATTITUDE
 
 PROBE = rotation_matrix(PROBE_ATTITUDE)
-Found = dict[str, dict[Call, Array]]
 SCALAR = {mujoco.mjtJoint.mjJNT_HINGE: "HINGE", mujoco.mjtJoint.mjJNT_SLIDE: "SLIDE"}
 
 
-def add_arrays(found: Found, m: Any, d: Any, links: Sequence[int], sites: Sequence[int]) -> None:
-    """Add all after `mj_forward` and `mj_rnePostConstraint`; all answers are of the bodies ``links``."""
-    add_parts(
-        found,
-        lambda: _add_motions(found, m, d, links, sites),
-        lambda: _add_views(found, d, links, sites),
-        lambda: _add_wrenches(found, m, d, links, sites),
-        lambda: _add_joint_frames(found, m, d, links),
-        lambda: _add_inertias(found, m, d),
-        lambda: _add_attitudes(found, m, d, links, sites),
-    )
-
-
-def _add_motions(found: Found, m: Any, d: Any, links: Sequence[int], sites: Sequence[int]) -> None:
-    point, root = d.site_xpos[sites], d.subtree_com[m.body_rootid[links]]
-    velocity, dots = np.zeros((2, m.nbody, 6))
+def _add_motions(s: Probed) -> None:
+    m, d = s.m, s.d
+    velocity, rates = np.zeros((2, m.nbody, 6))
     for b in range(1, m.nbody):
         own = slice(m.body_dofadr[b], m.body_dofadr[b] + m.body_dofnum[b])
         # subtrees of one root share the reference point
         velocity[b] = velocity[m.body_parentid[b]] + d.qvel[own] @ d.cdof[own]
-        dots[b] = dots[m.body_parentid[b]] + d.qacc[own] @ d.cdof[own] + d.qvel[own] @ d.cdof_dot[own]
-    for name, vectors in (("cvel", d.cvel), ("cdof", velocity)):
-        spin, at = _at_point(vectors[links], point - root)
-        found["frame_velocity"][f"MjData.{name}",] = at
-        found["frame_angular_velocity"][f"MjData.{name}",] = spin
-    lever, speed = point - root, found["frame_velocity"]["MjData.cvel",]
-    for name, vectors in (("cacc", d.cacc), ("cdof_dot", dots)):
-        spin, at = _at_point(vectors[links], lever)
-        quantity = "frame_proper_acceleration" if name == "cacc" else "frame_acceleration"
-        found[quantity][f"MjData.{name}",] = at + np.cross(d.cvel[links, :3], speed)
-        found["frame_angular_acceleration"][f"MjData.{name}",] = spin.copy()
-    _add_spatial_transforms(found, d, links, sites, root)
-
-
-def _add_spatial_transforms(
-    found: Found, d: Any, links: Sequence[int], sites: Sequence[int], root: Array
-) -> None:
-    moved = np.zeros((len(links), 6))
-    for body, site, old, out in zip(links, sites, root, moved, strict=True):
+        rates[b] = rates[m.body_parentid[b]] + d.qacc[own] @ d.cdof[own] + d.qvel[own] @ d.cdof_dot[own]
+    _, speed = _at_point(s, d.cvel)
+    turned = np.cross(d.cvel[s.links, :3], speed)
+    for name, vectors, moving, added in (
+        ("cvel", d.cvel, "velocity", 0.0),
+        ("cdof", velocity, "velocity", 0.0),
+        ("cacc", d.cacc, "proper_acceleration", turned),
+        ("cdof_dot", rates, "acceleration", turned),
+    ):
+        spin, at = _at_point(s, vectors)
+        s.add(f"frame_{moving}", (f"MjData.{name}",), at + added)
+        s.add(f"frame_angular_{moving.removeprefix('proper_')}", (f"MjData.{name}",), spin)
+    moved, roots = np.zeros((len(s.links), 6)), d.subtree_com[m.body_rootid[s.links]]
+    for body, site, old, out in zip(s.links, s.sites, roots, moved, strict=True):
         mujoco.mju_transformSpatial(out, d.cvel[body], 0, d.site_xpos[site], old, d.site_xmat[site])
-    found["frame_angular_velocity_local"]["mju_transformSpatial",] = moved[:, :3]
-    found["frame_velocity_local"]["mju_transformSpatial",] = moved[:, 3:]
+    quantities = "frame_angular_velocity_local", "frame_velocity_local"
+    s.add_halves(quantities, ("mju_transformSpatial",), moved)
 
 
-def _add_views(found: Found, d: Any, links: Sequence[int], sites: Sequence[int]) -> None:
+def _add_views(s: Probed) -> None:
     """Read by named views, and the sensors from the array of all."""
-    found["body_position"]["MjData.body",] = np.array([d.body(b).xpos.copy() for b in links])
-    found["frame_position"]["MjData.site",] = np.array([d.site(s).xpos.copy() for s in sites])
-    count = range(len(links))
+    s.add("body_position", ("MjData.body",), [s.d.body(b).xpos for b in s.links])
+    s.add("frame_position", ("MjData.site",), [s.d.site(site).xpos for site in s.sites])
     for kind, quantity, read, size in (
         ("geom", "frame_position", "xpos", 1.0),
         ("camera", "frame_position", "xpos", 1.0),
@@ -80,37 +59,30 @@ def _add_views(found: Found, d: Any, links: Sequence[int], sites: Sequence[int])
         ("ten", "frame_distance", "length", 1.5),
         ("actuator", "frame_distance", "length", 3.0),
     ):
-        views = [getattr(getattr(d, kind)(f"probe {k}"), read) for k in count]
-        found[quantity][f"MjData.{kind}",] = np.array([np.ravel(view) for view in views]) / size
-    value = np.array([d.sensor(f"FRAMEPOS {k}").data.copy() for k in count])
-    found["frame_position"]["MjData.sensor",] = value
+        views = [getattr(getattr(s.d, kind)(f"probe {k}"), read) for k in range(len(s.links))]
+        s.add(quantity, (f"MjData.{kind}",), np.array([np.ravel(view) for view in views]) / size)
+    s.add("frame_position", ("MjData.sensor",), s.sensors("FRAMEPOS"))
 
 
-def _at_point(vectors: Float[Array, "n 6"], lever: Float[Array, "n 3"]) -> tuple[Array, Array]:
-    return vectors[:, :3].copy(), vectors[:, 3:] + np.cross(vectors[:, :3], lever)
+def _at_point(s: Probed, vectors: Array) -> tuple[Array, Array]:
+    """Angular part, and linear part at the probe points, of a spatial vector per body."""
+    lever = s.d.site_xpos[s.sites] - s.d.subtree_com[s.m.body_rootid[s.links]]
+    own = vectors[s.links]
+    return own[:, :3], own[:, 3:] + np.cross(own[:, :3], lever)
 
 
-def _axes(turn: Array) -> Array:
-    """Rows of the axes of the probe frames, of attitudes (N, 3, 3) of bodies."""
-    return np.asarray((turn @ PROBE).mT.reshape(-1, 3))
-
-
-def _add_attitudes(found: Found, m: Any, d: Any, links: Sequence[int], sites: Sequence[int]) -> None:
-    none, inertial = np.broadcast_to(np.eye(3), (len(links), 3, 3)), rotation_matrix(m.body_iquat[links])
-    probe = np.broadcast_to(PROBE, none.shape)
-    for name, own, ids in (
-        ("site_xquat", probe, sites), ("xquat", none, links), ("xmat", none, links),
-        ("xiquat", inertial, links), ("ximat", inertial, links),
-    ):  # fmt: skip
-        turn = getattr(d, name)[ids]
-        turn = rotation_matrix(turn) if name.endswith("quat") else turn.reshape(-1, 3, 3)
-        found["frame_axes"][f"MjData.{name}",] = _axes(turn @ own.mT)
-    places, turns = np.zeros((len(links), 3)), np.zeros((len(links), 9))
-    same = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
-    for site, body, place, turn in zip(sites, links, places, turns, strict=True):
-        mujoco.mj_local2Global(d, place, turn, m.site_pos[site], m.site_quat[site], body, same)
-    found["frame_axes"]["mj_local2Global", "mjtSameFrame"] = turns.reshape(-1, 3, 3).mT.reshape(-1, 3)
-    found["frame_position"]["mj_local2Global", "mjtSameFrame"] = places
+def _add_attitudes(s: Probed) -> None:
+    d, inertial = s.d, rotation_matrix(s.m.body_iquat[s.links]).mT @ PROBE
+    for name in ("site_xquat", "xquat", "xmat", "xiquat", "ximat"):
+        of = None if name == "site_xquat" else inertial if name[1] == "i" else PROBE
+        ids = s.sites if name == "site_xquat" else s.links
+        s.add_attitudes((f"MjData.{name}",), getattr(d, name)[ids], of)
+    places, turns = np.zeros((len(s.links), 3)), np.zeros((len(s.links), 9))
+    same, call = mujoco.mjtSameFrame.mjSAMEFRAME_NONE, ("mj_local2Global", "mjtSameFrame")
+    for site, body, place, turn in zip(s.sites, s.links, places, turns, strict=True):
+        mujoco.mj_local2Global(d, place, turn, s.m.site_pos[site], s.m.site_quat[site], body, same)
+    s.add_attitudes(call, turns)
+    s.add("frame_position", call, places)
 
 
 def _own_motion(m: Any, d: Any, b: int, sensors: set[str]) -> tuple[Array, Array, list[Array]]:
@@ -121,9 +93,8 @@ def _own_motion(m: Any, d: Any, b: int, sensors: set[str]) -> tuple[Array, Array
 
     """
     quat, moved = m.body_quat[b].copy(), m.body_pos[b].copy()
-    joints = range(m.body_jntadr[b], m.body_jntadr[b] + m.body_jntnum[b])
     rates = [np.zeros(3)]
-    for j in joints:
+    for j in _joints(m, b):
         name = SCALAR.get(mujoco.mjtJoint(m.jnt_type[j]))
         if m.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE:  # it has no sensor
             at = m.jnt_qposadr[j]
@@ -149,21 +120,23 @@ def _own_motion(m: Any, d: Any, b: int, sensors: set[str]) -> tuple[Array, Array
     return moved, quat, rates
 
 
-def _add_joint_frames(found: Found, m: Any, d: Any, links: Sequence[int]) -> None:
+def _joints(m: Any, b: int) -> range:
+    return range(m.body_jntadr[b], m.body_jntadr[b] + m.body_jntnum[b])
+
+
+def _add_joint_frames(s: Probed) -> None:
     """Go from joint to joint by what sensors report of each, and by the frames of the joints."""
-    turn, spin = np.broadcast_to(np.eye(3), (m.nbody, 3, 3)).copy(), np.zeros((m.nbody, 3))
-    place, along = np.zeros((m.nbody, 3)), np.zeros((m.nbody, 3))
+    m, d, links = s.m, s.d, s.links
+    turn, (spin, place, along) = np.tile(np.eye(3), (m.nbody, 1, 1)), np.zeros((3, m.nbody, 3))
     sensors = set[str]()
     for b in range(1, m.nbody):
         up = m.body_parentid[b]
         moved, quat, rates = _own_motion(m, d, b, sensors)
-        rate = turn[up].T @ spin[up]
-        joints = range(m.body_jntadr[b], m.body_jntadr[b] + m.body_jntnum[b])
-        own_turn = rotation_matrix(quat)
+        own_turn, rate = rotation_matrix(quat), turn[up].T @ spin[up]
         turn[b], place[b] = turn[up] @ own_turn, place[up] + turn[up] @ moved
         spin[b] = turn[b] @ (own_turn.T @ rate + sum(rates))
         along[b] = spin[up]
-        for j in joints:
+        for j in _joints(m, b):
             if m.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE:
                 along[b] = along[b] + d.qvel[m.jnt_dofadr[j]] * d.xaxis[j]
             elif m.jnt_type[j] != mujoco.mjtJoint.mjJNT_SLIDE:
@@ -171,34 +144,34 @@ def _add_joint_frames(found: Found, m: Any, d: Any, links: Sequence[int]) -> Non
     by = tuple(f"mjtSensor.mjSENS_{kind}" for kind in sorted(sensors))
     positions = tuple(x for x in by if x.endswith(("POS", "QUAT")))
     if by:
-        found["body_position"][positions], found["frame_axes"][positions] = place[links], _axes(turn[links])
-        found["frame_angular_velocity"][tuple(x for x in by if x not in positions)] = spin[links]
+        s.add("body_position", positions, place[links])
+        s.add_axes(positions, turn[links] @ PROBE)
+        s.add("frame_angular_velocity", tuple(x for x in by if x not in positions), spin[links])
     if np.any(m.jnt_type == mujoco.mjtJoint.mjJNT_HINGE):
-        found["frame_angular_velocity"]["MjData.xaxis",] = along[links]
+        s.add("frame_angular_velocity", ("MjData.xaxis",), along[links])
     has_joint = m.body_jntnum[links] > 0
     if np.any(has_joint):
-        _add_joint_views(found, m, d, links)
+        _add_joint_views(s)
         anchored = d.xpos[links].copy()
         last = (m.body_jntadr[links] + m.body_jntnum[links] - 1)[has_joint]
         arms = np.matvec(d.xmat[links].reshape(-1, 3, 3)[has_joint], m.jnt_pos[last])
-        anchored[has_joint] = d.xanchor[last] - arms
         # a slide moves the body after the anchor was found
         is_moved = m.jnt_type[last] == mujoco.mjtJoint.mjJNT_SLIDE
-        anchored[np.flatnonzero(has_joint)[is_moved]] = d.xpos[links][has_joint][is_moved]
+        anchored[has_joint] = np.where(is_moved[:, None], anchored[has_joint], d.xanchor[last] - arms)
         if not np.all(is_moved):
-            found["body_position"]["MjData.xanchor",] = anchored
+            s.add("body_position", ("MjData.xanchor",), anchored)
 
 
-def _add_joint_views(found: Found, m: Any, d: Any, links: Sequence[int]) -> None:
+def _add_joint_views(s: Probed) -> None:
     """Add the velocities by views of joints."""
     for kind in ("joint", "jnt"):
-        velocity = np.zeros((m.nbody, 6))
-        for b in range(1, m.nbody):
-            velocity[b] = velocity[m.body_parentid[b]]
-            for j in range(m.body_jntadr[b], m.body_jntadr[b] + m.body_jntnum[b]):
-                one = getattr(d, kind)(j)
+        velocity = np.zeros((s.m.nbody, 6))
+        for b in range(1, s.m.nbody):
+            velocity[b] = velocity[s.m.body_parentid[b]]
+            for j in _joints(s.m, b):
+                one = getattr(s.d, kind)(j)
                 velocity[b] += np.ravel(one.qvel) @ np.reshape(one.cdof, (-1, 6))
-        found["frame_angular_velocity"][f"MjData.{kind}",] = velocity[links, :3]
+        s.add("frame_angular_velocity", (f"MjData.{kind}",), velocity[s.links, :3])
 
 
 def spatial_inertia(ten: Float[Array, "10"]) -> Float[Array, "6 6"]:
@@ -210,13 +183,12 @@ def spatial_inertia(ten: Float[Array, "10"]) -> Float[Array, "6 6"]:
     return np.block([[J, cross], [cross.T, mass * np.eye(3)]])
 
 
-def _add_inertias(found: Found, m: Any, d: Any) -> None:
+def _add_inertias(s: Probed) -> None:
     """Kinetic energies by inertias of bodies, of composites, and by the factors of the mass matrix."""
-    energy = found["kinetic_energy"]
-    v = d.qvel
+    m, d, v = s.m, s.d, s.d.qvel
     rotors = float(m.dof_armature @ v**2)
     total = sum(d.cvel[b] @ spatial_inertia(d.cinert[b]) @ d.cvel[b] for b in range(1, m.nbody))
-    energy["MjData.cinert",] = np.array([[(total + rotors) / 2]])
+    s.add("kinetic_energy", ("MjData.cinert",), (total + rotors) / 2)
     total, d.crb[:] = rotors, 0.0
     mujoco.mj_crb(m, d)
     for i in range(m.nv):
@@ -224,17 +196,18 @@ def _add_inertias(found: Found, m: Any, d: Any) -> None:
         total += momentum @ d.cdof[i] * v[i]
         while (j := m.dof_parentid[j]) >= 0:
             total += 2 * momentum @ d.cdof[j] * v[j]
-    energy["mj_crb", "MjData.crb"] = np.array([[total / 2]])
+    s.add("kinetic_energy", ("mj_crb", "MjData.crb"), total / 2)
     total = 0.0
     for i, (at, count) in enumerate(zip(m.M_rowadr, m.M_rownnz, strict=True)):
         of_row = slice(at, at + count - 1)
         pivot = v[i] + d.qLD[of_row] @ v[m.M_colind[of_row]]
         total += d.qLD[at + count - 1] * pivot**2
-    energy["MjData.qLD",] = np.array([[total / 2]])
+    s.add("kinetic_energy", ("MjData.qLD",), total / 2)
 
 
-def _add_wrenches(found: Found, m: Any, d: Any, links: Sequence[int], sites: Sequence[int]) -> None:
+def _add_wrenches(s: Probed) -> None:
     """Balance every body, from the last to the first: what its joint carries."""
+    m, d = s.m, s.d
     wrench = np.zeros((m.nbody, 6))
     for b in reversed(range(1, m.nbody)):
         J = spatial_inertia(d.cinert[b])
@@ -242,8 +215,12 @@ def _add_wrenches(found: Found, m: Any, d: Any, links: Sequence[int], sites: Seq
         turned = np.append(np.cross(w, momentum[:3]) + np.cross(v, momentum[3:]), np.cross(w, momentum[3:]))
         wrench[b] += J @ d.cacc[b] + turned - d.cfrc_ext[b]
         wrench[m.body_parentid[b]] += wrench[b]
-    lever = d.subtree_com[m.body_rootid[links]] - d.site_xpos[sites]
-    local = d.site_xmat[sites].reshape(-1, 3, 3).mT
-    moment = wrench[links, :3] + np.cross(lever, wrench[links, 3:])
-    found["joint_force_local"]["MjData.cfrc_ext",] = np.matvec(local, wrench[links, 3:])
-    found["joint_moment_local"]["MjData.cfrc_ext",] = np.matvec(local, moment)
+    lever = d.subtree_com[m.body_rootid[s.links]] - d.site_xpos[s.sites]
+    local, force = d.site_xmat[s.sites].reshape(-1, 3, 3).mT, wrench[s.links, 3:]
+    moment = wrench[s.links, :3] + np.cross(lever, force)
+    s.add("joint_force_local", ("MjData.cfrc_ext",), np.matvec(local, force))
+    s.add("joint_moment_local", ("MjData.cfrc_ext",), np.matvec(local, moment))
+
+
+# Add all after `mj_forward` and `mj_rnePostConstraint`.
+ARRAYS = _add_motions, _add_views, _add_wrenches, _add_joint_frames, _add_inertias, _add_attitudes

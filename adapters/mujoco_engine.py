@@ -59,7 +59,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adapters.mujoco_common import full_mass_matrix, member, set_attributes, warnings_to
-from adapters.mujoco_surface import POSE_FUNCTIONS, add_probes, pose_function, surface_answer
+from adapters.mujoco_probes import Probed
+from adapters.mujoco_surface import POSE_FUNCTIONS, add_probes, add_surface, pose_function
 from adapters.mujoco_variants import (
     COLUMN_NAMES,
     HINGE_ANGLES,
@@ -76,6 +77,7 @@ from plumbline.model import kinematics
 from plumbline.model.datatypes import (
     ROD,
     Array,
+    Call,
     EngineFailure,
     Float,
     Indices,
@@ -244,18 +246,14 @@ class Mujoco(MetamorphicHooks):
     def _surface(self, model: Model, states: Sequence[State]) -> Sequence[SurfaceAnswer]:
         if self.is_soft(model):
             return []
-        chain = _MujocoChain(model, has_probes=True)
+        chain, found = _MujocoChain(model, has_probes=True), list[dict[str, dict[Call, Array]]]()
         with _raise_on_warnings(chain.d):
-            found = [
-                surface_answer(
-                    chain.m,
-                    chain.d,
-                    chain.link_ids,
-                    chain.evaluate_forward(s),
-                    kinematics.elastic_energy(model, s),
-                )
-                for s in states
-            ]
+            for state in states:
+                rates = chain.evaluate_forward(state)
+                elastic = kinematics.elastic_energy(model, state)
+                s = Probed(chain.m, chain.d, chain.link_ids, rates, elastic)
+                add_surface(s)
+                found.append(s.found)
         add_pose_answers(found, states, POSE_FUNCTIONS, pose_function)
         return found
 
