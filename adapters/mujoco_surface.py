@@ -208,11 +208,8 @@ def _add_sensors(s: Probed) -> None:
 
 
 def _add_frames(s: Probed) -> None:
-    m, d, ids = (
-        s.m,
-        s.d,
-        {"SITE": s.sites, "GEOM": s.ids("geom"), "CAMERA": s.ids("camera"), "XBODY": s.links},
-    )
+    m, d, geoms = s.m, s.d, s.ids("geom")
+    ids: dict[str, Any] = {"SITE": s.sites, "GEOM": geoms, "CAMERA": s.ids("camera"), "XBODY": s.links}
     for name in ("xpos", "xipos"):
         s.add("body_position", (f"MjData.{name}",), getattr(d, name)[s.links])
     for name, kind in (("site", "SITE"), ("geom", "GEOM"), ("cam", "CAMERA")):
@@ -230,7 +227,7 @@ def _add_frames(s: Probed) -> None:
                     moving = moving.replace("frame_", "body_").replace("proper_", "")
                 s.add_halves((turning + suffix, moving + suffix), (function, f"mjtObj.mjOBJ_{kind}"), vectors)
     _add_jacobians(s)
-    s.add_attitudes(("MjData.geom_xquat",), d.geom_xquat[ids["GEOM"]])
+    s.add_attitudes(("MjData.geom_xquat",), d.geom_xquat[geoms])
 
 
 def _add_relative(s: Probed) -> None:
