@@ -19,23 +19,18 @@ items: Any = exudyn.itemInterface  # its constructors are untyped
 Output: Any = exudyn.OutputVariableType
 
 
-class OtherItems:
-    """The module of items with some of them made in other ways, by name."""
-
-    def __init__(self, **ways: Callable[..., Any]) -> None:
-        self._ways = ways
-
-    def __getattr__(self, name: str) -> Any:
-        return self._ways.get(name) or getattr(exudyn.itemInterface, name)
+Ways = Mapping[str, Callable[..., Any]]  # by kind of item what adds one in another way, with its parameters
 
 
-def add_item(mbs: Any, item: Any) -> Any:
-    """Add a load, connector or joint; an item made in another way may add itself."""
-    if callable(item):
-        return item(mbs)
-    return (mbs.AddLoad if "Load" in type(item).__name__ else mbs.AddObject)(item)
+def add_item(mbs: Any, ways: Ways, kind: str, **given: Any) -> Any:
+    """Add a load, connector or joint of a kind, in another way where there is one."""
+    if kind in ways:
+        return ways[kind](mbs, **given)
+    add = mbs.AddLoad if kind in LOADS else mbs.AddObject
+    return add(getattr(items, kind)(**given))
 
 
+LOADS = ("LoadForceVector", "LoadTorqueVector", "Force", "Torque")
 NEWTON_TOLERANCE = 1e-12  # relative and absolute; at the engine's defaults extrapolation stops at 2e-9
 
 NO_TOLERANCE = 1e30
@@ -88,7 +83,7 @@ def make_settings() -> Any:
 
 
 def add_loads(
-    mbs: Any, model: Model, k: int, marker: Any, ground: Any, moment: Float[Array, "3"], items: Any = items
+    mbs: Any, model: Model, k: int, marker: Any, ground: Any, moment: Float[Array, "3"], ways: Ways
 ) -> None:
     """Apply the loads of a body at its centre of mass, evaluated wherever the integrator evaluates forces.
 
@@ -100,31 +95,24 @@ def add_loads(
 
     """
     if np.any(model.force[k]):
-        add_item(mbs, items.LoadForceVector(markerNumber=marker, loadVector=model.force[k].tolist()))
+        force = model.force[k].tolist()
+        add_item(mbs, ways, "LoadForceVector", markerNumber=marker, loadVector=force)
     if np.any(moment):
-        torque = items.LoadTorqueVector(markerNumber=marker, loadVector=moment.tolist(), bodyFixed=True)
-        add_item(mbs, torque)
+        given = {"markerNumber": marker, "loadVector": moment.tolist()}
+        add_item(mbs, ways, "LoadTorqueVector", **given, bodyFixed=True)
     if model.drag_force[k] or model.drag_moment[k]:
         damping = np.diag(np.repeat([model.drag_force[k], model.drag_moment[k]], 3))
-        add_item(
-            mbs,
-            items.ObjectConnectorRigidBodySpringDamper(
-                markerNumbers=[ground, marker], stiffness=np.zeros((6, 6)), damping=damping
-            ),
-        )
+        given = {"markerNumbers": [ground, marker], "stiffness": np.zeros((6, 6)), "damping": damping}
+        add_item(mbs, ways, "ObjectConnectorRigidBodySpringDamper", **given)
 
 
-def add_point_spring(mbs: Any, model: Model, i: int, markers: list[Any], items: Any = items) -> None:
+def add_point_spring(mbs: Any, model: Model, i: int, markers: list[Any], ways: Ways) -> None:
     """Add a spring and damper between two points."""
     add_item(
-        mbs,
-        items.ObjectConnectorSpringDamper(
-            markerNumbers=markers,
-            referenceLength=float(model.spring_length[i]),
-            stiffness=float(model.spring_stiffness[i]),
-            damping=float(model.spring_damping[i]),
-        ),
-    )
+        mbs, ways, "ObjectConnectorSpringDamper", markerNumbers=markers,
+        referenceLength=float(model.spring_length[i]), stiffness=float(model.spring_stiffness[i]),
+        damping=float(model.spring_damping[i]),
+    )  # fmt: skip
 
 
 def written_items(mbs: Any) -> list[tuple[str, dict[str, str]]]:

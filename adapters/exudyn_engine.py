@@ -143,17 +143,11 @@ class ExudynChain:
             if last > first:
                 middle = [self._add_marker(piece, np.zeros(3)) for piece in (first, last)]
                 self.welds.append(mbs.AddObject(items.ObjectJointGeneric(markerNumbers=middle)))
-            add_loads(
-                mbs, model, k, self._add_marker(first, np.zeros(3)), pivot, model.moment[k], change.items
-            )
+            centre = self._add_marker(first, np.zeros(3))
+            add_loads(mbs, model, k, centre, pivot, model.moment[k], change.ways)
         for i, (bodies, points) in enumerate(zip(model.spring_body, model.spring_point, strict=True)):
-            add_point_spring(
-                mbs,
-                model,
-                i,
-                [self._end_marker(*end) for end in zip(bodies, points, strict=True)],
-                change.items,
-            )
+            ends = [self._end_marker(*end) for end in zip(bodies, points, strict=True)]
+            add_point_spring(mbs, model, i, ends, change.ways)
         for k in range(model.n, len(model.kind)):
             self._add_joint(k)
         self.probes = Probes(mbs, model, self.piece_bodies, self.nodes) if has_probes else None
@@ -208,8 +202,9 @@ class ExudynChain:
             turns = rotation_matrix(model.turn[k])
             sign = -1 if what == "turn" and i and number == 1 else 1  # a universal joint's second axis
             if what == "slide":
-                connector = self.change.items.ObjectConnectorLinearSpringDamper(
-                    markerNumbers=ends, axisMarker0=turns[0][:, number], offset=float(model.rest[k, i]),
+                connector = add_item(
+                    self.mbs, self.change.ways, "ObjectConnectorLinearSpringDamper", markerNumbers=ends,
+                    axisMarker0=turns[0][:, number], offset=float(model.rest[k, i]),
                     force=float(-effort), **coefficients,
                 )  # fmt: skip
             else:
@@ -218,12 +213,13 @@ class ExudynChain:
                     items.NodeGenericData(initialCoordinates=[sign * self.x[k, i]], numberOfDataCoordinates=1)
                 )
                 local = np.roll(np.eye(3), -number - 1, axis=1) if sign > 0 else SECOND_AXIS
-                connector = self.change.items.ObjectConnectorTorsionalSpringDamper(
+                connector = add_item(
+                    self.mbs, self.change.ways, "ObjectConnectorTorsionalSpringDamper",
                     markerNumbers=ends[::sign], rotationMarker0=turns[::sign][0] @ local,
                     rotationMarker1=turns[::sign][1] @ local, offset=float(sign * model.rest[k, i]),
                     nodeNumber=last_angle, torque=float(-sign * effort), **coefficients,
                 )  # fmt: skip
-            self.connectors.append((k, add_item(self.mbs, connector), what == "slide", sign * axis))
+            self.connectors.append((k, connector, what == "slide", sign * axis))
 
     def _end_marker(self, body: int, point: Array) -> Any:
         """Add a marker at a point of a body on which others hang, or of the world."""

@@ -296,7 +296,7 @@ class _KinematicTree:
             self._add_loads_and_sensors(k, pivot)
         for i, (bodies, points) in enumerate(zip(model.spring_body, model.spring_point, strict=True)):
             ends = [self._point_marker(ground, int(b), at) for b, at in zip(bodies, points, strict=True)]
-            add_point_spring(self.mbs, model, i, ends, change.items)
+            add_point_spring(self.mbs, model, i, ends, change.ways)
         self.mbs.Assemble()
 
     def _point_marker(self, ground: Any, body: int, point: Array) -> Any:
@@ -368,7 +368,7 @@ class _KinematicTree:
         place = {"objectNumber": self.tree, "linkNumber": link, "localPosition": centre}
         marker = self.mbs.AddMarker(items.MarkerKinematicTreeRigid(**place))
         moment = self.body_axes_of_links[k].T @ self.model.moment[k]
-        add_loads(self.mbs, self.model, k, marker, ground, moment, self.change.items)
+        add_loads(self.mbs, self.model, k, marker, ground, moment, self.change.ways)
         for output, sensors in self.sensors.items():
             sensor = items.SensorKinematicTree(**place, outputVariableType=output, writeToFile=False)
             sensors.append(self.mbs.AddSensor(sensor))

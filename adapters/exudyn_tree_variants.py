@@ -7,21 +7,22 @@ that each exercises.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import exudyn
 import numpy as np
 from exudyn import kinematicTree, rigidBodyUtilities, robotics
 
-from adapters.exudyn_common import OtherItems, items, make_settings, set_explicit_method, set_linear_solver
-from adapters.exudyn_variants import HAS, MANY_BODIES, WAYS
-from plumbline.engines.variants import Variant
-from plumbline.model.datatypes import Array, Call, EngineFailure, Float, Model
+from adapters.exudyn_common import Ways, items, make_settings, set_explicit_method, set_linear_solver
+from adapters.exudyn_variants import MANY_BODIES, of_ways
+from plumbline.engines.variants import variants_of
+from plumbline.model.datatypes import Array, EngineFailure, Float, Model
 
 utilities: Any = rigidBodyUtilities  # as below, functions are untyped
 trees: Any = kinematicTree
 robots: Any = robotics
+SOLVER = "MainSolverExplicit"
 LONG_STEP = 1.0  # s: of one step of Euler's method, in which v₁ = v₀ + h a to rounding
 
 
@@ -237,7 +238,7 @@ class TreeChange:
     add_tree: Callable[..., tuple[Any, Any]] | None = None  # of a system, links, gravity and rates
     add_elements: Callable[..., None] | None = None  # of a system, node, rotors, dampers, springs and forces
     matrices: Callable[[Any, Matrices], Matrices] = lambda _, matrices: matrices
-    items: Any = items
+    ways: Ways = field(default_factory=dict)
 
 
 def _is_small(model: Model) -> bool:
@@ -262,93 +263,54 @@ def _has_effort(model: Model) -> bool:
     return _is_small(model) and bool(np.any(model.effort))
 
 
-def _of_items(kind: str, names: Call, way: Callable[..., Any]) -> Variant:
-    def suits(model: Model) -> bool:
-        return _is_small(model) and HAS[kind](model)
-
-    return Variant("spelling", names, TreeChange(items=OtherItems(**{kind: way})), suits)
-
-
-def _solver(*parts: str) -> Call:
-    return tuple(f"MainSolverExplicit.{part}" for part in parts)
-
+_option = variants_of("option", TreeChange, _is_small)
+_spelling = variants_of("spelling", TreeChange, _is_small)
+CONNECTORS = "CoordinateSpringDamper", "CoordinateSpringDamperExt"
 
 VARIANTS = (
-    Variant(
-        "spelling",
-        ("MainSystem.CreateKinematicTree", "rigidBodyUtilities.TreeLink"),
-        TreeChange(_add_by_tree_links),
-        _is_small,
-    ),
-    Variant("spelling", ("robotics.Robot", "robotics.RobotLink"), TreeChange(_add_robot), _is_small),
-    Variant(
-        "option",
-        (
-            "kinematicTree.KinematicTree66", "kinematicTree.CRM", "kinematicTree.CRF",
-            "kinematicTree.JointTransformMotionSubspace66", "kinematicTree.MassCOMinertia2T66",
-        ),
-        TreeChange(matrices=_by_plucker_matrices),
+    _spelling("MainSystem.CreateKinematicTree rigidBodyUtilities.TreeLink", add_tree=_add_by_tree_links),
+    _spelling("robotics.Robot robotics.RobotLink", add_tree=_add_robot),
+    _option(
+        "kinematicTree.KinematicTree66 kinematicTree.CRM kinematicTree.CRF "
+        "kinematicTree.JointTransformMotionSubspace66 kinematicTree.MassCOMinertia2T66",
         _is_plain,
+        matrices=_by_plucker_matrices,
     ),
-    Variant(
-        "vectors",
-        ("kinematicTree.KinematicTree33", "kinematicTree.JointTransformMotionSubspace"),
-        TreeChange(matrices=_by_vectors),
-        _is_plain,
+    variants_of("vectors", TreeChange, _is_plain)(
+        "kinematicTree.KinematicTree33 kinematicTree.JointTransformMotionSubspace", matrices=_by_vectors
     ),
-    Variant("option", ("kinematicTree.Inertia2T66",), TreeChange(matrices=_by_robot), _is_serial),
-    Variant("option", ("SolveDynamic",), TreeChange(matrices=_by_step(_run_by_function)), _is_small),
-    Variant("option", ("MainSystem.SolveDynamic",), TreeChange(matrices=_by_step(_run_by_system)), _is_small),
-    Variant(
-        "option",
-        ("DynamicSolverType.ExplicitEuler",
-         *_solver("UpdateCurrentTime", "InitializeStep", "Newton", "FinishStep")),
-        TreeChange(matrices=_by_step(_run_by_parts("Newton"))),
-        _is_small,
-    ),
-    Variant(
-        "option",
-        _solver("DiscontinuousIteration"),
-        TreeChange(matrices=_by_step(_run_by_parts("DiscontinuousIteration"))),
-        _is_small,
-    ),
-    Variant("option", _solver("SolveSteps"), TreeChange(matrices=_by_step(_run_by_steps)), _is_small),
+    _option("kinematicTree.Inertia2T66", _is_serial, matrices=_by_robot),
     *(
-        Variant(
-            "spelling",
-            (f"itemInterface.{name}", f"itemInterface.ObjectConnector{name}"),
-            TreeChange(add_elements=_grounded(_spring(name))),
-            _has_elements,
+        _option(names, matrices=_by_step(run))
+        for names, run in (
+            ("SolveDynamic", _run_by_function),
+            ("MainSystem.SolveDynamic", _run_by_system),
+            (f"DynamicSolverType.ExplicitEuler {SOLVER}.UpdateCurrentTime {SOLVER}.InitializeStep "
+             f"{SOLVER}.Newton {SOLVER}.FinishStep", _run_by_parts("Newton")),
+            (f"{SOLVER}.DiscontinuousIteration", _run_by_parts("DiscontinuousIteration")),
+            (f"{SOLVER}.SolveSteps", _run_by_steps),
         )
-        for name in ("CoordinateSpringDamper", "CoordinateSpringDamperExt")
     ),
     *(
-        Variant(
-            "spelling",
-            (f"itemInterface.ObjectConnector{name}SpringForceUserFunction",),
-            TreeChange(add_elements=_grounded(_spring_by_function(name))),
-            _has_elements,
+        _spelling(names, suits, add_elements=add)
+        for names, add, suits in (
+            *(
+                (f"itemInterface.{name} itemInterface.ObjectConnector{name}", _grounded(_spring(name)),
+                 _has_elements)
+                for name in CONNECTORS
+            ),
+            *(
+                (f"itemInterface.ObjectConnector{name}SpringForceUserFunction",
+                 _grounded(_spring_by_function(name)), _has_elements)
+                for name in CONNECTORS
+            ),
+            ("itemInterface.ObjectGenericODE2ForceUserFunction "
+             "itemInterface.ObjectGenericODE2MassMatrixUserFunction", _generic_by_functions, _has_elements),
+            ("itemInterface.LoadCoordinateLoadUserFunction itemInterface.MarkerNodeCoordinate",
+             _load_by_function, _has_elements),
+            ("itemInterface.LoadCoordinate itemInterface.NodePointGround",
+             _grounded(_spring("ObjectConnectorCoordinateSpringDamper")), _has_effort),
         )
-        for name in ("CoordinateSpringDamper", "CoordinateSpringDamperExt")
     ),
-    Variant(
-        "spelling",
-        ("itemInterface.ObjectGenericODE2ForceUserFunction",
-         "itemInterface.ObjectGenericODE2MassMatrixUserFunction"),
-        TreeChange(add_elements=_generic_by_functions),
-        _has_elements,
-    ),
-    Variant(
-        "spelling",
-        ("itemInterface.LoadCoordinateLoadUserFunction", "itemInterface.MarkerNodeCoordinate"),
-        TreeChange(add_elements=_load_by_function),
-        _has_elements,
-    ),
-    Variant(
-        "spelling",
-        ("itemInterface.LoadCoordinate", "itemInterface.NodePointGround"),
-        TreeChange(add_elements=_grounded(_spring("ObjectConnectorCoordinateSpringDamper"))),
-        _has_effort,
-    ),
-    *(_of_items(*way) for way in WAYS if "Function" in way[1][0] and "Vector" in way[1][0]),
+    *of_ways(_spelling, _is_small, "LoadVectorUserFunction"),
 )  # fmt: skip

@@ -7,17 +7,17 @@ exercises.  A node has coordinates of its own for the attitude, whose rates are 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import exudyn
 import numpy as np
 from exudyn import rigidBodyUtilities
 
-from adapters.exudyn_common import OtherItems, items, known_arguments, make_rigid_body, sizes_of_body
+from adapters.exudyn_common import Ways, add_item, items, known_arguments, make_rigid_body, sizes_of_body
 from adapters.pose_functions import Pose, rate_maps
-from plumbline.engines.variants import Variant
-from plumbline.model.datatypes import Array, Call, Float, JointKind, Model, Unsupported
+from plumbline.engines.variants import Variant, variants_of
+from plumbline.model.datatypes import Array, Float, JointKind, Model, Unsupported
 from plumbline.model.kinematics import quaternion_rate, rotation_matrix, rotation_vector
 from plumbline.model.welding import RigidPart
 
@@ -75,36 +75,30 @@ def _no_rates_of_its_own(p: Float[Array, "4"]) -> Float[Array, "3 3"]:
     return np.eye(3)
 
 
-def _with_weight(mbs: Any, body: Any, gravity: Array) -> Any:
-    weight = mbs.AddMarker(items.MarkerBodyMass(bodyNumber=body))
-    mbs.AddLoad(items.LoadMassProportional(markerNumber=weight, loadVector=gravity.tolist()))
-    return body
+def _weight(marker: Any, gravity: Array) -> Any:
+    return items.LoadMassProportional(markerNumber=marker, loadVector=gravity.tolist())
 
 
-def _weight_by_function(mbs: Any, body: Any, gravity: Array) -> Any:
-    weight = mbs.AddMarker(items.MarkerBodyMass(bodyNumber=body))
+def _weight_by_function(marker: Any, gravity: Array) -> Any:
     given = {"loadVector": [0.0] * 3, "loadVectorUserFunction": lambda mbs, t, load: gravity.tolist()}
-    mbs.AddLoad(items.LoadMassProportional(markerNumber=weight, **given))
-    return body
+    return items.LoadMassProportional(markerNumber=marker, **given)
 
 
-def _add_by_short_names(mbs: Any, piece: Piece) -> tuple[Any, Any]:
-    reference = [*piece.place, *piece.turn]
-    velocities = [*piece.velocity, *(euler_parameter_rates(piece.turn) @ piece.spin)]
-    node = mbs.AddNode(items.RigidEP(referenceCoordinates=reference, initialVelocities=velocities))
-    inertia = utilities.InertiaTensor2Inertia6D(piece.part.inertia)
-    sizes = sizes_of_body(mass=piece.part.mass, inertia=inertia)
-    body = mbs.AddObject(items.RigidBody(nodeNumber=node, **sizes))
-    weight = mbs.AddMarker(items.MarkerBodyMass(bodyNumber=body))
-    mbs.AddLoad(items.Gravity(markerNumber=weight, loadVector=piece.gravity.tolist()))
-    return node, body
+def _short_weight(marker: Any, gravity: Array) -> Any:
+    return items.Gravity(markerNumber=marker, loadVector=gravity.tolist())
+
+
+def _short_body(node: Any, mass: float, J: Array) -> Any:
+    sizes = sizes_of_body(mass=mass, inertia=utilities.InertiaTensor2Inertia6D(J))
+    return items.RigidBody(nodeNumber=node, **sizes)
 
 
 def _node(
     kind: str,
-    parameters: Callable[[Array], Array],
-    rates: Callable[[Array], Array],
-    with_weight: Callable[[Any, Any, Array], Any] = _with_weight,
+    parameters: Callable[[Array], Array] = np.array,
+    rates: Callable[[Array], Array] = euler_parameter_rates,
+    weight: Callable[[Any, Array], Any] = _weight,
+    make_body: Callable[[Any, float, Array], Any] = make_rigid_body,
 ) -> Any:
     """How a body on a node of this kind is added."""
 
@@ -113,8 +107,9 @@ def _node(
         velocities = [*piece.velocity, *(rates(piece.turn) @ piece.spin)]
         item = getattr(items, kind)(referenceCoordinates=reference, initialVelocities=velocities)
         node = mbs.AddNode(item)
-        body = mbs.AddObject(make_rigid_body(node, piece.part.mass, piece.part.inertia))
-        return node, with_weight(mbs, body, piece.gravity)
+        body = mbs.AddObject(make_body(node, piece.part.mass, piece.part.inertia))
+        mbs.AddLoad(weight(mbs.AddMarker(items.MarkerBodyMass(bodyNumber=body)), piece.gravity))
+        return node, body
 
     return add
 
@@ -137,16 +132,15 @@ def _by_helper(add: Callable[..., Any], place: str, velocity: str, turn: str, sp
     return add_body
 
 
-USUAL_BODY = _node("NodeRigidBodyEP", np.array, euler_parameter_rates)
+USUAL_BODY = _node("NodeRigidBodyEP")
 
 
 def _set_later(set_parameters: Callable[..., None]) -> Any:
     """Add a body of another mass and at rest, and set both later."""
 
     def add(mbs: Any, piece: Piece) -> tuple[Any, Any]:
-        other = RigidPart(2 * piece.part.mass, piece.part.centre, piece.part.inertia)
-        rest = Piece(other, piece.place, 0 * piece.velocity, piece.turn, 0 * piece.spin, piece.gravity)
-        node, body = USUAL_BODY(mbs, rest)
+        other, rest = replace(piece.part, mass=2 * piece.part.mass), np.zeros(3)
+        node, body = USUAL_BODY(mbs, replace(piece, part=other, velocity=rest, spin=rest))
         rates = [*piece.velocity, *(euler_parameter_rates(piece.turn) @ piece.spin)]
         set_parameters(mbs, node, body, rates, piece.part.mass)
         return node, body
@@ -214,9 +208,10 @@ def _short(kind: str) -> Callable[[Any, Joint], Any]:
     return add
 
 
-def _by_utility(function: Callable[..., Any]) -> Callable[[Any, Joint], Any]:
+def _by_utility(function: str) -> Callable[[Any, Joint], Any]:
     def add(mbs: Any, joint: Joint) -> Any:
-        made = function(mbs, *joint.bodies, point=joint.place, axis=joint.axes[:, 2])
+        create = getattr(utilities, function)
+        made = create(mbs, *joint.bodies, point=joint.place, axis=joint.axes[:, 2])
         return made[0] if isinstance(made, list | tuple) else made
 
     return add
@@ -227,7 +222,7 @@ def _ball_of_generic(mbs: Any, joint: Joint) -> Any:
     return mbs.AddObject(items.ObjectJointGeneric(markerNumbers=list(joint.markers), constrainedAxes=rows))
 
 
-def _created(function: str, *given: str) -> Callable[[Any, Joint], Any]:
+def _created(function: str, given: str) -> Callable[[Any, Joint], Any]:
     """A joint by a function of the system that takes these."""
 
     def create(mbs: Any, joint: Joint) -> Any:
@@ -236,7 +231,7 @@ def _created(function: str, *given: str) -> Callable[[Any, Joint], Any]:
             "constrainedAxes": list(joint.rows), "distance": joint.length,
             "localPosition0": joint.points[0], "localPosition1": joint.points[1],
         }  # fmt: skip
-        own = {name: values[name] for name in given}
+        own = {name: values[name] for name in given.split()}
         made = getattr(mbs, function)(bodyNumbers=list(joint.bodies), **own)
         return made[0] if isinstance(made, list) else made  # before 1.10 with its markers
 
@@ -277,7 +272,7 @@ class Change:
     joints: Callable[[Any, Joint], Any] = _usual_joint
     are_meant: Callable[[JointKind], bool] = lambda _: True  # the joints that ``joints`` adds
     assemble: Callable[[Any], None] = _assemble
-    items: Any = items  # of loads and spring-dampers
+    ways: Ways = field(default_factory=dict)  # of loads and spring-dampers
     solver: Callable[[], Any] = exudyn.MainSolverImplicitSecondOrder
     initialize: Callable[[Any, Any, Any], bool] = lambda solver, *rest: bool(solver.InitializeSolver(*rest))
     mass_matrix: Callable[[Any, Array], Array] = lambda _, M: M  # of the chain, and the solver's
@@ -298,19 +293,22 @@ def _has_no_axes(model: Model) -> bool:
     return _is_open(model) and all(kind.has_attitude for kind in model.kinds)
 
 
-def _of_joints(
-    names: Call, add: Callable[[Any, Joint], Any], are_meant: Callable[[JointKind], bool]
-) -> Variant:
+_option = variants_of("option", Change, _is_open)
+_spelling = variants_of("spelling", Change, _is_open)
+
+
+def _joints(names: str, add: Callable[[Any, Joint], Any], are_meant: Callable[[JointKind], bool]) -> Variant:
     def suits(model: Model) -> bool:
         return _is_open(model) and any(map(are_meant, model.kinds))
 
-    return Variant("spelling", names, Change(joints=add, are_meant=are_meant), suits)
+    return _spelling(names, suits, joints=add, are_meant=are_meant)
 
 
 def _renamed(kind: str) -> Callable[..., Any]:
-    return lambda **given: getattr(items, kind)(**given)
+    return lambda mbs, **given: add_item(mbs, {}, kind, **given)
 
 
+DRAG = "ObjectConnectorRigidBodySpringDamper"
 SHORT_NAMES = {
     "LoadForceVector": "Force", "LoadTorqueVector": "Torque",
     "ObjectConnectorSpringDamper": "SpringDamper", "ObjectConnectorLinearSpringDamper": "LinearSpringDamper",
@@ -322,52 +320,39 @@ SHORT_NAMES = {
 def _created_between(function: str, **more: Any) -> Callable[..., Any]:
     """A connector by a function of the system, between the bodies and at the points of its markers."""
 
-    def make(markerNumbers: Any, **given: Any) -> Callable[[Any], Any]:
-        def add(mbs: Any) -> Any:
-            ends = [mbs.GetMarker(marker) for marker in markerNumbers]
-            points = {f"localPosition{i}": end["localPosition"] for i, end in enumerate(ends)}
-            create = getattr(mbs, function)
-            return create(
-                bodyNumbers=[end["bodyNumber"] for end in ends],
-                **points,
-                **given,
-                **known_arguments(create, more),
-            )
+    def add(mbs: Any, markerNumbers: Any, **given: Any) -> Any:
+        ends, create = [mbs.GetMarker(marker) for marker in markerNumbers], getattr(mbs, function)
+        given |= {f"localPosition{i}": end["localPosition"] for i, end in enumerate(ends)}
+        bodies = [end["bodyNumber"] for end in ends]
+        return create(bodyNumbers=bodies, **given, **known_arguments(create, more))
 
-        return add
-
-    return make
+    return add
 
 
-def _created_along(mbs: Any, function: str, markers: Any, axis: Array, start: float, **law: Any) -> Any:
+def _created_along(
+    mbs: Any, function: str, given: Mapping[str, Any], axis: Array, start: float, **more: Any
+) -> Any:
     """The same along an axis of the first body, with coordinates that are zero at the start."""
-    ends = [mbs.GetMarker(marker) for marker in markers]
+    ends = [mbs.GetMarker(marker) for marker in given["markerNumbers"]]
+    law = {name: given[name] for name in ("stiffness", "damping", "offset")} | more
     name = "bodyNumbers" if function == "CreateTorsionalSpringDamper" else "itemNumbers"
     place = {"position": ends[0]["localPosition"], "axis": axis, "useGlobalFrame": False}
     law["offset"] -= start
     return getattr(mbs, function)(**{name: [end["bodyNumber"] for end in ends]}, **place, **law)
 
 
-def _torsional_by_function(**given: Any) -> Callable[[Any], Any]:
-    def add(mbs: Any) -> Any:
-        axis = np.asarray(given["rotationMarker0"])[:, 2]
-        angle = mbs.GetNodeParameter(given["nodeNumber"], "initialCoordinates")[0]
-        law = {name: given[name] for name in ("stiffness", "damping", "offset", "torque")}
-        function = "CreateTorsionalSpringDamper"
-        return _created_along(mbs, function, given["markerNumbers"], axis, angle, **law)
-
-    return add
+def _torsional_by_function(mbs: Any, **given: Any) -> Any:
+    axis = np.asarray(given["rotationMarker0"])[:, 2]
+    angle = mbs.GetNodeParameter(given["nodeNumber"], "initialCoordinates")[0]
+    function = "CreateTorsionalSpringDamper"
+    return _created_along(mbs, function, given, axis, angle, torque=given["torque"])
 
 
-def _linear_by_function(**given: Any) -> Callable[[Any], Any]:
-    def add(mbs: Any) -> Any:
-        axis, markers = np.asarray(given["axisMarker0"]), given["markerNumbers"]
-        (here, turn), (there, _) = (_place_of(mbs, mbs.GetMarker(marker)) for marker in markers)
-        law = {name: given[name] for name in ("stiffness", "damping", "offset", "force")}
-        shift = float((turn @ axis) @ (there - here))
-        return _created_along(mbs, "CreateLinearSpringDamper", markers, axis, shift, **law)
-
-    return add
+def _linear_by_function(mbs: Any, **given: Any) -> Any:
+    axis = np.asarray(given["axisMarker0"])
+    (here, turn), (there, _) = (_place_of(mbs, mbs.GetMarker(marker)) for marker in given["markerNumbers"])
+    shift = float((turn @ axis) @ (there - here))
+    return _created_along(mbs, "CreateLinearSpringDamper", given, axis, shift, force=given["force"])
 
 
 def _place_of(mbs: Any, marker: Any) -> tuple[Array, Array]:
@@ -381,79 +366,65 @@ def _place_of(mbs: Any, marker: Any) -> tuple[Array, Array]:
 
 
 def _created_load(function: str) -> Callable[..., Any]:
-    def make(markerNumber: Any, **given: Any) -> Callable[[Any], Any]:
-        def add(mbs: Any) -> Any:
-            marker = mbs.GetMarker(markerNumber)
-            place = {"bodyNumber": marker["bodyNumber"], "localPosition": marker["localPosition"]}
-            return getattr(mbs, function)(**place, **given)
+    def add(mbs: Any, markerNumber: Any, **given: Any) -> Any:
+        marker = mbs.GetMarker(markerNumber)
+        place = {name: marker[name] for name in ("bodyNumber", "localPosition")}
+        return getattr(mbs, function)(**place, **given)
 
-        return add
-
-    return make
+    return add
 
 
 def _load_by_function(kind: str) -> Callable[..., Any]:
-    def make(loadVector: Any, **given: Any) -> Any:
-        return getattr(items, kind)(
-            loadVector=[0.0] * 3, loadVectorUserFunction=lambda mbs, t, load: loadVector, **given
-        )
+    def add(mbs: Any, loadVector: Any, **given: Any) -> Any:
+        given["loadVectorUserFunction"] = lambda mbs, t, load: loadVector
+        return add_item(mbs, {}, kind, loadVector=[0.0] * 3, **given)
 
-    return make
+    return add
 
 
 def _law_by_function(kind: str, argument: str) -> Callable[..., Any]:
     """A connector whose law k (x − offset) + d v + constant a function computes from x and v."""
 
-    def make(stiffness: Any, damping: Any, **given: Any) -> Any:
+    def add(mbs: Any, stiffness: Any, damping: Any, **given: Any) -> Any:
         rest = given.get("offset", 0.0)
         constant = next((given[name] for name in ("force", "torque") if name in given), 0.0)
 
         def law(mbs: Any, t: float, item: int, x: float, rate: float, *numbers: Any) -> float:
             return float(stiffness * (x - rest) + damping * rate + constant)
 
-        return getattr(items, kind)(stiffness=stiffness, damping=damping, **given, **{argument: law})
+        return add_item(mbs, {}, kind, stiffness=stiffness, damping=damping, **given, **{argument: law})
 
-    return make
+    return add
 
 
-def _six_by_function(damping: Array, **given: Any) -> Any:
+def _six_by_function(mbs: Any, damping: Array, **given: Any) -> Any:
     def law(
         mbs: Any, t: float, item: int, shift: Any, turn: Any, velocity: Any, spin: Any, *numbers: Any
     ) -> list[float]:
         return [float(x) for x in damping @ np.append(velocity, spin)]
 
-    return items.ObjectConnectorRigidBodySpringDamper(
-        damping=damping, springForceTorqueUserFunction=law, **given
-    )
+    given["springForceTorqueUserFunction"] = law
+    return add_item(mbs, {}, DRAG, damping=damping, **given)
 
 
 def _drag_by_two(way: Callable[..., Any]) -> Callable[..., Any]:
     """Drag by a connector of displacements and one of rotations."""
 
-    def make(damping: Array, markerNumbers: Any, **given: Any) -> Callable[[Any], Any]:
-        def add(mbs: Any) -> Any:
-            turning = np.diag(np.append(np.zeros(3), np.diag(damping)[3:]))
-            mbs.AddObject(
-                items.ObjectConnectorRigidBodySpringDamper(
-                    damping=turning, markerNumbers=markerNumbers, **given
-                )
-            )
-            item = way(
-                markerNumbers=markerNumbers, stiffness=[0.0] * 3, damping=np.diag(damping)[:3].tolist()
-            )
-            return item(mbs) if callable(item) else mbs.AddObject(item)
+    def add(mbs: Any, damping: Array, markerNumbers: Any, **given: Any) -> Any:
+        turning = np.diag(np.append(np.zeros(3), np.diag(damping)[3:]))
+        add_item(mbs, {}, DRAG, damping=turning, markerNumbers=markerNumbers, **given)
+        moving = np.diag(damping)[:3].tolist()
+        return way(mbs, markerNumbers=markerNumbers, stiffness=[0.0] * 3, damping=moving)
 
-        return add
-
-    return make
+    return add
 
 
-def _cartesian_by_function(damping: list[float], **given: Any) -> Any:
+def _cartesian_by_function(mbs: Any, damping: list[float], **given: Any) -> Any:
     def law(mbs: Any, t: float, item: int, x: Any, rate: Any, *numbers: Any) -> list[float]:
         return [float(d * one) for d, one in zip(damping, rate, strict=True)]
 
-    kind = items.ObjectConnectorCartesianSpringDamper
-    return kind(damping=damping, springForceUserFunction=law, **given)
+    kind = "ObjectConnectorCartesianSpringDamper"
+    return add_item(mbs, {}, kind, damping=damping, springForceUserFunction=law, **given)
 
 
 def _has_drag(model: Model) -> bool:
@@ -477,63 +448,63 @@ def _has_elements_that(what: str) -> Callable[[Model], bool]:
 HAS: Mapping[str, Callable[[Model], bool]] = {
     "LoadForceVector": lambda model: bool(np.any(model.force)),
     "LoadTorqueVector": lambda model: bool(np.any(model.moment)),
-    "ObjectConnectorRigidBodySpringDamper": _has_drag,
+    DRAG: _has_drag,
     "ObjectConnectorSpringDamper": lambda model: len(model.spring_body) > 0,
     "ObjectConnectorLinearSpringDamper": _has_elements_that("slide"),
     "ObjectConnectorTorsionalSpringDamper": _has_elements_that("turn"),
 }
 # under the name of the version; else the drag would act between the points
 _FUNCTION: Any = exudyn.MainSystem.CreateRigidBodySpringDamper
-_NOT_INTRINSIC = dict(
-    list(
-        known_arguments(_FUNCTION, {"useIntrinsicFormulation": False, "intrinsicFormulation": False}).items()
-    )[:1]
-)
-WAYS: tuple[tuple[str, Call, Callable[..., Any]], ...] = (
-    *((kind, (f"itemInterface.{short}",), _renamed(short)) for kind, short in SHORT_NAMES.items()),
+_NAMES_OF_INTRINSIC = {"useIntrinsicFormulation": False, "intrinsicFormulation": False}
+_NOT_INTRINSIC = dict(list(known_arguments(_FUNCTION, _NAMES_OF_INTRINSIC).items())[:1])
+# By kind of item and names what adds it.
+WAYS: tuple[tuple[str, str, Callable[..., Any]], ...] = (
+    *((kind, f"itemInterface.{short}", _renamed(short)) for kind, short in SHORT_NAMES.items()),
     *(
-        (f"Load{name}Vector", (f"itemInterface.Load{name}VectorLoadVectorUserFunction",),
-         _load_by_function(f"Load{name}Vector"))
+        way
         for name in ("Force", "Torque")
-    ),
-    *(
-        (f"Load{name}Vector", (f"MainSystem.Create{name}",), _created_load(f"Create{name}"))
-        for name in ("Force", "Torque")
+        for kind in (f"Load{name}Vector",)
+        for way in (
+            (kind, f"itemInterface.{kind}LoadVectorUserFunction", _load_by_function(kind)),
+            (kind, f"MainSystem.Create{name}", _created_load(f"Create{name}")),
+        )
     ),
     *(
         (f"ObjectConnector{name}SpringDamper",
-         (f"itemInterface.ObjectConnector{name}SpringDamperSpring{what}UserFunction",),
+         f"itemInterface.ObjectConnector{name}SpringDamperSpring{what}UserFunction",
          _law_by_function(f"ObjectConnector{name}SpringDamper", f"spring{what}UserFunction"))
         for name, what in (("", "Force"), ("Linear", "Force"), ("Torsional", "Torque"))
     ),
-    ("ObjectConnectorSpringDamper", ("MainSystem.CreateSpringDamper",),
-     _created_between("CreateSpringDamper")),
-    ("ObjectConnectorTorsionalSpringDamper", ("MainSystem.CreateTorsionalSpringDamper",),
-     _torsional_by_function),
-    ("ObjectConnectorLinearSpringDamper", ("MainSystem.CreateLinearSpringDamper",),
-     _linear_by_function),
-    ("ObjectConnectorRigidBodySpringDamper", ("MainSystem.CreateRigidBodySpringDamper",),
-     _created_between("CreateRigidBodySpringDamper", **_NOT_INTRINSIC)),
-    ("ObjectConnectorRigidBodySpringDamper",
-     ("itemInterface.ObjectConnectorRigidBodySpringDamperSpringForceTorqueUserFunction",), _six_by_function),
-    ("ObjectConnectorRigidBodySpringDamper",
-     ("itemInterface.ObjectConnectorCartesianSpringDamper", "itemInterface.CartesianSpringDamper"),
+    *(
+        (f"ObjectConnector{name}SpringDamper", f"MainSystem.Create{name}SpringDamper", way)
+        for name, way in (
+            ("", _created_between("CreateSpringDamper")),
+            ("Torsional", _torsional_by_function),
+            ("Linear", _linear_by_function),
+            ("RigidBody", _created_between("CreateRigidBodySpringDamper", **_NOT_INTRINSIC)),
+        )
+    ),
+    (DRAG, f"itemInterface.{DRAG}SpringForceTorqueUserFunction", _six_by_function),
+    (DRAG, "itemInterface.ObjectConnectorCartesianSpringDamper itemInterface.CartesianSpringDamper",
      _drag_by_two(_renamed("CartesianSpringDamper"))),
-    ("ObjectConnectorRigidBodySpringDamper",
-     ("itemInterface.ObjectConnectorCartesianSpringDamperSpringForceUserFunction",),
+    (DRAG, "itemInterface.ObjectConnectorCartesianSpringDamperSpringForceUserFunction",
      _drag_by_two(_cartesian_by_function)),
-    ("ObjectConnectorRigidBodySpringDamper", ("MainSystem.CreateCartesianSpringDamper",),
+    (DRAG, "MainSystem.CreateCartesianSpringDamper",
      _drag_by_two(_created_between("CreateCartesianSpringDamper"))),
 )  # fmt: skip
 
 
-def _of_item(kind: str, names: Call, way: Callable[..., Any]) -> Variant:
-    """A way to make items of this kind, where a mechanism has some."""
+def of_ways(
+    spelling: Callable[..., Variant], is_meant: Callable[[Model], bool], end: str = ""
+) -> Sequence[Variant]:
+    """List the ways to make items, of mechanisms that have some; of those whose names have this end."""
 
-    def suits(model: Model) -> bool:
-        return _is_open(model) and HAS[kind](model)
+    def suits(kind: str) -> Callable[[Model], bool]:
+        return lambda model: is_meant(model) and HAS[kind](model)
 
-    return Variant("spelling", names, Change(items=OtherItems(**{kind: way})), suits)
+    return [
+        spelling(names, suits(kind), ways={kind: way}) for kind, names, way in WAYS if names.endswith(end)
+    ]
 
 
 def _initialize_by_parts(solver: Any, mbs: Any, settings: Any) -> bool:
@@ -578,132 +549,95 @@ def _is_ball(kind: JointKind) -> bool:
     return kind.is_spherical and not kind.holds_distance
 
 
+def _is_rod(kind: JointKind) -> bool:
+    return kind.holds_distance
+
+
+def _texts(owner: str, *names: str) -> str:
+    """The names of a class or module."""
+    return " ".join(f"{owner}.{name}" for name in names)
+
+
+SOLVER = "MainSolverImplicitSecondOrder"
 VARIANTS = (
-    Variant(
-        "spelling",
-        ("itemInterface.NodeRigidBodyRxyz",),
-        Change(_node("NodeRigidBodyRxyz", _angles, _angle_rates), _angle_rates),
+    _spelling(
+        "itemInterface.NodeRigidBodyRxyz",
         _has_no_axes,
+        add_body=_node("NodeRigidBodyRxyz", _angles, _angle_rates),
+        rates=_angle_rates,
     ),
-    Variant(
-        "spelling",
-        ("itemInterface.NodeRigidBodyRotVecLG",),
-        Change(_node("NodeRigidBodyRotVecLG", rotation_vector, _no_rates_of_its_own), _no_rates_of_its_own),
+    _spelling(
+        "itemInterface.NodeRigidBodyRotVecLG",
         _has_no_axes,
+        add_body=_node("NodeRigidBodyRotVecLG", rotation_vector, _no_rates_of_its_own),
+        rates=_no_rates_of_its_own,
     ),
-    Variant(
-        "spelling",
-        ("MainSystem.CreateRigidBody", "rigidBodyUtilities.RigidBodyInertia"),
-        Change(
-            _by_helper(
-                exudyn.MainSystem.CreateRigidBody, "referencePosition", "initialVelocity",
-                "referenceRotationMatrix", "initialAngularVelocity",
-            )
+    _spelling(
+        "MainSystem.CreateRigidBody rigidBodyUtilities.RigidBodyInertia",
+        add_body=_by_helper(
+            exudyn.MainSystem.CreateRigidBody, "referencePosition", "initialVelocity",
+            "referenceRotationMatrix", "initialAngularVelocity",
         ),
-        _is_open,
     ),
-    Variant(
-        "spelling",
-        ("rigidBodyUtilities.AddRigidBody", "rigidBodyUtilities.GetRigidBodyNode"),
-        Change(
-            _by_helper(
-                utilities.AddRigidBody, "position", "velocity", "rotationMatrix", "angularVelocity"
-            )
+    _spelling(
+        "rigidBodyUtilities.AddRigidBody rigidBodyUtilities.GetRigidBodyNode",
+        add_body=_by_helper(
+            utilities.AddRigidBody, "position", "velocity", "rotationMatrix", "angularVelocity"
         ),
-        _is_open,
     ),
-    Variant(
-        "spelling",
-        ("MainSystem.SetNodeParameter", "MainSystem.SetObjectParameter"),
-        Change(_set_later(_set_parameters)),
-        _is_open,
+    _spelling(
+        "MainSystem.SetNodeParameter MainSystem.SetObjectParameter", add_body=_set_later(_set_parameters)
     ),
-    Variant(
-        "spelling",
-        ("MainSystem.ModifyNode", "MainSystem.ModifyObject"),
-        Change(_set_later(_modify)),
-        _is_open,
+    _spelling("MainSystem.ModifyNode MainSystem.ModifyObject", add_body=_set_later(_modify)),
+    _option(_texts("MainSystem", *ASSEMBLY), assemble=_assemble_by_parts),
+    _option("SystemData.GetSystemState SystemData.SetSystemState", assemble=_assemble_and_set_state),
+    *of_ways(_spelling, _is_open),
+    _option(
+        _texts(SOLVER, "InitializeSolverPreChecks", *INITIALISATION), initialize=_initialize_by_parts
     ),
-    Variant(
-        "option",
-        tuple(f"MainSystem.{part}" for part in ASSEMBLY),
-        Change(assemble=_assemble_by_parts),
-        _is_open,
-    ),
-    Variant(
-        "option",
-        ("SystemData.GetSystemState", "SystemData.SetSystemState"),
-        Change(assemble=_assemble_and_set_state),
-        _is_open,
-    ),
-    *(_of_item(*way) for way in WAYS),
-    Variant(
-        "option",
-        tuple(
-            f"MainSolverImplicitSecondOrder.{part}"
-            for part in ("InitializeSolverPreChecks", *INITIALISATION)
-        ),
-        Change(initialize=_initialize_by_parts),
-        _is_open,
-    ),
-    Variant("option", ("MainSolverStatic",), Change(solver=lambda: exudyn.MainSolverStatic()), _is_open),
-    Variant(
-        "option",
-        ("MainSystem.ComputeItem", "ComputeItemType"),
-        Change(mass_matrix=_mass_matrix_of_items, jacobian=_jacobian_of_items),
+    _option("MainSolverStatic", solver=lambda: exudyn.MainSolverStatic()),
+    _option(
+        "MainSystem.ComputeItem ComputeItemType",
         _has_no_axes,
+        mass_matrix=_mass_matrix_of_items,
+        jacobian=_jacobian_of_items,
     ),
-    Variant(
-        "option",
-        ("MainSystem.ComputeLinearizedSystem", "ComputeLinearizedSystem"),
-        Change(mass_matrix=_mass_matrix_of_linearised),
+    _option(
+        "MainSystem.ComputeLinearizedSystem ComputeLinearizedSystem",
         _has_no_axes,
+        mass_matrix=_mass_matrix_of_linearised,
     ),
-    Variant(
-        "spelling",
-        ("itemInterface.RigidEP", "itemInterface.RigidBody", "itemInterface.Gravity",
-         "rigidBodyUtilities.InertiaTensor2Inertia6D"),
-        Change(_add_by_short_names),
-        _is_open,
+    _spelling(
+        "itemInterface.RigidEP itemInterface.RigidBody itemInterface.Gravity "
+        "rigidBodyUtilities.InertiaTensor2Inertia6D",
+        add_body=_node("RigidEP", weight=_short_weight, make_body=_short_body),
     ),
-    Variant(
-        "spelling",
-        ("itemInterface.LoadMassProportionalLoadVectorUserFunction",),
-        Change(_node("NodeRigidBodyEP", np.array, euler_parameter_rates, _weight_by_function)),
-        _is_open,
+    _spelling(
+        "itemInterface.LoadMassProportionalLoadVectorUserFunction",
+        add_body=_node("NodeRigidBodyEP", weight=_weight_by_function),
     ),
-    _of_joints(("itemInterface.SphericalJoint",), _short("SphericalJoint"), _is_ball),
-    _of_joints(
-        ("itemInterface.DistanceConstraint",), _short("DistanceConstraint"), lambda kind: kind.holds_distance
+    *(
+        _joints(f"itemInterface.{name}", add, are_meant)
+        for name, add, are_meant in (
+            ("SphericalJoint", _short("SphericalJoint"), _is_ball),
+            ("DistanceConstraint", _short("DistanceConstraint"), _is_rod),
+            ("ObjectJointRevoluteZ", _item("ObjectJointRevoluteZ", np.eye(3)), TURNS),
+            ("ObjectJointPrismaticX", _item("ObjectJointPrismaticX", TURN_TO_X), SLIDES),
+            ("ObjectJointGeneric", _ball_of_generic, _is_ball),
+        )
     ),
-    _of_joints(
-        ("rigidBodyUtilities.AddRevoluteJoint",), _by_utility(utilities.AddRevoluteJoint), TURNS
+    *(
+        _joints(f"rigidBodyUtilities.{name}", _by_utility(name), are_meant)
+        for name, are_meant in (("AddRevoluteJoint", TURNS), ("AddPrismaticJoint", SLIDES))
     ),
-    _of_joints(
-        ("rigidBodyUtilities.AddPrismaticJoint",), _by_utility(utilities.AddPrismaticJoint), SLIDES
-    ),
-    _of_joints(("itemInterface.ObjectJointRevoluteZ",), _item("ObjectJointRevoluteZ", np.eye(3)), TURNS),
-    _of_joints(("itemInterface.ObjectJointPrismaticX",), _item("ObjectJointPrismaticX", TURN_TO_X), SLIDES),
-    _of_joints(("itemInterface.ObjectJointGeneric",), _ball_of_generic, _is_ball),
-    _of_joints(
-        ("MainSystem.CreateRevoluteJoint",), _created("CreateRevoluteJoint", "position", "axis"), TURNS
-    ),
-    _of_joints(
-        ("MainSystem.CreatePrismaticJoint",), _created("CreatePrismaticJoint", "position", "axis"), SLIDES
-    ),
-    _of_joints(
-        ("MainSystem.CreateGenericJoint",),
-        _created("CreateGenericJoint", "position", "rotationMatrixAxes", "constrainedAxes"),
-        BOTH,
-    ),
-    _of_joints(
-        ("MainSystem.CreateSphericalJoint",),
-        _created("CreateSphericalJoint", "position", "constrainedAxes"),
-        _is_ball,
-    ),
-    _of_joints(
-        ("MainSystem.CreateDistanceConstraint",),
-        _created("CreateDistanceConstraint", "localPosition0", "localPosition1", "distance"),
-        lambda kind: kind.holds_distance,
+    *(
+        _joints(f"MainSystem.{name}", _created(name, given), are_meant)
+        for name, given, are_meant in (
+            ("CreateRevoluteJoint", "position axis", TURNS),
+            ("CreatePrismaticJoint", "position axis", SLIDES),
+            ("CreateGenericJoint", "position rotationMatrixAxes constrainedAxes", BOTH),
+            ("CreateSphericalJoint", "position constrainedAxes", _is_ball),
+            ("CreateDistanceConstraint", "localPosition0 localPosition1 distance", _is_rod),
+        )
     ),
 )  # fmt: skip
