@@ -406,7 +406,8 @@ class Exudyn(ExudynAdapter):
                 chain = ExudynChain(model, state, has_probes=True)
                 _evaluate_state(chain)
                 assert chain.probes is not None
-                found.append(chain.probes.answer())
+                chain.probes.add_all()
+                found.append(chain.probes.found)
             add_pose_answers(found, states, POSE_FUNCTIONS, pose_function)
         return found
 

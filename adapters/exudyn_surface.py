@@ -6,8 +6,7 @@ here into those of the probe frame.
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from importlib import import_module
 from typing import Any, NamedTuple
@@ -16,8 +15,9 @@ import exudyn
 import numpy as np
 
 from adapters.exudyn_common import Output, items
+from adapters.surface_record import SurfaceRecord
 from plumbline.engines.missing_names import add_parts
-from plumbline.model.datatypes import Array, Call, Model
+from plumbline.model.datatypes import Array, Model
 from plumbline.model.kinematics import rotation_matrix
 from plumbline.model.probe_frames import PROBE_ATTITUDE, probe_points
 
@@ -204,107 +204,88 @@ OF_NODES = [(name, output.of_node, output.read) for name, output in OUTPUTS if o
 OF_MARKERS = [(name, output.quantity, output.read) for name, output in OUTPUTS if output.has_marker]
 
 
-class Probes:
+class Probes(SurfaceRecord):
     """Markers and sensors at the probe points of bodies; they are added before the system is assembled."""
 
     def __init__(self, mbs: Any, model: Model, bodies: Sequence[Any], nodes: Sequence[Any]) -> None:
         """Add them to the bodies of a system, each of one piece."""
+        super().__init__()
         self.mbs, self.bodies, self.nodes = mbs, bodies, nodes
-        self.points = [point.tolist() for point in probe_points(model)]
-        self.markers = [
-            mbs.AddMarker(items.MarkerBodyRigid(bodyNumber=body, localPosition=point))
-            for body, point in zip(bodies, self.points, strict=True)
-        ]
+        probes = zip(bodies, [point.tolist() for point in probe_points(model)], strict=True)
+        places = [{"bodyNumber": body, "localPosition": point} for body, point in probes]
+        markers = [mbs.AddMarker(items.MarkerBodyRigid(**place)) for place in places]
         self.markers_of_centres = {
             "MarkerBodyPosition": [mbs.AddMarker(items.MarkerBodyPosition(bodyNumber=x)) for x in bodies],
             "MarkerNodePosition": [mbs.AddMarker(items.MarkerNodePosition(nodeNumber=x)) for x in nodes],
             "MarkerNodeRigid": [mbs.AddMarker(items.MarkerNodeRigid(nodeNumber=x)) for x in nodes],
         }
+        # Functions that read items, kinds of sensors on them, their outputs, and the items with their points.
+        self.readers = (
+            ("GetObjectOutputBody", "SensorBody", OF_BODIES, places),
+            ("GetNodeOutput", "SensorNode", OF_NODES, [{"nodeNumber": node} for node in nodes]),
+            ("GetMarkerOutput", "SensorMarker", OF_MARKERS, [{"markerNumber": marker} for marker in markers]),
+        )
         silent = {"writeToFile": False, "storeInternal": False}
-        # by kind, output, quantity and how it is read
-        self.sensors: dict[tuple[str, str, str, Callable[[Array], Array]], list[Any]] = defaultdict(list)
-        for body, point, node, marker in zip(bodies, self.points, nodes, self.markers, strict=True):
-            places: Mapping[str, tuple[list[Any], Mapping[str, Any]]] = {
-                "SensorBody": (OF_BODIES, {"bodyNumber": body, "localPosition": point}),
-                "SensorNode": (OF_NODES, {"nodeNumber": node}),
-                "SensorMarker": (OF_MARKERS, {"markerNumber": marker}),
-            }
-            for kind, (quantities, place) in places.items():
-                for name, quantity, read in quantities:
-                    item = getattr(items, kind)(**place, outputVariableType=getattr(Output, name), **silent)
-                    self.sensors[kind, name, quantity, read].append(mbs.AddSensor(item))
-
-        velocities = [key for key in self.sensors if key[:2] == ("SensorBody", "Velocity")]
+        self.sensors = dict[tuple[str, str, str], list[Any]]()  # by kind, output and quantity
+        for _, kind, outputs, given in self.readers:
+            for name, quantity, _ in outputs:
+                make = partial(getattr(items, kind), outputVariableType=getattr(Output, name), **silent)
+                self.sensors[kind, name, quantity] = [mbs.AddSensor(make(**one)) for one in given]
+        law = {"factors": [0.5, 1.5], "sensorUserFunction": _weighted_sum}
         self.sums = [
-            mbs.AddSensor(
-                items.SensorUserFunction(
-                    sensorNumbers=[sensor, sensor],
-                    factors=[0.5, 1.5],
-                    sensorUserFunction=_weighted_sum,
-                    **silent,
-                )
-            )
-            for sensor in (self.sensors[velocities[0]] if velocities else ())
+            mbs.AddSensor(items.SensorUserFunction(sensorNumbers=[sensor, sensor], **law, **silent))
+            for sensor in self.sensors.get(("SensorBody", "Velocity", "frame_velocity"), [])
         ]
 
-    def answer(self) -> dict[str, dict[Call, Array]]:
+    def add_all(self) -> None:
         """Read all at the current state."""
-        mbs, found = self.mbs, defaultdict[str, dict[Call, Array]](dict)
-        places = (
-            ("GetObjectOutputBody", OF_BODIES, list(zip(self.bodies, self.points, strict=True))),
-            ("GetNodeOutput", OF_NODES, [(node,) for node in self.nodes]),
-            ("GetMarkerOutput", OF_MARKERS, [(marker,) for marker in self.markers]),
-        )
-        read: list[tuple[str, str, Call, Callable[[Array], Array], list[Any]]] = [
-            (quantity, name, (f"MainSystem.{function}",), of,
-             [getattr(mbs, function)(item, getattr(Output, name), *point) for item, *point in given])
-            for function, quantities, given in places
-            for name, quantity, of in quantities
-        ]  # fmt: skip
-        read += [
-            (quantity, name, ("MainSystem.GetSensorValues", f"itemInterface.{kind}"), of,
-             [mbs.GetSensorValues(sensor) for sensor in sensors])
-            for (kind, name, quantity, of), sensors in self.sensors.items()
-        ]  # fmt: skip
-        for quantity, name, call, of, values in read:
-            found[quantity][*call, f"OutputVariableType.{name}"] = of(np.array(values))
+        mbs, data = self.mbs, self.mbs.systemData
+        for function, kind, outputs, places in self.readers:
+            read = getattr(mbs, function)
+            for name, quantity, of in outputs:
+                output, member = getattr(Output, name), f"OutputVariableType.{name}"
+                direct = [read(item, output, *point) for item, *point in (x.values() for x in places)]
+                self.add(quantity, (f"MainSystem.{function}", member), of(np.array(direct)))
+                sensed = [mbs.GetSensorValues(sensor) for sensor in self.sensors[kind, name, quantity]]
+                call = "MainSystem.GetSensorValues", f"itemInterface.{kind}", member
+                self.add(quantity, call, of(np.array(sensed)))
         add_parts(
-            found,
-            *(partial(self._add_coordinates, found, *one) for one in OF_COORDINATES.items()),
-            partial(self._add_sums, found),
-            partial(self._add_dictionary, found),
-            *(partial(self._add_configuration, found, one) for one in ("Initial", "Current", "StartOfStep")),
+            self.found,
+            *(partial(self._add_coordinates, *one) for one in OF_COORDINATES.items()),
+            self._add_sums,
+            self._add_dictionary,
+            *(partial(self._add_configuration, one) for one in ("Initial", "Current", "StartOfStep")),
         )
         for kind, markers in self.markers_of_centres.items():
             for name, quantity in (("Position", "body_position"), ("Velocity", "body_velocity")):
                 values = [mbs.GetMarkerOutput(marker, getattr(Output, name)) for marker in markers]
-                found[quantity][f"itemInterface.{kind}",] = np.array(values)
-        data = mbs.systemData
+                self.add(quantity, (f"itemInterface.{kind}",), values)
         # not GetODE2CoordinatesTotal, which corrupts memory (docs/surface/exudyn_coordinates_total.py)
         reference = exudyn.ConfigurationType.Reference
         total = np.array(data.GetODE2Coordinates(reference)) + data.GetODE2Coordinates()
-        for kind, numbers in (("Node", self.nodes), ("Object", self.bodies)):
-            own = np.array([total[getattr(data, f"Get{kind}LTGODE2")(item)][:3] for item in numbers])
-            found["body_position"][f"SystemData.Get{kind}LTGODE2", "ConfigurationType.Reference"] = own
-        return found
+        for kind in ("Node", "Object"):
+            by = f"SystemData.Get{kind}LTGODE2", "ConfigurationType.Reference"
+            self.add("body_position", by, self._own(total, kind))
 
-    def _add_coordinates(self, found: dict[str, dict[Call, Array]], name: str, quantity: str) -> None:
+    def _own(self, values: Any, kind: str = "Node") -> list[Array]:
+        """The first three of each body's or node's own coordinates, of those of the system."""
+        where = getattr(self.mbs.systemData, f"Get{kind}LTGODE2")
+        numbers = self.nodes if kind == "Node" else self.bodies
+        return [np.array(values)[np.array(where(item))][:3] for item in numbers]
+
+    def _add_coordinates(self, name: str, quantity: str) -> None:
         values = [self.mbs.GetNodeOutput(node, getattr(Output, name))[:3] for node in self.nodes]
-        found[quantity]["MainSystem.GetNodeOutput", f"OutputVariableType.{name}"] = np.array(values)
+        self.add(quantity, ("MainSystem.GetNodeOutput", f"OutputVariableType.{name}"), values)
 
-    def _add_sums(self, found: dict[str, dict[Call, Array]]) -> None:
+    def _add_sums(self) -> None:
         values = np.array([self.mbs.GetSensorValues(sensor) for sensor in self.sums])
-        call = ("itemInterface.SensorUserFunction", "itemInterface.SensorUserFunctionSensorUserFunction")
-        found["frame_velocity"][call] = values / 2
+        call = "itemInterface.SensorUserFunction", "itemInterface.SensorUserFunctionSensorUserFunction"
+        self.add("frame_velocity", call, values / 2)
 
-    def _add_configuration(self, found: dict[str, dict[Call, Array]], name: str) -> None:
-        data, configuration = self.mbs.systemData, getattr(exudyn.ConfigurationType, name)
-        rates = np.array(data.GetODE2Coordinates_t(configuration))
-        own = np.array([rates[np.array(data.GetNodeLTGODE2(node))][:3] for node in self.nodes])
-        found["body_velocity"][f"ConfigurationType.{name}",] = own
+    def _add_configuration(self, name: str) -> None:
+        rates = self.mbs.systemData.GetODE2Coordinates_t(getattr(exudyn.ConfigurationType, name))
+        self.add("body_velocity", (f"ConfigurationType.{name}",), self._own(rates))
 
-    def _add_dictionary(self, found: dict[str, dict[Call, Array]]) -> None:
-        data = self.mbs.systemData
-        rates = np.array(data.GetSystemStateDict()["ODE2Coords_t"])
-        own = np.array([rates[np.array(data.GetNodeLTGODE2(node))][:3] for node in self.nodes])
-        found["body_velocity"]["SystemData.GetSystemStateDict",] = own
+    def _add_dictionary(self) -> None:
+        rates = self.mbs.systemData.GetSystemStateDict()["ODE2Coords_t"]
+        self.add("body_velocity", ("SystemData.GetSystemStateDict",), self._own(rates))
