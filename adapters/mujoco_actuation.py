@@ -15,6 +15,7 @@ from adapters.mujoco_common import (
     DOFS,
     add_actuator,
     add_sensor,
+    bodies_of,
     dense_rows,
     member,
     named_joints,
@@ -74,7 +75,7 @@ def with_actuators(ways: Mapping[str, Mapping[str, str]]) -> Callable[[Any], Any
 
 def _add_sensors(spec: Any) -> None:
     """Add sensors of the forces of actuators, and of those at scalar joints and at tendons."""
-    scalar = [x for body in spec.bodies for x in body.joints if DOFS[x.type] == 1]
+    scalar = [x for x in named_joints(spec) if DOFS[x.type] == 1]
     for kind, of, elements in (
         ("JOINTACTFRC", "JOINT", scalar),
         ("ACTUATORFRC", "ACTUATOR", spec.actuators),
@@ -186,7 +187,7 @@ def _accelerate_by_sensors(m: Any, d: Any, kind: str) -> None:
             if DOFS[J(m.jnt_type[j])] == 1:
                 force[m.jnt_dofadr[j]] = d.sensor(f"{kind} {m.joint(j).name}").data[0]
     else:
-        moment = dense_rows(d.actuator_moment, d, "moment", m.nv)
+        moment = dense_rows(d.actuator_moment, m, d, "moment")
         exerted = np.array([d.sensor(f"{kind} {m.actuator(a).name}").data[0] for a in range(len(moment))])
         force = exerted @ moment
     d.qacc[:] = through_inverse(m, d, d.qfrc_smooth - d.qfrc_actuator + force)
@@ -308,7 +309,7 @@ def forward_without_gravity(m: Any, d: Any) -> None:
 
 def with_gravcomp(spec: Any) -> Any:
     """Mark all bodies, so that the compiler counts them."""
-    for body in list(spec.bodies)[1:]:
+    for body in bodies_of(spec):
         body.gravcomp = 1.0
     return spec
 

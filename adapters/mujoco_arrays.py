@@ -12,6 +12,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from adapters.mujoco_common import structure_of
 from adapters.mujoco_probes import Probed
 from plumbline.model.datatypes import Array, Float
 from plumbline.model.kinematics import quaternion_exponential, quaternion_product, rotation_matrix
@@ -73,16 +74,16 @@ def _at_point(s: Probed, vectors: Array) -> tuple[Array, Array]:
 
 def _add_attitudes(s: Probed) -> None:
     d, inertial = s.d, rotation_matrix(s.m.body_iquat[s.links]).mT @ PROBE
-    for name in ("site_xquat", "xquat", "xmat", "xiquat", "ximat"):
-        of = None if name == "site_xquat" else inertial if name[1] == "i" else PROBE
-        ids = s.sites if name == "site_xquat" else s.links
-        s.add_attitudes((f"MjData.{name}",), getattr(d, name)[ids], of)
     places, turns = np.zeros((len(s.links), 3)), np.zeros((len(s.links), 9))
     same, call = mujoco.mjtSameFrame.mjSAMEFRAME_NONE, ("mj_local2Global", "mjtSameFrame")
     for site, body, place, turn in zip(s.sites, s.links, places, turns, strict=True):
         mujoco.mj_local2Global(d, place, turn, s.m.site_pos[site], s.m.site_quat[site], body, same)
     s.add_attitudes(call, turns)
     s.add("frame_position", call, places)
+    for name in ("xquat", "xmat", "ximat", "xiquat", "site_xquat"):  # older versions lack the last
+        of = None if name == "site_xquat" else inertial if name[1] == "i" else PROBE
+        ids = s.sites if name == "site_xquat" else s.links
+        s.add_attitudes((f"MjData.{name}",), getattr(d, name)[ids], of)
 
 
 def _own_motion(m: Any, d: Any, b: int, sensors: set[str]) -> tuple[Array, Array, list[Array]]:
@@ -197,10 +198,10 @@ def _add_inertias(s: Probed) -> None:
         while (j := m.dof_parentid[j]) >= 0:
             total += 2 * momentum @ d.cdof[j] * v[j]
     s.add("kinetic_energy", ("mj_crb", "MjData.crb"), total / 2)
-    total = 0.0
-    for i, (at, count) in enumerate(zip(m.M_rowadr, m.M_rownnz, strict=True)):
+    total, of = 0.0, structure_of(m, d, "M")
+    for i, (at, count) in enumerate(zip(of.M_rowadr, of.M_rownnz, strict=True)):
         of_row = slice(at, at + count - 1)
-        pivot = v[i] + d.qLD[of_row] @ v[m.M_colind[of_row]]
+        pivot = v[i] + d.qLD[of_row] @ v[of.M_colind[of_row]]
         total += d.qLD[at + count - 1] * pivot**2
     s.add("kinetic_energy", ("MjData.qLD",), total / 2)
 

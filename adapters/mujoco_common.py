@@ -47,9 +47,31 @@ def add_actuator(
     return set_attributes(spec.add_actuator(), **given, **attributes)
 
 
+def compiler_of(spec: Any) -> Any:
+    """The compiler's options; in 3.2.0 to 3.2.4 they are attributes of the spec itself."""
+    return getattr(spec, "compiler", spec)
+
+
+def children_of(body: Any, kind: str = "body") -> list[Any]:
+    """What a body has of one kind; older versions have no lists."""
+    found = [getattr(body, f"first_{kind}")()]
+    while found[-1]:
+        found.append(getattr(body, f"next_{kind}")(found[-1]))
+    return found[:-1]
+
+
+def bodies_of(spec: Any) -> list[Any]:
+    """All bodies but the world, parents first."""
+    _ = spec.bodies  # 3.2.0 has none, and crashes where a body has no children
+    found = children_of(spec.worldbody)
+    for body in found:
+        found += children_of(body)
+    return found
+
+
 def named_joints(spec: Any) -> list[Any]:
     """The joints of a spec; those without a name are given one."""
-    joints = [joint for body in spec.bodies for joint in body.joints]
+    joints = [joint for body in bodies_of(spec) for joint in children_of(body, "joint")]
     for j, joint in enumerate(joints):
         joint.name = joint.name or f"joint {j}"
     return joints
@@ -77,10 +99,18 @@ def through_inverse(m: Any, d: Any, force: Float[Array, "nv"]) -> Float[Array, "
     return np.asarray(found[0])
 
 
-def dense_rows(values: Float[Array, "*stored"], of: Any, name: str, width: int) -> Float[Array, "rows width"]:
-    """A sparse matrix as a dense one; old versions hold it so."""
+def structure_of(m: Any, d: Any, name: str) -> Any:
+    """What has the structure of a sparse matrix: the model, in older versions the data."""
+    return d if hasattr(d, f"{name}_rowadr") else m
+
+
+def dense_rows(
+    values: Float[Array, "*stored"], m: Any, d: Any, name: str, width: int = 0
+) -> Float[Array, "rows width"]:
+    """A sparse matrix as a dense one, of as many columns as rates by default; old versions hold it so."""
     if values.ndim == 2:
         return values
+    of, width = structure_of(m, d, name), width or m.nv
     counts, starts, columns = (getattr(of, f"{name}_{x}") for x in ("rownnz", "rowadr", "colind"))
     if values.size == len(counts) * width and not np.any(counts):
         return np.reshape(values, (-1, width))

@@ -58,7 +58,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from adapters.mujoco_common import full_mass_matrix, member, set_attributes, warnings_to
+from adapters.mujoco_common import compiler_of, full_mass_matrix, member, set_attributes, warnings_to
 from adapters.mujoco_probes import Probed
 from adapters.mujoco_surface import POSE_FUNCTIONS, add_probes, add_surface, pose_function
 from adapters.mujoco_variants import (
@@ -354,7 +354,7 @@ class _MujocoChain:
         has_text: bool = False,
     ) -> None:
         spec, self.change = mujoco.MjSpec(), change
-        _compiler_options(spec).autolimits = False
+        compiler_of(spec).autolimits = False
         self.model, self.use_dense_solve = model, dense
         self.link_ids: list[int] = []
         self.ball_ids: list[int] = []
@@ -876,11 +876,6 @@ def model_text(spec: Any, m: Any) -> tuple[str, dict[str, Any]]:
 
 
 # -- older versions ----------------------------------------------------------------------------------
-
-
-def _compiler_options(spec: Any) -> Any:
-    """Return the compiler's options; in 3.2.0 to 3.2.4 they are attributes of the spec itself."""
-    return getattr(spec, "compiler", spec)
 
 
 def _autoreset_flag() -> int:

@@ -7,6 +7,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from adapters.mujoco_common import bodies_of, children_of, compiler_of
 from plumbline.model.datatypes import Array, Float
 from plumbline.model.kinematics import quaternion_conjugate, quaternion_product, rotation_matrix
 
@@ -20,7 +21,7 @@ MESH_FACES = np.array([
 
 def of_shapes(spec: Any) -> Any:
     """Make every body with a full inertia of a box, a mesh, an ellipsoid, a ball, a shell and a cylinder."""
-    for k, body in enumerate(list(spec.bodies)[1:]):
+    for k, body in enumerate(bodies_of(spec)):
         if np.isnan(body.fullinertia[0]):
             continue
         xx, yy, zz, xy, xz, yz = body.fullinertia
@@ -51,7 +52,7 @@ def of_shapes(spec: Any) -> Any:
 
 def of_shapes_only(spec: Any) -> Any:
     """The same where the compiler is to look at nothing else."""
-    spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    compiler_of(spec).inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
     return of_shapes(spec)
 
 
@@ -79,15 +80,15 @@ def _add_mesh(spec: Any, body: Any, name: str, mass: float, half: Array, quat: A
 
 def without_shapes(spec: Any) -> Any:
     """Give bodies shapes that do not count."""
-    spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
-    for body in list(spec.bodies)[1:]:
+    compiler_of(spec).inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
+    for body in bodies_of(spec):
         _add_geom(body, "BOX", 7.0, [1, 2, 3], np.array([1.0, 0, 0, 0]))
     return spec
 
 
 def in_z_frames(spec: Any) -> Any:
     """Put every body in a frame that has its z axis, and turn it about that."""
-    for body in list(spec.bodies)[1:]:
+    for body in bodies_of(spec):
         quat = np.array(body.quat) / np.linalg.norm(body.quat)
         z = rotation_matrix(quat)[:, 2]
         least = np.array([1 + z[2], -z[1], z[0], 0.0])
@@ -108,9 +109,8 @@ def welds_as_points(spec: Any) -> Any:
         if weld.type != mujoco.mjtEq.mjEQ_WELD:
             continue
         bodies = [spec.site(name).parent for name in (weld.name1, weld.name2)]
-        length = max(
-            (float(np.linalg.norm(joint.pos)) for body in bodies for joint in body.joints), default=0.0
-        )
+        arms = [joint.pos for body in bodies for joint in children_of(body, "joint")]
+        length = max((float(np.linalg.norm(arm)) for arm in arms), default=0.0)
         for i, place in enumerate((length or 1.0) * np.eye(3)):
             names = [f"point {e} {i} {side}" for side in (1, 2)]
             for body, name in zip(bodies, names, strict=True):
@@ -126,7 +126,7 @@ def welds_as_points(spec: Any) -> Any:
 def attached(spec: Any) -> Any:
     """Attach the whole to an empty one, whose defaults have another rotor, damper and spring of joints."""
     attach, other = mujoco.MjSpec.attach, mujoco.MjSpec()
-    other.compiler.autolimits = False
+    compiler_of(other).autolimits = False
     other.default.joint.armature = 3.0
     attach(other, spec, frame=other.worldbody.add_frame(), prefix="attached ")
     return other

@@ -25,6 +25,7 @@ from adapters.mujoco_common import (
     member,
     named_joints,
     set_attributes,
+    structure_of,
     through_inverse,
     times_mass,
 )
@@ -161,9 +162,9 @@ def _add_relative_probes(spec: Any, links: Sequence[Any], model: Model) -> None:
     far = 1e3 * (1.0 + float(np.linalg.norm(anchor.pos)))  # it is not reached
     for k, (link, point) in enumerate(zip(links, probe_points(model), strict=True)):
         probe = f"probe {k}"
-        for one in (link.add_geom(), link.add_camera()):
+        shape, camera = link.add_geom(), link.add_camera()
+        for one in (shape, camera):
             set_attributes(one, name=probe, pos=point, quat=PROBE_ATTITUDE)
-        shape = link.geoms[-1]
         shape.size[0], shape.contype, shape.conaffinity, shape.mass = 1e-3, 0, 0, 0.0
         for name in RELATIVE_SENSORS:
             sensor = add_sensor(spec, name, "SITE", probe, f"{name} in first {k}")
@@ -241,9 +242,9 @@ def _add_relative(s: Probed) -> None:
     for name, (_, quantity, size) in DISTANCE_SENSORS.items():
         s.add(quantity, (f"mjtSensor.mjSENS_{name}",), s.sensors(name) / size)
     tendons, on_tendons = s.ids("tendon"), s.ids("actuator")
-    jacobian = dense_rows(d.ten_J, m if hasattr(m, "ten_J_rowadr") else d, "ten_J", m.nv)[tendons]
+    jacobian = dense_rows(d.ten_J, m, d, "ten_J")[tendons]
     ends = d.wrap_xpos.reshape(-1, 3)[d.ten_wrapadr[tendons][:, None] + np.arange(2)]
-    moment = dense_rows(d.actuator_moment, d, "moment", m.nv)
+    moment = dense_rows(d.actuator_moment, m, d, "moment")
     # a spatial tendon has a row of both points per straight piece or pulley
     away, by = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=-1), "mjtTrn.mjTRN_TENDON"
     for quantity, call, value in (
@@ -332,9 +333,10 @@ def _add_sum(s: Probed) -> None:
     """Add the kinetic energy by M added to nothing."""
     m, v, added = s.m, s.d.qvel, np.zeros(s.m.nM)
     columns = np.zeros(m.nM, np.int32)  # the binding's sizes; it fills nC
-    columns[: m.nC] = m.M_colind
-    mujoco.mj_addM(m, s.d, added, m.M_rownnz.copy(), m.M_rowadr.copy(), columns)
-    lower = dense_rows(added, m, "M", m.nv)
+    of = structure_of(m, s.d, "M")
+    columns[: m.nC] = of.M_colind
+    mujoco.mj_addM(m, s.d, added, of.M_rownnz.copy(), of.M_rowadr.copy(), columns)
+    lower = dense_rows(added, m, s.d, "M")
     s.add("kinetic_energy", ("mj_addM",), v @ (lower @ v + np.tril(lower, -1).T @ v) / 2)
 
 
@@ -429,15 +431,15 @@ def _add_implicit_steps(s: Probed, dynamics: dict[Call, Array]) -> None:
         mujoco.mj_forward(own, other)
         if name == "EULER":
             mujoco.mj_Euler(own, other)
-            L = dense_rows(other.qH, m, "M", m.nv)
+            L = dense_rows(other.qH, m, other, "M")
             pivots, added = L @ v + (1 - np.diag(L)) * v, h * m.dof_damping @ v**2
             s.add("kinetic_energy", ("MjData.qH",), (np.diag(L) @ pivots**2 - added) / 2)
             s.add("kinetic_energy", ("MjData.qHDiagInv",), ((pivots / other.qHDiagInv) @ pivots - added) / 2)
             continue
         mujoco.mj_implicit(own, other)
-        D = dense_rows(other.qDeriv, m, "D", m.nv)
+        D = dense_rows(other.qDeriv, m, other, "D")
         if name == "IMPLICIT":
-            LU = dense_rows(other.qLU, m, "D", m.nv)
+            LU = dense_rows(other.qLU, m, other, "D")
             twice = ((np.triu(LU, 1) + np.eye(m.nv)).T @ v) @ (np.tril(LU) @ v) + h * v @ D @ v
             s.add("kinetic_energy", ("MjData.qLU",), twice / 2)
         change = times_mass(m, d, (other.qvel - v) / h) - D @ (other.qvel - v)

@@ -20,7 +20,7 @@ import numpy as np
 
 from adapters import mujoco_actuation as actuation
 from adapters import mujoco_shapes as shapes
-from adapters.mujoco_common import dense_rows, member, through_inverse
+from adapters.mujoco_common import bodies_of, compiler_of, dense_rows, member, through_inverse
 from adapters.pose_functions import FIXED_PLACE, Pose, rate_maps
 from plumbline.engines.variants import Variant, variants_of
 from plumbline.model.datatypes import Array, Call, Model
@@ -278,8 +278,8 @@ def _default_options(m: Any, d: Any) -> tuple[Any, Any]:
 def _forward_by_constraint_matrix(m: Any, d: Any) -> None:
     """Solve for the forces of constraints by their matrix, that of dual solvers, and by its root."""
     mujoco.mj_forward(m, d)
-    root = dense_rows(d.efc_Y, d, "efc_Y", m.nv)
-    matrices = dense_rows(d.efc_AR, d, "efc_AR", len(d.efc_b)), root @ root.T + np.diag(d.efc_R)
+    root = dense_rows(d.efc_Y, m, d, "efc_Y")
+    matrices = dense_rows(d.efc_AR, m, d, "efc_AR", len(d.efc_b)), root @ root.T + np.diag(d.efc_R)
     d.efc_force[:] = -sum(np.linalg.solve(matrix, d.efc_b) for matrix in matrices) / 2
     mujoco.mj_mulJacTVec(m, d, d.qfrc_constraint, d.efc_force)
     d.qacc[:] = through_inverse(m, d, d.qfrc_smooth + d.qfrc_constraint)
@@ -287,7 +287,7 @@ def _forward_by_constraint_matrix(m: Any, d: Any) -> None:
 
 def _constraint_forces(m: Any, d: Any, softness: Array, reference: Array) -> Array:
     """Solve for the forces of constraints by their Jacobian."""
-    rows = dense_rows(d.efc_J, d, "efc_J", m.nv)
+    rows = dense_rows(d.efc_J, m, d, "efc_J")
     through, product = np.zeros_like(rows), np.zeros(len(rows))
     mujoco.mj_solveM(m, d, through, rows)
     mujoco.mj_mulJacVec(m, d, product, d.qacc_smooth)
@@ -331,7 +331,7 @@ def _switched_off(spec: Any) -> Any:
 
 
 def _never_asleep(spec: Any) -> Any:
-    for body in _bodies(spec):
+    for body in bodies_of(spec):
         if body.parent.name == "world":
             body.sleep = mujoco.mjtSleepPolicy.mjSLEEP_NEVER
     return spec
@@ -348,13 +348,9 @@ def _keep(m: Any, d: Any) -> None:
     """Leave what the last state left in the data."""
 
 
-def _bodies(spec: Any) -> list[Any]:
-    return list(spec.bodies)[1:]
-
-
 def _in_frames(spec: Any) -> Any:
     """Put every body in two frames, one in the other."""
-    for body in _bodies(spec):
+    for body in bodies_of(spec):
         back = quaternion_conjugate(PROBE_ATTITUDE)
         outer = body.parent.add_frame(pos=FIXED_PLACE, quat=PROBE_ATTITUDE)
         inner = body.parent.add_frame(pos=-rotation_matrix(back) @ FIXED_PLACE, quat=back)
@@ -367,8 +363,9 @@ def _oriented(kind: str, convert: Callable[[Pose], Array]) -> Variant:
     """Give the attitudes of bodies and of their inertias in another form than as quaternions."""
 
     def describe(spec: Any) -> Any:
-        spec.compiler.degree, spec.compiler.eulerseq = False, list("xyz")
-        for body in _bodies(spec):
+        compiler = compiler_of(spec)
+        compiler.degree, compiler.eulerseq = False, list("xyz")
+        for body in bodies_of(spec):
             for orientation, quat in ((body.alt, body.quat), (body.ialt, body.iquat)):
                 orientation.type = member(f"mjtOrientation.mjORIENTATION_{kind}")
                 pose = Pose(np.zeros(3), np.array(quat) / np.linalg.norm(quat))

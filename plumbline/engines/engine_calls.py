@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from importlib import metadata
 from io import StringIO
 
@@ -17,9 +18,9 @@ import numpy as np
 
 from plumbline.engines.adapter import Adapter, EngineInfo
 from plumbline.engines.environments import declared_attribute
-from plumbline.engines.missing_names import MISSING_NAMES, OWN_PACKAGES
+from plumbline.engines.missing_names import FAILED_PARTS, IS_APART, MISSING_NAMES, OWN_PACKAGES
 from plumbline.engines.registry import load_adapter
-from plumbline.engines.variants import NoAnswer, VariantKind
+from plumbline.engines.variants import NoAnswer, Variant, VariantKind
 from plumbline.model.datatypes import (
     Array,
     Call,
@@ -34,8 +35,10 @@ from plumbline.model.datatypes import (
     Unsupported,
 )
 from plumbline.processes.exceptions import describe_exception
+from plumbline.processes.isolation import EndedEarly, call_in_fork
 
 BESIDES = ("surface", "variants")  # what an engine is asked for after the state quantities
+APART = "apart"  # the same, each part and variant in a process of its own
 SURFACE_STATES = 8  # of a scenario, at which what engines report besides the state quantities is compared
 
 
@@ -144,7 +147,7 @@ def evaluate_states(
     """Evaluate the state quantities of one engine; what the engine raises becomes a reason.
 
     Args:
-        besides: which of `BESIDES` to ask for, too.
+        besides: which of `BESIDES` to ask for, too, and `APART` where an engine has crashed by them.
 
     Returns:
         The quantities at each state, or the reason why there are none.
@@ -171,6 +174,7 @@ def evaluate_states(
         failure = describe_exception(error)
     surface, surface_failure = dict[str, dict[Call, Array]](), ""
     variants: dict[VariantKind, dict[Call, list[StateQuantities] | NoAnswer]] = {}
+    IS_APART.set(APART in besides)
     if quantities and not failure and "surface" in besides:
         try:
             surface = stack_answers(adapter.surface(model, states[:SURFACE_STATES]))
@@ -197,18 +201,27 @@ def evaluate_variants(
     """
     found: dict[VariantKind, dict[Call, list[StateQuantities] | NoAnswer]] = {}
     for variant in adapter.variants:
-        if not variant.suits(model):
-            continue
-        by_names = found.setdefault(variant.kind, {})
-        try:
-            by_names[variant.names] = adapter.with_variant(variant).evaluate(model, states)
-        except Unsupported as refusal:
-            by_names[variant.names] = NoAnswer(str(refusal), is_refusal=True)
-        except MemoryError:
-            raise
-        except Exception as error:  # as above
-            by_names[variant.names] = NoAnswer(describe_exception(error), is_refusal=False)
+        if variant.suits(model):
+            by_names = found.setdefault(variant.kind, {})
+            ask = partial(_variant_answer, adapter, variant, model, states)
+            try:
+                by_names[variant.names] = call_in_fork(ask) if IS_APART.get() else ask()
+            except EndedEarly as error:
+                by_names[variant.names] = NoAnswer(str(error), is_refusal=False)
     return found
+
+
+def _variant_answer(
+    adapter: Adapter, variant: Variant, model: Model, states: Sequence[State]
+) -> list[StateQuantities] | NoAnswer:
+    try:
+        return adapter.with_variant(variant).evaluate(model, states)
+    except Unsupported as refusal:
+        return NoAnswer(str(refusal), is_refusal=True)
+    except MemoryError:
+        raise
+    except Exception as error:  # as above
+        return NoAnswer(describe_exception(error), is_refusal=False)
 
 
 def stack_answers(answers: Sequence[SurfaceAnswer]) -> dict[str, dict[Call, Array]]:
@@ -218,12 +231,14 @@ def stack_answers(answers: Sequence[SurfaceAnswer]) -> dict[str, dict[Call, Arra
         answers: of the surface, one per state; later states may lack calls of the first.
 
     """
-    return {
+    failed = {words: np.zeros((1, 1, 1)) for one in answers for words in one.get(FAILED_PARTS, {})}
+    return ({FAILED_PARTS: failed} if failed else {}) | {
         quantity: {
             call: np.array([one[quantity][call] for one in answers if call in one.get(quantity, {})])
             for call in calls
         }
         for quantity, calls in (answers[0] if answers else {}).items()
+        if quantity != FAILED_PARTS
     }
 
 

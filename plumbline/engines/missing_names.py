@@ -1,16 +1,22 @@
-"""What the installed version of an engine lacks of the names that an adapter uses."""
+"""What an answer of the surface lacks: names of the engine, and parts by which it failed."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextvars import ContextVar
 from types import ModuleType
 
 import numpy as np
 
-from plumbline.model.datatypes import Array, Call
+from plumbline.model.datatypes import Array, Call, Unsupported
+from plumbline.processes.exceptions import describe_exception
+from plumbline.processes.isolation import EndedEarly, call_in_fork
 
-# Under this name an answer of the surface has the names of the engine that its version lacks.
-MISSING_NAMES = "missing names"
+# Under these names an answer of the surface has the names of the engine that its version lacks, and what
+# parts failed by.
+MISSING_NAMES, FAILED_PARTS = "missing names", "failed parts"
+# Whether each part has a process of its own, that a crash ends alone.
+IS_APART = ContextVar("IS_APART", default=False)
 BASE_REQUIREMENTS = ("numpy", "scipy", "packaging", "pydantic")  # imported by adapters and core in workers
 # What every environment has: what is missing there is a mistake of this project or of the environment.
 OWN_PACKAGES = {"plumbline", "adapters", "reference_impl", *BASE_REQUIREMENTS, ""}
@@ -37,17 +43,47 @@ def missing_name(error: Exception, adapter: str = "") -> str | None:
 
 
 def add_parts(found: dict[str, dict[Call, Array]], *parts: Callable[[], object]) -> None:
-    """Let each part add to an answer of the surface, up to the first name that the engine's version lacks.
+    """Let each part add to an answer of the surface, up to its first failure or name that the version lacks.
 
     Raises:
         AttributeError: a name is missing elsewhere than in the engine.
 
+    `MemoryError` and `Unsupported` pass through.
+
     """
     for part in parts:
         try:
-            part()
-        except (AttributeError, ModuleNotFoundError) as error:
-            name = missing_name(error)
-            if name is None:
-                raise
-            found.setdefault(MISSING_NAMES, {})[name,] = np.zeros((1, 1))
+            if IS_APART.get():
+                found |= call_in_fork(lambda: _add_part(found, part))  # noqa: B023
+            else:
+                _add_part(found, part)
+        except EndedEarly as error:
+            _note(found, FAILED_PARTS, f"{_label(part)}: {error}")
+
+
+def _add_part(
+    found: dict[str, dict[Call, Array]], part: Callable[[], object]
+) -> dict[str, dict[Call, Array]]:
+    try:
+        part()
+    except (MemoryError, Unsupported):
+        raise
+    except (AttributeError, ModuleNotFoundError) as error:
+        name = missing_name(error)
+        if name is None:
+            raise
+        _note(found, MISSING_NAMES, name)
+    except Exception as error:  # an engine may raise anything, and other parts are to be compared
+        _note(found, FAILED_PARTS, f"{_label(part)}: {describe_exception(error)}")
+    return found
+
+
+def _note(found: dict[str, dict[Call, Array]], kind: str, words: str) -> None:
+    found.setdefault(kind, {})[words,] = np.zeros((1, 1))
+
+
+def _label(part: Callable[[], object]) -> str:
+    """What a part adds, by the function that it calls or is a part of."""
+    whole = getattr(part, "func", part)
+    names = whole.__code__.co_names if whole.__name__ == "<lambda>" else (whole.__name__,)
+    return next((name for name in names if "add" in name), whole.__name__).replace("_", " ").strip()

@@ -12,7 +12,7 @@ import numpy as np
 from plumbline.diagnosis.cause import Cause, Diagnosis
 from plumbline.engines import engine_calls, environments
 from plumbline.engines.adapter import EngineInfo
-from plumbline.engines.engine_calls import BESIDES
+from plumbline.engines.engine_calls import APART, BESIDES
 from plumbline.engines.specifications import task_engine
 from plumbline.engines.surface import SURFACES
 from plumbline.execution.plan import (
@@ -267,7 +267,7 @@ class ScenarioRun:
         has_besides = key.kind == TaskKind.STATE and environments.split_version(key.engine)[0] in SURFACES
         failures = self._failures_besides.setdefault(key, []) if has_besides else []
         if outcome.failure and has_besides and len(failures) < len(BESIDES):
-            # What is asked for last may have ended the worker; one that hung is asked for the states only.
+            # What is asked for besides may have ended the worker; one that hung is asked for the states only.
             failures += [outcome.failure] * (len(BESIDES) if outcome.is_overdue else 1)
             return [self._cell_task(key)]
         self._pending.discard(key)
@@ -421,7 +421,8 @@ class ScenarioRun:
         """The function that computes a cell, and its arguments after the engine."""
         s, plan = self.scenario, self._plan
         if key.kind == TaskKind.STATE:
-            asked = BESIDES[: max(0, len(BESIDES) - len(self._failures_besides.get(key, ())))]
+            by_failures: list[tuple[str, ...]] = [BESIDES, (*BESIDES, APART), ()]
+            asked = by_failures[len(self._failures_besides.get(key, ()))]
             return engine_calls.evaluate_states, (s.model, self._states, asked)
         if key.kind == TaskKind.RELATIONS:
             return relations.check_relations, (s.model, self._states)
@@ -478,9 +479,10 @@ class ScenarioRun:
             )
             return JudgingResult(rows=[row])
         found: JudgingResult = outcome.judge_result
-        for what, reason in zip(reversed(BESIDES), self._failures_besides.get(key, ()), strict=False):
+        failures = self._failures_besides.get(key, [])
+        for what in BESIDES if len(failures) == len(BESIDES) else ():  # else each part says how it ended
             quantity = "all" if what == "surface" else f"all_{what}"
-            row = self._context(key.engine).make_row("surface", "-", quantity, Verdict.FAILED, reason)
+            row = self._context(key.engine).make_row("surface", "-", quantity, Verdict.FAILED, failures[-1])
             found.rows.append(row)
         is_refused = any(row.verdict == Verdict.UNSUPPORTED and row.quantity == "all" for row in found.rows)
         if key.kind == TaskKind.STATE and is_singular(self._singular_value) and not is_refused:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from plumbline.engines.engine_calls import Evaluation
-from plumbline.engines.missing_names import MISSING_NAMES
+from plumbline.engines.missing_names import FAILED_PARTS, MISSING_NAMES
 from plumbline.judging.rows import WRONG_CALL, Row, RowContext, Verdict
 from plumbline.model.datatypes import Array
 from plumbline.truth.ground_truth import StateTruth
@@ -26,8 +26,7 @@ def judge_surface(context: RowContext, truth: StateTruth, evaluation: Evaluation
         evaluation: with the engine's answers at the same states, or why there are none.
 
     Returns:
-        One row per quantity, with the number of calls in ``extra``; one row where the engine failed, or lacks
-        names.
+        One row per quantity, with the number of calls in ``extra``, and rows of what failed or is lacking.
 
     """
     if evaluation.surface_failure and truth.surface:
@@ -37,6 +36,9 @@ def judge_surface(context: RowContext, truth: StateTruth, evaluation: Evaluation
         for name in SURFACE_QUANTITIES
         if name in truth.surface and name in evaluation.surface
     ]
+    if failed := evaluation.surface.get(FAILED_PARTS):
+        reason = "; ".join(sorted(words for (words,) in failed))
+        rows.append(context.make_row("surface", "-", "all", Verdict.FAILED, reason))
     if missing := evaluation.surface.get(MISSING_NAMES):  # what was not compared is no agreement
         names = ", ".join(name for call in missing for name in call)
         reason = f"version {context.version} has no {names}: what they report is not compared"
@@ -79,11 +81,12 @@ def _row(context: RowContext, quantity: str, true: SurfaceTruth, evaluation: Eva
 
 
 def _worst(value: Array, true: SurfaceTruth) -> tuple[float, float, float, int]:
-    """The largest ratio of error and tolerance, with both and the state; infinite where shapes differ."""
+    """The largest ratio of error and tolerance, with both and the state; infinite of what is no answer."""
     first = slice(len(value))  # some calls are made at the first states only
     if not len(value) or value.shape != true.value[first].shape:
         return np.inf, np.inf, 0.0, 0
     error, tolerance = np.linalg.norm(value - true.value[first], axis=-1), true.tolerance[first]
+    error = np.where(np.isfinite(error), error, np.inf)
     ratio = error / np.maximum(tolerance, TINY)
     at = np.unravel_index(int(np.argmax(ratio)), ratio.shape)
     return float(ratio[at]), float(error[at]), float(tolerance[at]), int(at[0])

@@ -12,13 +12,14 @@ import contextlib
 import ctypes
 import errno
 import os
+import pickle
 import shutil
 import signal
 import sys
 import tempfile
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from pathlib import Path
-from typing import IO, Self
+from typing import IO, Self, TypeVar
 
 from plumbline.processes.exceptions import PlumblineError
 
@@ -27,6 +28,7 @@ try:
 except ImportError:  # Windows: orphaned folders stay there
     fcntl = None  # type: ignore[assignment]
 
+T = TypeVar("T")
 _LOCK_FILE = "owner.lock"
 _RANDOM_NAME = "[a-z0-9_]" * 8  # what mkdtemp adds to a prefix
 _PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36  # linux/prctl.h
@@ -46,6 +48,40 @@ def die_with_parent(parent: int, number: int = 9) -> None:
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, number)
     if os.getppid() != parent and not (_PROC / str(parent)).exists():
         os._exit(1)  # the parent ended before the call
+
+
+class EndedEarly(PlumblineError):
+    """A process ended before it had an answer."""
+
+
+def call_in_fork(call: Callable[[], T]) -> T:
+    """Call in a process of its own, so that a crash ends nothing else; in this one where there is no fork.
+
+    Raises:
+        EndedEarly: the call raised, or ended the process.
+
+    """
+    if not hasattr(os, "fork"):
+        return call()
+    parent, (read, write) = os.getpid(), os.pipe()
+    if not (child := os.fork()):
+        code = 1
+        with contextlib.suppress(BaseException):
+            die_with_parent(parent)
+            with open(write, "wb") as stream:
+                pickle.dump(call(), stream)
+            code = 0
+        os._exit(code)
+    os.close(write)
+    with open(read, "rb") as stream:
+        sent = stream.read()
+    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    if code < 0:
+        raise EndedEarly(f"crashed: the process died of {signal.Signals(-code).name}")
+    if code:
+        raise EndedEarly("the process ended without an answer")
+    answer: T = pickle.loads(sent)
+    return answer
 
 
 def adopt_orphans() -> None:

@@ -1,5 +1,7 @@
 """Rows of the surface: what engines report besides the state quantities, against the certified motion."""
 
+import os
+import signal
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +10,7 @@ import pytest
 
 from adapters import mujoco_surface
 from plumbline.engines.engine_calls import Evaluation, evaluate_states, evaluate_variants, stack_answers
-from plumbline.engines.missing_names import add_parts
+from plumbline.engines.missing_names import FAILED_PARTS, IS_APART, add_parts
 from plumbline.engines.registry import load_adapter
 from plumbline.engines.surface import SURFACES
 from plumbline.engines.variants import NoAnswer
@@ -202,6 +204,34 @@ def test_a_name_that_this_project_lacks_is_a_failure(tree, monkeypatch):
     model, states, _ = tree
     monkeypatch.delattr(mujoco_surface, "SENSOR_STAGES")
     found = evaluate_states("mujoco", model, states, ["surface"])
-    assert found.surface_failure == "NameError: name 'SENSOR_STAGES' is not defined" and not found.variants
+    assert list(found.surface[FAILED_PARTS]) == [
+        ("add sensors: NameError: name 'SENSOR_STAGES' is not defined",)
+    ]
+    assert "frame_position" in found.surface, "the other parts are compared"
     with pytest.raises(AttributeError):
         add_parts({}, lambda: np.a_name_of_a_package_that_every_environment_has)
+
+
+def test_a_part_that_fails_or_ends_its_process_costs_that_part_only():
+    found = {}
+
+    def add_singular():
+        found["momentum"] = {("before",): np.ones((1, 3))}
+        np.linalg.inv(np.zeros((2, 2)))
+
+    def add_crash():
+        os.kill(os.getpid(), signal.SIGSEGV)
+
+    def add_energy():
+        found["energy"] = {("energy",): np.ones((1, 1))}
+
+    token = IS_APART.set(True)
+    try:
+        add_parts(found, add_singular, add_crash, add_energy)
+    finally:
+        IS_APART.reset(token)
+    assert {words for (words,) in found.pop(FAILED_PARTS)} == {
+        "add singular: LinAlgError: Singular matrix",
+        "add crash: crashed: the process died of SIGSEGV",
+    }
+    assert set(found) == {"momentum", "energy"}
