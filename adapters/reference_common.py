@@ -6,14 +6,27 @@ T = diag(M, 4 LᵀJL), the upper left block of S, the kinetic energy is ½ yᵀ 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import numpy as np
 
-from plumbline.model.datatypes import Array, Float, Integrator, Model, State, StateQuantities, Trajectory
+from plumbline import __version__
+from plumbline.engines.metamorphic_hooks import MetamorphicHooks
+from plumbline.model.datatypes import (
+    Array,
+    EngineFailure,
+    Float,
+    Integrator,
+    Model,
+    State,
+    StateQuantities,
+    Trajectory,
+)
 from plumbline.model.kinematics import velocity_jacobian
 from reference_impl.euler_parameters import A, L, euler_parameter_rate
 from reference_impl.integrate import IntegrationResult
 
-NO_WELD = "the notes know ball joints and rods, no joint that holds two bodies rigidly"
 DOP853 = Integrator(
     "dop853",
     "tolerance",
@@ -22,6 +35,25 @@ DOP853 = Integrator(
     note="scipy's DOP853 on y = (r, p, ṙ, ṗ), no stabilisation; resolution is rtol, atol is rtol "
     "times the natural size of each part of y",
 )
+
+
+class NotesAdapter(MetamorphicHooks):
+    """Declarations common to both columns of the notes' equations."""
+
+    package = "plumbline"
+    welding_unsupported_reason = "the notes know ball joints and rods, no joint that holds two bodies rigidly"
+
+    def version(self) -> str:
+        """Return the version of this checkout."""
+        return __version__
+
+    @contextmanager
+    def _named_failures(self) -> Iterator[None]:
+        """Report what the equations cannot be solved for as a failure of the column."""
+        try:
+            yield
+        except ArithmeticError as error:
+            raise EngineFailure(f"{self.title}: {error}") from error
 
 
 def notes_state(

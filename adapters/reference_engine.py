@@ -7,38 +7,20 @@ from typing import ClassVar
 
 import numpy as np
 
-from adapters.reference_common import (
-    DOP853,
-    NO_WELD,
-    notes_state,
-    state_quantities,
-    trajectory,
-)
-from plumbline import __version__
-from plumbline.engines.metamorphic_hooks import MetamorphicHooks
-from plumbline.model.datatypes import (
-    Array,
-    EngineFailure,
-    Integrator,
-    Model,
-    State,
-    StateQuantities,
-    Trajectory,
-)
+from adapters.reference_common import DOP853, NotesAdapter, notes_state, state_quantities, trajectory
+from plumbline.model.datatypes import Array, Integrator, Model, State, StateQuantities, Trajectory
 from plumbline.model.kinematics import joint_coordinates
 from reference_impl.direct import DirectSystem, Solution
 from reference_impl.fast.collocation import integrate_collocation
 from reference_impl.fast.tree_elimination import eliminated_system, fastest_acceleration
 from reference_impl.integrate import integrate_dop853
-from reference_impl.singular_system import SingularSystem
 
 
-class Reference(MetamorphicHooks):
+class Reference(NotesAdapter):
     """The notes' own system S x = b (N5) and first-order form (N6), raw."""
 
     name: ClassVar[str] = "reference"
     title: ClassVar[str] = "Reference (the notes)"
-    package: ClassVar[str] = "plumbline"
     integrators: ClassVar[tuple[Integrator, ...]] = (
         DOP853,
         Integrator(
@@ -54,11 +36,6 @@ class Reference(MetamorphicHooks):
 
     builds_trees = builds_elements = moves_loops = True
     options = ("dense factors", "O(N) form")
-    welding_unsupported_reason = NO_WELD
-
-    def version(self) -> str:
-        """Return the version of this checkout."""
-        return __version__
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
         system = DirectSystem(model)
@@ -66,10 +43,8 @@ class Reference(MetamorphicHooks):
         if self.option:
             dense = self.option == "dense factors"
             solve = system.solve_with_dense_factors if dense else eliminated_system([model]).solve
-        try:
+        with self._named_failures():
             return [self._quantities(system, state, solve) for state in states]
-        except SingularSystem as error:
-            raise EngineFailure(f"{self.title}: {error}") from error
 
     @staticmethod
     def _quantities(system: DirectSystem, state: State, solve: Callable[..., Solution]) -> StateQuantities:
@@ -93,28 +68,23 @@ class Reference(MetamorphicHooks):
         self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
     ) -> Trajectory:
         start, x = notes_state(state), joint_coordinates(model, state)[2]
-        try:
+        with self._named_failures():
             if integrator.name == "collocation":
                 system = eliminated_system([model], x)
                 return trajectory(integrate_collocation(system, *start, times, resolution))
-            return trajectory(
-                integrate_dop853(model, *start, times, resolution, fastest_acceleration(model), x)
-            )
-        except ArithmeticError as error:
-            raise EngineFailure(f"{self.title}: {error}") from error
+            by = fastest_acceleration(model)
+            return trajectory(integrate_dop853(model, *start, times, resolution, by, x))
 
     def _simulate_round_trip(
         self, model: Model, state: State, end: float, integrator: Integrator, resolution: float
     ) -> Trajectory:
         times = np.array([0.0, end, 2 * end])
-        try:
+        with self._named_failures():
             system = eliminated_system([model], joint_coordinates(model, state)[2])
             there = integrate_collocation(system, *notes_state(state), times[:2], resolution)
             turned = there.r[-1], there.p[-1], -there.v[-1], -there.pdot[-1]
             system = eliminated_system([model], there.x[-1])
             back = integrate_collocation(system, *turned, times[:2], resolution)
-        except ArithmeticError as error:
-            raise EngineFailure(f"{self.title}: {error}") from error
         names = ("r", "p", "v", "pdot")
         rows = {name: np.vstack([getattr(there, name), getattr(back, name)[1:]]) for name in names}
         return Trajectory(t=times, **rows, steps=there.steps + back.steps)

@@ -11,18 +11,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from adapters.reference_common import (
-    DOP853,
-    NO_WELD,
-    notes_state,
-    state_quantities,
-    trajectory,
-)
-from plumbline import __version__
-from plumbline.engines.metamorphic_hooks import MetamorphicHooks
+from adapters.reference_common import DOP853, NotesAdapter, notes_state, state_quantities, trajectory
 from plumbline.model.datatypes import (
     Array,
-    EngineFailure,
     Integrator,
     Model,
     State,
@@ -33,36 +24,27 @@ from plumbline.model.datatypes import (
 from plumbline.model.kinematics import joint_vectors
 from reference_impl.integrate import integrate_dop853, notes_acceleration
 from reference_impl.notes import assemble_system, solve_system
-from reference_impl.singular_system import SingularSystem
 
 
-class ReferencePrinted(MetamorphicHooks):
+class ReferencePrinted(NotesAdapter):
     """S1–S5, D1–D6 and S x = b (N5) as formulation.md prints them, and the first-order form (N6)."""
 
     name: ClassVar[str] = "reference-printed"
     title: ClassVar[str] = "Reference (the notes as printed)"
-    package: ClassVar[str] = "plumbline"
     integrators: ClassVar[tuple[Integrator, ...]] = (DOP853,)
     unsupported: ClassVar[Mapping[str, str]] = {
         "balls": "the notes print a rod at every joint; a ball joint is their limit of length 0 (E1)",
         "chains": "the notes print the equations of one and of two bodies",
     }
-    welding_unsupported_reason = NO_WELD
-
-    def version(self) -> str:
-        """Return the version of this checkout."""
-        return __version__
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
         self._check_printed(model)
-        return [self._quantities(model, state) for state in states]
+        with self._named_failures():
+            return [self._quantities(model, state) for state in states]
 
     def _quantities(self, model: Model, state: State) -> StateQuantities:
         n, at = model.n, notes_state(state)
-        try:
-            x = solve_system(model, *at)
-        except SingularSystem as error:
-            raise EngineFailure(f"{self.title}: {error}") from error
+        x = solve_system(model, *at)
         acceleration, pddot, multiplier = np.split(x, [3 * n, 7 * n, 8 * n])[:3]
         reaction = -2 * multiplier[:, None] * joint_vectors(model, state.r, state.p)
         S, _ = assemble_system(model, *at)
@@ -72,11 +54,9 @@ class ReferencePrinted(MetamorphicHooks):
         self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
     ) -> Trajectory:
         self._check_printed(model)
-        try:
-            run = integrate_dop853(model, *notes_state(state), times, resolution, notes_acceleration(model))
-        except ArithmeticError as error:
-            raise EngineFailure(f"{self.title}: {error}") from error
-        return trajectory(run)
+        with self._named_failures():
+            by = notes_acceleration(model)
+            return trajectory(integrate_dop853(model, *notes_state(state), times, resolution, by))
 
     def _check_printed(self, model: Model) -> None:
         if not np.all(model.rods):
