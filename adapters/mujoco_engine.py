@@ -278,15 +278,12 @@ class Mujoco(MetamorphicHooks):
             tree.m.opt.iterations = RUN_ITERATIONS
             tree.m.eq_solref[:] = RUN_SOLREF
             run = self._sampled_run(tree, soft.state(state), times, integrator, resolution)
-            runs.append(soft.cut.source_run(run) if soft.cut else run)
+            runs.append(soft.cut.source_run(run))
         limit: dict[str, Any] = {}
         change: dict[str, Array] = {}
         for name in ("r", "p", "v", "pdot"):
             column = [getattr(run, name) for run in runs]
-            for power in range(1, RUN_REGULARISATIONS):
-                before = column[-1]
-                column = [(RATIO**power * x - y) / (RATIO**power - 1) for y, x in pairwise(column)]
-            limit[name], change[name] = column[0], column[0] - before
+            limit[name], change[name] = _at_zero(column)
         error = np.array([_largest_norm(change[name]) for name in ("r", "p", "v")])
         error[1] *= 2  # |δp| of a unit quaternion is half the rotation angle
         before = limit["p"] - change["p"], limit["pdot"] - change["pdot"]
@@ -370,7 +367,8 @@ class _MujocoChain:
             pieces = (parts or undivided_bodies(model))[k]
             links.append(self._add_link(parent, k, hang, pieces))
             _add_load_actuators(spec, links[k], k, model)
-        _add_tendons(spec, links, model)
+        for i, (bodies, points) in enumerate(zip(model.spring_body, model.spring_point, strict=True)):
+            _add_tendon(spec, links, f"spring {i}", bodies, points)
         constraints = constraints or _Constraints()
         _add_equalities(spec, links, constraints)
         if has_probes:
@@ -378,7 +376,9 @@ class _MujocoChain:
         spec = change.describe(spec)
         m = spec.compile()
         m.opt.gravity = model.gravity
-        m.opt.disableflags = mujoco.mjtDisableBit.mjDSBL_CONTACT | _autoreset_flag()
+        # 3.2.0 always resets, which the contract's checks report
+        no_reset = getattr(mujoco.mjtDisableBit, "mjDSBL_AUTORESET", 0)
+        m.opt.disableflags = mujoco.mjtDisableBit.mjDSBL_CONTACT | no_reset
         # After compiling: the compiler refuses massless bodies, and cannot adjust what it does not see.
         given = np.full(m.nbody, True) if not change.has_own_inertia else np.array(self.mass) == 0
         m.body_mass[given] = np.array(self.mass)[given]
@@ -627,11 +627,11 @@ class _SoftMechanism:
         self.source, ties = model, list[_Tie]()
         self.rodless = rods_taken_out(model) if option == TENDONS else None
         rest = self.rodless.model if self.rodless else model
-        self.cut = cut_open(rest) if rest.has_loops else None
-        self.opened = self.cut.model if self.cut else rest
+        self.cut = cut_open(rest)
+        self.opened = self.cut.model
         self.rods = np.flatnonzero(model.rods).tolist() if self.rodless else []
         place = np.append(np.argsort(self.rodless.order), -1) if self.rodless else np.zeros(0, int)
-        place = np.append(self.cut.place, -1)[place] if self.cut else place
+        place = np.append(self.cut.place, -1)[place]
         for k in self.rods:
             softness = sum(1 / model.mass[b] for b in model.body[k] if b >= 0)
             ties.append(_Tie(place[model.body[k]], model.point[k], model.length[k], softness))
@@ -639,29 +639,28 @@ class _SoftMechanism:
         pairs = zip(self.opened.kinds, self.opened.length, strict=True)
         pitches = tuple(float(length) if kind.has_pitch else 0.0 for kind, length in pairs)
         added = tuple(added_motions(self.opened, held))
-        constraints = _Constraints(self.cut.ends if self.cut else (), added, pitches, tuple(ties))
-        parts = None if self.cut or self.rodless else parts  # whose bodies are in another order
+        constraints = _Constraints(self.cut.ends, added, pitches, tuple(ties))
+        parts = None if self.cut.ends or self.rodless else parts  # whose bodies are in another order
         self.tree = _MujocoChain(held, parts, option == DENSE, constraints, change=change, has_text=has_text)
 
     def state(self, state: State) -> State:
         """The state of the tree."""
         there = self.rodless.state(state) if self.rodless else state
-        there = self.cut.state(there) if self.cut else there
+        there = self.cut.state(there)
         if self.tree.model.kind != self.opened.kind:
             there = state_of_cylinders(self.opened, self.tree.model, there)
         return there
 
     def places(self) -> tuple[Int[Indices, "bodies"], Int[Indices, "joints"]]:
         """Which bodies of the tree are the mechanism's, and which hold its joints; −1 for a tie."""
-        place = self.cut.place if self.cut else np.arange(self.opened.n)
+        place = self.cut.place
         if not self.rodless:
             return place[: self.source.n], place
         return place[np.argsort(self.rodless.order)], np.append(place, -1)[self.rodless.joint]
 
     def quantities(self, state: State, there: State) -> StateQuantities:
         """Evaluate what is determinate, without a mass matrix; ``there`` is the state of the tree."""
-        answer = self.tree.quantities(there)
-        answer = self.cut.source_quantities(answer) if self.cut else answer
+        answer = self.cut.source_quantities(self.tree.quantities(there))
         if self.rodless:
             answer = self._with_rods(state, answer, self.rodless)
         if self.source.has_loops:
@@ -731,7 +730,7 @@ def _largest_norm(difference: Array) -> float:
 
 
 def _extrapolated(soft: _SoftMechanism, state: State, there: State, largest: float) -> dict[str, Array]:
-    """Extrapolate all quantities from one sequence of regularisations (Neville's scheme)."""
+    """Extrapolate all quantities from one sequence of regularisations."""
     found = list[dict[str, Array]]()
     for k in range(REGULARISATIONS):
         soft.tree.soften(largest / RATIO**k)
@@ -757,10 +756,16 @@ def _extrapolated(soft: _SoftMechanism, state: State, there: State, largest: flo
                 raise EngineFailure(f"MuJoCo's {name} is of order {order:.2g} in its regularisation, not 1")
         if steps[-1] > max(steps[0], MAX_NOISE * size):
             raise Unsupported(f"rounding of MuJoCo's constraint forces changes the {name} by {steps[-1]:.1g}")
-        for power in range(1, REGULARISATIONS):
-            column = [(RATIO**power * x - y) / (RATIO**power - 1) for y, x in pairwise(column)]
-        limit[name] = column[0]
+        limit[name], _ = _at_zero(column)
     return limit
+
+
+def _at_zero(column: list[Array]) -> tuple[Array, Array]:
+    """Extrapolate values at falling R to R = 0 (Neville's scheme); also what the last order changes."""
+    before = column
+    for power in range(1, len(column)):
+        before, column = column, [(RATIO**power * x - y) / (RATIO**power - 1) for y, x in pairwise(column)]
+    return column[0], column[0] - before[-1]
 
 
 def _add_load_actuators(spec: Any, body: Any, k: int, model: Model) -> None:
@@ -779,12 +784,6 @@ def _add_load_actuators(spec: Any, body: Any, k: int, model: Model) -> None:
                 biastype=mujoco.mjtBias.mjBIAS_AFFINE,
                 biasprm=[bias, 0, rate, 0, 0, 0, 0, 0, 0, 0],
             )
-
-
-def _add_tendons(spec: Any, links: list[Any], model: Model) -> None:
-    """Add a tendon between two sites for every spring between points."""
-    for i, (bodies, points) in enumerate(zip(model.spring_body, model.spring_point, strict=True)):
-        _add_tendon(spec, links, f"spring {i}", bodies, points)
 
 
 def _add_tendon(spec: Any, links: list[Any], name: str, bodies: NDArray[np.intp], points: Array) -> None:
@@ -873,11 +872,3 @@ def model_text(spec: Any, m: Any) -> tuple[str, dict[str, Any]]:
             if not np.array_equal(value, getattr(read, name)):
                 numbers[prefix + name] = np.array(value)
     return text, numbers
-
-
-# -- older versions ----------------------------------------------------------------------------------
-
-
-def _autoreset_flag() -> int:
-    """Return the flag that disables resets; 3.2.0 always resets, which the contract's checks report."""
-    return int(getattr(mujoco.mjtDisableBit, "mjDSBL_AUTORESET", 0))

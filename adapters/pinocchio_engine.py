@@ -554,7 +554,6 @@ class PinocchioChain:
         fields |= {name: getattr(self, name) for name in ("effort", "damping", "stiffness", "rest")}
         fields |= {"of_q": self.scalars[0], "of_v": self.scalars[1], "joint_rates": self.rate_map(state)}
         fields["elastic"] = np.array(elastic_energy(model, state))
-        place = np.arange(len(model.kind))
         settings: dict[str, Any] = {"proximal": PROXIMAL_SETTINGS, "algorithm": self.algorithm}
         settings |= {"stabilisation": STABILISATION, "has_elements": model.has_joint_elements}
         balls = zip(*(at.tolist() for at in self.sprung_balls), self.ball_rest, strict=True)
@@ -568,7 +567,7 @@ class PinocchioChain:
         reason = "scripts do not part the bodies that Pinocchio merges at a weld"
         if any(kind.is_rigid for kind in model.kinds):
             settings["missing"] = dict.fromkeys(("joint_reaction", "joint_moment"), reason)
-        return parts | settings | {"fields": fields | {"bodies": place[: model.n], "joints": place}}
+        return parts | settings | {"fields": fields}
 
     def _joint_wrenches(self) -> list[pin.Force]:
         """Return each body's joint wrench after `rnea`, in its joint's axes and about its near point.
@@ -739,7 +738,7 @@ def _has_joint(kind: str) -> Callable[[Model], bool]:
     """Whether a mechanism is built with such a joint."""
 
     def has(model: Model) -> bool:
-        tree = PinocchioChain(cut_open(model).model if model.has_loops else model, "crba")
+        tree = PinocchioChain(cut_open(model).model, "crba")
         return any(joint.shortname() == f"JointModel{kind}" for joint in tree.joints)
 
     return has
@@ -795,33 +794,26 @@ class Pinocchio(PinocchioAdapter):
     usual_algorithm: ClassVar[str] = "crba"  # for the accelerations of state evaluation
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
-        if model.has_loops:
-            cut = cut_open(model)
-            tree = PinocchioChain(cut.model, self.usual_algorithm, ends=cut.ends)
-            return [cut.source_quantities(tree.quantities(cut.state(state))) for state in states]
-        change = self.variant.change if self.variant else Change()
-        given = model, self.option or self.usual_algorithm, self.body_pieces(model)
+        cut, change = cut_open(model), self.variant.change if self.variant else Change()
+        parts = None if cut.ends else self.body_pieces(model)
+        given = cut.model, self.option or self.usual_algorithm, parts
         if change.joints:
             return [_SpelledTree(*given, change, state).quantities(state) for state in states]
-        chain = PinocchioChain(*given, change=change)
-        return [chain.quantities(state) for state in states]
+        chain = PinocchioChain(*given, cut.ends, change)
+        return [cut.source_quantities(chain.quantities(cut.state(state))) for state in states]
 
     def written(self, model: Model, state: State, moves: bool = False) -> dict[str, Any]:
         """Return the numbers of the engine's model at a state, see `PinocchioChain.written`."""
-        if not model.has_loops:
-            algorithm = "aba" if moves else self.option or self.usual_algorithm
-            return PinocchioChain(model, algorithm, self.body_pieces(model)).written(state)
         cut = cut_open(model)
-        found = PinocchioChain(cut.model, self.usual_algorithm, ends=cut.ends).written(cut.state(state))
+        algorithm = "aba" if moves and not cut.ends else self.option or self.usual_algorithm
+        parts = None if cut.ends else self.body_pieces(model)
+        found = PinocchioChain(cut.model, algorithm, parts, cut.ends).written(cut.state(state))
         found["fields"] |= {"bodies": cut.place[: model.n], "joints": cut.place}
         return found
 
     def _surface(self, model: Model, states: Sequence[State]) -> Sequence[SurfaceAnswer]:
-        cut = cut_open(model) if model.has_loops else None
-        chain = PinocchioChain(
-            cut.model if cut else model, self.usual_algorithm, ends=cut.ends if cut else ()
-        )
-        own = cut.place[: model.n] if cut else range(model.n)
+        cut = cut_open(model)
+        chain, own = PinocchioChain(cut.model, self.usual_algorithm, ends=cut.ends), cut.place[: model.n]
         joints, placements = [chain.body_joints[k] for k in own], [chain.placements[k] for k in own]
         frames = add_probe_frames(chain.pin_model, joints, placements, model)
         chain.data = chain.pin_model.createData()
@@ -833,11 +825,11 @@ class Pinocchio(PinocchioAdapter):
         ]
         found = list[dict[str, dict[Call, Array]]]()
         for state in states:
-            q, v = chain.coordinates(cut.state(state) if cut else state)
+            q, v = chain.coordinates(cut.state(state))
             motion = q, v, chain.acceleration(q, v)
-            s = Probed(chain.pin_model, frames, motion, None if cut else chain.rate_map(state))
+            s = Probed(chain.pin_model, frames, motion, None if cut.ends else chain.rate_map(state))
             add_surface(s, inertias)
-            if cut and len(found) < CLOSED_STATES:
+            if cut.ends and len(found) < CLOSED_STATES:
                 add_parts(s.found, partial(_add_closed, s, chain))
             found.append(s.found)
         add_pose_answers(found, states, POSE_FUNCTIONS, pose_function)
@@ -846,27 +838,17 @@ class Pinocchio(PinocchioAdapter):
     def _simulate(
         self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
     ) -> Trajectory:
-        if model.has_loops:
-            cut = cut_open(model)
-            tree = PinocchioChain(cut.model, self.usual_algorithm, ends=cut.ends)
-            for weld in tree.welds:
-                set_corrector(weld, STABILISATION)
-            run = self._sampled_run(tree, cut.state(state), times, integrator, resolution)
-            return cut.source_run(run)
-        chain = PinocchioChain(model, "crba" if integrator.kind == "tolerance" else "aba")
-        return self._sampled_run(chain, state, times, integrator, resolution)
-
-    @staticmethod
-    def _sampled_run(
-        chain: PinocchioChain, state: State, times: Array, integrator: Integrator, resolution: float
-    ) -> Trajectory:
-        start = chain.coordinates(state)
+        cut = cut_open(model)
+        chain = PinocchioChain(cut.model, "crba" if integrator.kind == "tolerance" else "aba", ends=cut.ends)
+        for weld in chain.welds:
+            set_corrector(weld, STABILISATION)
+        start = chain.coordinates(cut.state(state))
         if integrator.kind == "tolerance":
-            return chain.trajectory(times, *dop853(chain, *start, times, resolution))
+            return cut.source_run(chain.trajectory(times, *dop853(chain, *start, times, resolution)))
         step = FIXED_STEPS[integrator.name]
         samples = sample_steps(lambda qv: step(chain, *qv, resolution), start, times, resolution)
         q, v = (np.array(column) for column in zip(*samples, strict=True))
-        return chain.trajectory(times, q, v, round(float(times[-1] / resolution)))
+        return cut.source_run(chain.trajectory(times, q, v, round(float(times[-1] / resolution))))
 
 
 class PinocchioAba(Pinocchio):

@@ -17,7 +17,7 @@ import numpy as np
 import pinocchio as pin
 from scipy.linalg import lu_factor, lu_solve
 
-from adapters.pinocchio_common import init_constraint_dynamics
+from adapters.pinocchio_common import init_constraint_dynamics, translation
 from plumbline.model.datatypes import Array, Call, Float
 
 # μ over the largest entry of J M⁻¹ Jᵀ, and how often the step is taken.  Measured on squeezer: with 1e-5 the
@@ -127,18 +127,17 @@ def _still(m: pin.Model, q: Array, v: Array) -> pin.Data:
     return data
 
 
+def _ends(weld: Any) -> tuple[tuple[int, pin.SE3], tuple[int, pin.SE3]]:
+    """Joint and place in its frame of both ends."""
+    return (weld.joint1_id, weld.joint1_placement), (weld.joint2_id, weld.joint2_placement)
+
+
 def _bias(data: pin.Data, welds: Any) -> Array:
     """γ, in the axes of each weld's first end."""
     rows = []
     for weld in welds:
-        ends = [
-            (data.oMi[j] * place, place.actInv(data.a[j]))
-            for j, place in (
-                (weld.joint1_id, weld.joint1_placement),
-                (weld.joint2_id, weld.joint2_placement),
-            )
-        ]
-        (first, near), (second, far) = ends
+        first, second = (data.oMi[j] * place for j, place in _ends(weld))
+        near, far = (place.actInv(data.a[j]) for j, place in _ends(weld))
         rows.append((near - first.actInv(second).act(far)).vector)
     return np.concatenate(rows)
 
@@ -159,7 +158,7 @@ def _by_anchors(rows: _Rows) -> Iterator[tuple[bool, Call, Any]]:
         rigid.append(pin.convertToRigidConstraintModel(m, frame))
         rigid_data.append(rigid[-1].createData())
         for corner in size * CORNERS:
-            at = pin.SE3(np.eye(3), corner)
+            at = translation(corner)
             point = pin.PointAnchorConstraintModel(m, ends[0], ends[1] * at, ends[2], ends[3] * at)
             own = point.createData()
             point.calc(m, still, own)
@@ -198,16 +197,8 @@ def _by_factors(rows: _Rows, still: pin.Data, frames: Any, data: Any) -> Iterato
 def _of_point(data: pin.Data, point: Any) -> Array:
     """γ of a point, in the axes of its first end, as its Jacobian has it."""
     turn = (data.oMi[point.joint1_id] * point.joint1_placement).rotation
-    ends = [
-        data.oMi[j].rotation @ pin.classicAcceleration(data.v[j], data.a[j], place_of(place))
-        for j, place in (
-            (point.joint1_id, point.joint1_placement),
-            (point.joint2_id, point.joint2_placement),
-        )
-    ]
-    return np.asarray(turn.T @ (ends[1] - ends[0]))
-
-
-def place_of(place: pin.SE3) -> pin.SE3:
-    """A placement without its turn."""
-    return pin.SE3(np.eye(3), place.translation)
+    near, far = (
+        data.oMi[j].rotation @ pin.classicAcceleration(data.v[j], data.a[j], translation(place.translation))
+        for j, place in _ends(point)
+    )
+    return np.asarray(turn.T @ (far - near))

@@ -85,6 +85,8 @@ class CutMechanism:
             The tree's state; the parts go by the closing joints' own coordinates.
 
         """
+        if not self.ends:
+            return state
         fields = {name: value[..., self.source.body[:, 1], :] for name, value in vars(state).items()}
         fields |= zip(("u", "udot", "x", "xdot"), joint_coordinates(self.source, state), strict=True)
         order = np.argsort(self.place)
@@ -110,9 +112,11 @@ class CutMechanism:
             answer: of the tree.
 
         Returns:
-            Of the mechanism; without a mass matrix.
+            Of the mechanism; of one with loops without a mass matrix.
 
         """
+        if not self.ends:
+            return answer
         bodies, found = self.place[: self.source.n], {}
         for name, value in vars(answer).items():
             of_joint = name in ("joint_reaction", "joint_moment")
@@ -174,10 +178,12 @@ def cut_open(model: Model) -> CutMechanism:
     A body with c of them keeps 2⁻ᶜ of its mass and inertia, and their parts get ½, ¼, …: exact in binary.
 
     Args:
-        model: with loops.
+        model: one without loops is the tree itself.
 
     """
     n, (far, near) = model.n, model.body.T
+    if not model.has_loops:
+        return CutMechanism(model, model, np.arange(n), ())
     order: list[int] = []
 
     def visit(body: int) -> None:
