@@ -75,11 +75,25 @@ def pytest_xdist_make_scheduler(config, log):
 
 @pytest.fixture(scope="session")
 def cache_folders(tmp_path_factory):
-    """Paths of caches, one for each test: tmp_path_factory would look through all of them to name another."""
-    # The caches link to it: on a new machine `mkdir` would fail at the dangling link.
-    (user_cache_folder() / "engines").mkdir(parents=True, exist_ok=True)
-    folder = tmp_path_factory.mktemp("caches")
-    return (folder / str(number) for number in itertools.count())
+    """Caches, one for each test: tmp_path_factory would look through all of them to name another.
+
+    The tests of a session share the environments of engines, and what is remembered by its content: parsed
+    files and compiled integrators.
+    """
+    engines, base = user_cache_folder() / "engines", tmp_path_factory.getbasetemp()
+    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    for path in (engines, shared / "remembered"):
+        path.mkdir(parents=True, exist_ok=True)
+    caches = tmp_path_factory.mktemp("caches")
+
+    def make(number):
+        folder = caches / str(number)
+        folder.mkdir()
+        (folder / "engines").symlink_to(engines)
+        (folder / "remembered").symlink_to(shared / "remembered")
+        return folder
+
+    return map(make, itertools.count())
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -92,10 +106,8 @@ def warm_process():
 
 @pytest.fixture(autouse=True)
 def own_cells(cache_folders, monkeypatch):
-    """A test finds no cells of other runs. It shares the environments of engines, which take long to make."""
+    """A test finds no cells of other runs."""
     folder = next(cache_folders)
-    folder.mkdir()
-    (folder / "engines").symlink_to(user_cache_folder() / "engines")
     monkeypatch.setenv("PLUMBLINE_CACHE", str(folder))
     return folder / "cells"
 

@@ -21,6 +21,13 @@ pytestmark = pytest.mark.skipif(
 )
 
 
+@pytest.fixture(autouse=True)
+def small_catalogue(monkeypatch):
+    """To find of which scenario a certificate is a proof, `verify` reads the whole catalogue."""
+    some = {name: find_scenario_file(name) for name in ("tumbling-ball", "tumbling-rod", "four-bar")}
+    monkeypatch.setattr("plumbline.execution.proofs.catalogue", lambda: some)
+
+
 @pytest.fixture(scope="module")
 def certificate(tmp_path_factory):
     """Path of a certificate of 0.25 s, and what `prove` printed."""

@@ -57,7 +57,7 @@ def imports(name: str, *, at_import: bool) -> set[str]:
     def visit(node: ast.AST) -> None:
         if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test) and at_import:
             return
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda) and at_import:
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and at_import:
             return
         if isinstance(node, ast.Import):
             found.update(alias.name for alias in node.names)
@@ -66,7 +66,8 @@ def imports(name: str, *, at_import: bool) -> set[str]:
             members = {f"{node.module}.{alias.name}" for alias in node.names}
             found.update(members & MODULES.keys() or {str(node.module)})
         for child in ast.iter_child_nodes(node):
-            visit(child)
+            if isinstance(child, ast.stmt | ast.excepthandler | ast.match_case):
+                visit(child)
 
     visit(syntax_tree(name))
     return {module for module in found if module.split(".")[0] in PROJECT}

@@ -11,6 +11,11 @@ from plumbline.scenario.yaml_reader import read_yaml
 from plumbline.truth import taylor
 
 
+@pytest.fixture(autouse=True)
+def nothing_remembered(own_cells):
+    (own_cells.parent / "remembered").unlink()
+
+
 def stored_files(own_cells):
     return sorted((own_cells.parent / "remembered").iterdir())
 
