@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from tests.helpers.commands import ROOT, run_plumbline
+from tests.helpers.commands import ROOT, invoke, run_plumbline
 from tests.helpers.terminal_counts import agreed
 
 SECRET = "TOP-SECRET-4711"
@@ -100,15 +100,19 @@ def check(hostile, done):
     assert SECRET not in everything
 
 
-def test_no_engine_of_the_folder_is_started_and_no_module_imported(hostile):
+def test_no_engine_of_the_folder_is_started_and_no_module_imported(hostile, monkeypatch):
     folder = hostile[0]
     run = "run", "tumbling-ball", "--level", "state", "--jobs", 1, "--out", "plumbline-out"
     done = run_plumbline(*run, "--engine", "mujoco", cwd=folder)
     assert done.returncode == 0 and agreed(done.stdout) >= 7, done.stdout + done.stderr
     check(hostile, done)
-    for name in ("program", "file", "module", "shell"):
-        done = run_plumbline(*run, "--engine", name, cwd=folder)
-        assert done.returncode == 2 and "--trust allows it" in done.stderr, done.stderr
+    done = run_plumbline(*run, "--engine", "program", cwd=folder)
+    assert done.returncode == 2 and "--trust allows it" in done.stderr, done.stderr
+    check(hostile, done)
+    monkeypatch.chdir(folder)  # the same without processes of their own
+    for name in ("file", "module", "shell"):
+        done = invoke(*run, "--engine", name)
+        assert done.exit_code == 2 and "--trust allows it" in done.stderr, done.stderr
         check(hostile, done)
 
 

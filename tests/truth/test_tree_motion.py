@@ -35,7 +35,7 @@ def taylor(model, state, times=TIMES, precision="extended"):
     return np.asarray(run.r, float), np.asarray(run.p, float), run
 
 
-FAST_KINDS = ("rod", "universal", "cylindrical", "free")  # compiled in a second each; engines run the others
+FAST_KINDS = ("universal", "cylindrical", "free")  # compiled in a second each; engines run the others
 
 
 @pytest.mark.parametrize("kind", [pytest.param(x, marks=[] if x in FAST_KINDS else SLOW) for x in KINDS])
