@@ -1,7 +1,5 @@
 """The reference as an engine: the map to the contract's quantities, its errors, its raw trajectories."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -10,8 +8,6 @@ from adapters.reference_engine import Reference
 from plumbline.model.datatypes import EngineFailure
 from plumbline.model.kinematics import (
     angular_velocity,
-    mass_matrix,
-    rotation_matrix,
     state_from_minimal,
     velocity_jacobian,
 )
@@ -33,34 +29,6 @@ def test_velocity_map_gives_the_bodies_rates(rods):
     model, state = model_and_state(rods)
     bodies = (velocity_jacobian(model, state) @ generalized_velocity(model, state)).reshape(model.n, 6)
     np.testing.assert_allclose(bodies, np.hstack([state.v, state.omega]), atol=1e-14)
-
-
-@pytest.mark.parametrize("rods", [[True], [False], [True, False, True], [False, True, False, False]], ids=str)
-def test_energy_momentum_and_mass_matrix_belong_together(rods):
-    model, state = model_and_state(rods)
-    (reported,) = Reference().evaluate(model, [state])
-    nu = generalized_velocity(model, state)
-    np.testing.assert_allclose(reported.kinetic_energy, nu @ reported.mass_matrix @ nu / 2, rtol=1e-14)
-    np.testing.assert_allclose(reported.mass_matrix, mass_matrix(model, state), atol=1e-14)
-    spin = np.einsum("nij,njk,nk->ni", rotation_matrix(state.p), model.inertia, state.omega)
-    momentum = np.cross(state.r, model.mass[:, None] * state.v) + spin
-    np.testing.assert_allclose(reported.angular_momentum, momentum.sum(0), atol=1e-14)
-    weight = -model.mass[:, None] * model.gravity
-    np.testing.assert_allclose(reported.potential_energy, np.sum(weight * state.r), rtol=1e-13)
-
-
-@pytest.mark.parametrize("rods", [[True, False], [False, True]], ids=str)
-def test_accelerations_are_the_rates_of_the_velocities(rods):
-    """Central differences of the simulated velocities at the middle of a run, to their own h² ω² error."""
-    model, state = model_and_state(rods)
-    h = 1e-4
-    run = Reference().simulate(model, state, np.array([0, h, 2 * h]), "dop853", 1e-13)
-    omega = angular_velocity(run.p, run.pdot)
-    p = run.p[1] / np.linalg.norm(run.p[1], axis=1, keepdims=True)
-    now = replace(state, p=p, r=run.r[1], v=run.v[1], omega=omega[1])
-    (reported,) = Reference().evaluate(model, [now])
-    np.testing.assert_allclose((run.v[2] - run.v[0]) / (2 * h), reported.acceleration, atol=1e-4)
-    np.testing.assert_allclose((omega[2] - omega[0]) / (2 * h), reported.angular_acceleration, atol=1e-4)
 
 
 def test_trajectories_are_raw():

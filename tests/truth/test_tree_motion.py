@@ -6,15 +6,14 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
-from plumbline.model.datatypes import KINDS, Model
-from plumbline.model.invariants import attitude_error, compute_invariants, position_error
-from plumbline.model.kinematics import ball_spring_rest, complete_state, quaternion_rate, state_from_minimal
+from plumbline.model.datatypes import KINDS
+from plumbline.model.invariants import attitude_error, position_error
+from plumbline.model.kinematics import ball_spring_rest, complete_state, quaternion_rate
 from plumbline.model.random_mechanisms import ELEMENTS, random_tree
 from plumbline.model.sampling import random_states
 from plumbline.scenario.loader import find_scenario_file, load_scenario
 from plumbline.truth import ground_truth
 from plumbline.truth import trajectory_truth as trajectory
-from plumbline.truth.closed_form.tops_and_pendulums import free_top, planar_pendulum
 from plumbline.truth.ground_truth import perturbed_models
 from plumbline.truth.predictability_horizon import perturbation_growth, perturbed_states, project_to_manifold
 from plumbline.truth.taylor import simulate_taylor
@@ -108,92 +107,6 @@ def test_precisions_agree():
     assert extended.r.dtype == quad.r.dtype == np.longdouble
     assert np.max(np.abs(extended.r - quad.r)) < 1e-16
     assert 0 < np.max(np.abs(double.r - quad.r)) < 1e-12
-
-
-def test_invariants_hold_along_the_true_motion():
-    model = replace(
-        random_tree(np.random.default_rng(2), 6, loads=False), gravity=np.array([0.0, 0.0, -9.81])
-    )
-    (state,) = random_states(model, 1, 4)
-    run = trajectory_truth(model, state, TIMES).trajectory
-    found = compute_invariants(model, run)
-    for name in ("energy_drift", "joint_gap", "gap_rate", "norm_drift"):
-        assert np.max(np.abs(getattr(found, name))) < 1e-10, name
-
-
-@pytest.mark.parametrize(
-    ("scenario", "is_conserved"), [("furuta", True), ("hinge-pendulum", False), ("universal-pendulum", False)]
-)
-def test_momentum_is_conserved_where_joints_at_the_world_allow_it(scenario, is_conserved):
-    case = load_scenario(find_scenario_file(scenario))
-    bare = {name: 0 * getattr(case.model, name) for name in ("force", "moment", "drag_force", "drag_moment")}
-    model = replace(case.model, **bare)
-    run = trajectory_truth(model, case.state, TIMES).trajectory
-    drift = compute_invariants(model, run).momentum_drift
-    assert (drift is not None) == is_conserved
-    if drift is not None:
-        assert np.max(np.abs(drift)) < 1e-14
-
-
-def planar_bodies(n, inertia):
-    """A chain of balls that moves in the plane x z, and its state."""
-    model = Model.chain(
-        mass=np.array([1.2, 0.7])[:n], inertia=inertia, proximal=np.array([[0.1, 0, 0.3], [0, 0, 0.2]])[:n],
-        distal=np.array([[0.05, 0, -0.3], [0, 0, 0]])[:n], length=np.zeros(n),
-        gravity=np.array([0, 0, -9.81]), force=np.zeros((n, 3)), moment=np.zeros((n, 3)),
-        drag_force=np.zeros(n), drag_moment=np.zeros(n),
-    )  # fmt: skip
-    half = np.array([0.4, -0.9])[:n]
-    p = np.stack([np.cos(half), 0 * half, np.sin(half), 0 * half], 1)
-    omega = np.array([[0, 1.5, 0], [0, -4.0, 0]])[:n]
-    return model, state_from_minimal(model, p, omega, np.zeros((n, 3)), np.zeros((n, 3)))
-
-
-def on_hinges(model, state):
-    """The same bodies on hinges about y, with products of inertia that balls would feel."""
-    half = np.sqrt(0.5)
-    turn = np.tile([half, -half, 0, 0], (model.n, 2, 1))  # takes z to y
-    full = model.inertia.copy()
-    full[:, 0, 1] = full[:, 1, 0] = 0.004
-    hinged = Model(**(vars(model) | {"kind": ("hinge",) * model.n, "turn": turn, "inertia": full}))
-    angle = 2 * np.arctan2(state.p[:, 2], state.p[:, 0])
-    x, xdot = np.zeros((2, model.n, 2))
-    x[:, 0] = np.diff(angle, prepend=0.0)
-    xdot[:, 0] = np.diff(state.omega[:, 1], prepend=0.0)
-    return hinged, complete_state(hinged, replace(state, x=x, xdot=xdot))
-
-
-def test_a_hinge_pendulum_moves_by_elliptic_functions():
-    model, state = planar_bodies(1, np.diag([0.03, 0.03, 0.03])[None])
-    hinged, start = on_hinges(model, state)
-    np.testing.assert_allclose(start.r, state.r, atol=1e-15)
-    r, p, _ = taylor(hinged, start)
-    exact_r, exact_p = planar_pendulum(model, state)(TIMES)
-    assert np.max(position_error(r, exact_r)) < 2e-15
-    assert np.max(attitude_error(p, exact_p)) < 5e-15
-    other = simulate_notes_form(hinged, start, TIMES, NOTES_RTOL)
-    assert np.max(position_error(other.r, exact_r)) < 1e-14
-
-
-def test_a_double_pendulum_on_parallel_hinges_moves_as_one_on_balls():
-    """Joint angles and M = LᵀDL against quaternions and block elimination of joint forces."""
-    model, state = planar_bodies(2, np.stack([np.diag([0.03, 0.02, 0.03]), np.diag([0.01, 0.015, 0.01])]))
-    r, p, _ = taylor(*on_hinges(model, state))
-    expected_r, expected_p, _ = taylor(model, state)
-    assert np.max(position_error(r, expected_r)) < 1e-13
-    assert np.max(attitude_error(p, expected_p)) < 1e-12
-
-
-def test_a_free_body_turns_as_the_free_top_and_falls():
-    case = load_scenario(find_scenario_file("free-top"))
-    free = {"kind": ("free",), "point": 0 * case.model.point}
-    model = replace(case.model, **free)
-    velocity = np.array([[0.3, -0.2, 1.0]])
-    state = complete_state(model, replace(case.state, r=np.zeros((1, 3)), v=velocity))
-    r, p, _ = taylor(model, state)
-    fall = TIMES[:, None, None] * velocity + TIMES[:, None, None] ** 2 / 2 * model.gravity
-    assert np.max(position_error(r, fall)) < 2e-15
-    assert np.max(attitude_error(p, free_top(case.model, case.state)(TIMES)[1])) < 1e-14
 
 
 # a wrong truth is reported
