@@ -20,7 +20,6 @@ from plumbline.model.features import joint_roles
 from plumbline.model.loops import loop_gaps
 from plumbline.model.random_mechanisms import ELEMENTS, random_loop_mechanism
 from plumbline.processes.cpu_time import CpuTimes
-from plumbline.processes.worker_pool import Limits
 from plumbline.scenario import loader
 from plumbline.scenario.generator import (
     MAX_RANDOM_BODIES,
@@ -36,11 +35,8 @@ from plumbline.storage.history_of_nights import History
 from plumbline.storage.results_store import ResultTables, read_table
 from plumbline.studies.coverage_study import CoverageFailure
 from tests.helpers.nightly_tests import slow
+from tests.helpers.nights import run_night
 from tests.reports.test_report import decoded_chunks
-
-
-def ignore_output(*_):
-    pass
 
 
 def test_a_random_scenario_depends_on_its_seed_and_number_alone():
@@ -134,13 +130,7 @@ def test_a_mechanism_comes_back_from_its_file():
 
 
 def run_nightly(out, **more):
-    chosen = loader.load_scenarios(["rest"])
-    options = {"random_count": 3, "seed": 11, "jobs": 1, "limits": Limits(), "is_full_catalogue": False,
-               "extra_refinements": 0} | more  # fmt: skip
-    progress, engine = options.pop("progress", ignore_output), options.pop("engine", "mujoco")
-    return nightly.run_nightly(
-        out, chosen, [engine], command="-", progress=progress, log=ignore_output, **options
-    )  # fmt: skip
+    return run_night(out, more.pop("engine", "mujoco"), **({"random_count": 3} | more))
 
 
 @pytest.mark.skipif(not all(map(find_spec, TRUTH_TOOLS)), reason="the truth tools are not installed")

@@ -26,7 +26,7 @@ def rows_of(adapter, monkeypatch, joints="bb"):
     model = pendulums.make_model(joints)
     states = random_states(model, 2, seed=1)
     return judge_states(
-        CONTEXT, state_truth(model, states), engine_calls.evaluate_states("reference", model, states)
+        CONTEXT, state_truth(model, states), engine_calls.evaluate_states("reference", model, states, [])
     ).rows
 
 
@@ -108,16 +108,16 @@ def test_a_refusal_keeps_its_gap_between_processes():
 def test_every_refusal_in_the_catalogue_is_declared(engine):
     """The base class or the adapter refuses with a declared gap, or evaluates."""
     adapter = load_adapter(engine)
-    for name in (
+    for name in [
         "double-tumbling-rods",
         "sprung-ball",
         "sprung-universal",
         "four-bar",
         "point-mass-arm",
         "furuta",
-    ):
+    ]:
         s = load_scenario(catalogue()[name])
-        found = engine_calls.evaluate_states(engine, s.model, [s.state])
+        found = engine_calls.evaluate_states(engine, s.model, [s.state], [])
         assert found.failure is None
         if found.unsupported is not None:
             assert found.gap, f"{engine}, {name}: {found.unsupported}"

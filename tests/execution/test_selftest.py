@@ -9,8 +9,7 @@ import pytest
 from plumbline.cli import nightly
 from plumbline.execution import selftest
 from plumbline.execution.selftest import SelfTestResult
-from plumbline.processes.worker_pool import Limits
-from plumbline.scenario import loader
+from tests.helpers.nights import run_night
 
 PASSING_TEST = """
 def test_rates(record_property):
@@ -123,12 +122,7 @@ def test_a_night_whose_self_test_misses_a_defect_is_not_green(tmp_path, trouble)
         report.write_text("<testsuite/>")
         return SelfTestResult({"planted": 67, "reported": 67}, trouble)
 
-    _, place = nightly.run_nightly(
-        tmp_path, loader.load_scenarios(["rest"]), ["mujoco"], random_count=0, seed=1, jobs=1,
-        limits=Limits(), is_full_catalogue=False, command="-", level="state",
-        self_test=reported, progress=lambda *_: None,
-        log=lambda _: None,
-    )  # fmt: skip
+    _, place = run_night(tmp_path, level="state", self_test=reported)
     run = json.loads((place / "results.json").read_text())["run"]
     assert run["exit_code"] == bool(trouble) and run["self_test"]["planted"] == 67
     assert ("67 planted" in run["sentence"]) == (not trouble) and trouble in run["sentence"]
@@ -138,22 +132,15 @@ def test_a_night_whose_self_test_misses_a_defect_is_not_green(tmp_path, trouble)
 def test_a_night_killed_as_it_was_done_is_not_had_twice(tmp_path, monkeypatch):
     pytest.importorskip("mujoco")
 
-    def night():
-        return nightly.run_nightly(
-            tmp_path, loader.load_scenarios(["rest"]), ["mujoco"], random_count=0, seed=None, jobs=1,
-            limits=Limits(), is_full_catalogue=False, command="-", level="state",
-            progress=lambda *_: None, log=lambda _: None,
-        )  # fmt: skip
-
     def killed(_):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
         patched.setattr(nightly.shutil, "rmtree", lambda path, **more: None if more else killed(path))
-        night()
+        run_night(tmp_path, level="state", seed=None)
     (first,) = (tmp_path / "history").iterdir()
     assert (tmp_path / "unfinished" / "plan.json").exists()
-    result, place = night()
+    result, place = run_night(tmp_path, level="state", seed=None)
     seeds = [json.loads((p / "results.json").read_text())["run"]["seed"] for p in (first, place)]
     assert place != first and seeds[0] != seeds[1] == result.metadata["seed"]
     assert not (tmp_path / "unfinished").exists()

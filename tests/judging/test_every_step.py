@@ -84,7 +84,7 @@ def test_a_mistake_inside_a_run_is_reported_with_its_step(mistake):
     assert all(f"at step {row.extra['first_step']:.0f} (t = " in row.reason for row in steps)
 
 
-@pytest.mark.parametrize("mistake", some_fast(RUN_MISTAKES, 16))
+@pytest.mark.parametrize("mistake", some_fast(RUN_MISTAKES, 32))
 def test_a_mistake_inside_a_run_is_named_with_its_condition(mistake):
     """A factor of 1 + 1e-9, and in which steps it acts; in the first step it is below what is diagnosed."""
     defect = mistake.defect

@@ -159,7 +159,7 @@ def test_a_loose_bound_is_no_agreement(tree):
 
 def test_a_wrong_call_is_named(tree):
     model, states, truth = tree
-    answers = evaluate_states("mujoco", model, states).surface["frame_angular_velocity_local"]
+    answers = evaluate_states("mujoco", model, states, ["surface"]).surface["frame_angular_velocity_local"]
     wrong = {call: value * ("mjtSensor.mjSENS_GYRO" not in call) for call, value in answers.items()}
     evaluation = Evaluation([], None, None, 0.0, surface={"frame_angular_velocity_local": wrong})
     (row,) = judge_surface(WHO, truth, evaluation)

@@ -46,13 +46,6 @@ def test_the_order_is_seen_and_the_limit_is_reached(order, powers):
     assert error < 1e-6 * np.max(np.abs(ys[-1] - limit)) + 1e-14
 
 
-def test_order_two_under_an_order_four_name_is_seen_as_two():
-    _, ys = samples_with_error(2, (2, 3, 4))
-    seen = observed_order(ys, 1e-16, 4)
-    assert seen.is_asymptotic
-    assert seen.value == pytest.approx(2, abs=ORDER_MARGIN)
-
-
 @pytest.mark.parametrize(
     ("last", "shown"),
     [
@@ -85,24 +78,6 @@ def test_wrong_powers_are_paid_for_in_uncertainty():
     limit, ys = samples_with_error(1, (1, 2, 3))
     found = romberg(ys, (4, 5, 6))
     assert np.max(np.linalg.norm(found.y - limit, axis=-1)) <= found.uncertainty[-1]
-
-
-def test_rounding_is_not_an_order():
-    limit, _ = samples_with_error(4, (4,))
-    noise = np.random.default_rng(1).normal(size=(6, *limit.shape)) * 1e-16
-    seen = observed_order([limit + n for n in noise], 1e-15, 4)
-    assert seen.is_at_rounding_floor
-    assert seen.value is None
-
-
-def test_a_run_that_blew_up_is_a_point_of_the_study():
-    limit, ys = samples_with_error(4, (4, 5, 6))
-    ys[0] = np.full_like(limit, np.nan)
-    seen = observed_order(ys, 1e-16, 4)
-    assert seen.value == pytest.approx(4, abs=ORDER_MARGIN)
-    assert np.isnan(seen.orders).tolist() == [True, False, False, False]
-    assert seen.differences[0] == np.inf
-    assert np.max(np.abs(romberg(ys, (4, 5, 6)).y - limit)) < 1e-12
 
 
 def test_without_finite_runs_there_is_no_limit():

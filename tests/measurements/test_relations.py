@@ -33,6 +33,7 @@ from plumbline.model.datatypes import EngineFailure, Unsupported
 from plumbline.model.welding import split_bodies, split_body
 from plumbline.truth.rounding_bound import state_rounding_bound
 from tests.helpers import pendulums
+from tests.helpers.nightly_tests import SLOW
 from tests.helpers.pendulums import JOINT_PATTERNS
 from tests.helpers.planted_defects import STATE_DEFECTS
 from tests.helpers.planting import Defect, answer_change, model_change, number_change, plant
@@ -203,7 +204,7 @@ WELDING_RELATIONS = [
 ]
 
 
-@pytest.mark.parametrize("defect", ["inertia-xx-1e-6", "distal-1e-5"])
+@pytest.mark.parametrize("defect", ["inertia-xx-1e-6", pytest.param("distal-1e-5", marks=SLOW)])
 @pytest.mark.parametrize(("engine", "relation"), OPTION_RELATIONS + WELDING_RELATIONS)
 def test_a_defect_in_one_way_of_the_engine_breaks_it(engine, relation, defect):
     faulty = defect_in_default_formulation(replace(defect_named(defect), engine=engine))

@@ -7,24 +7,15 @@ from pathlib import Path
 
 import psutil
 
-from plumbline.cli import nightly
 from plumbline.engines import registry
 from plumbline.processes import worker_process
 from plumbline.processes.worker_pool import Limits
 from plumbline.scenario import loader
 from plumbline.storage.history_of_nights import History
 from tests.helpers import faulty_engines as faulty
+from tests.helpers.nights import run_night
 
 LIMITS = Limits(seconds=30, gigabytes=4)  # a sound cell beside two other test processes takes up to 10 s
-
-
-def run_nightly(out, engines):
-    (s,) = loader.load_scenarios(["planar-small"])
-    return nightly.run_nightly(
-        out, [replace(s, duration=0.5)], engines, random_count=0, seed=1, jobs=2, limits=LIMITS,
-        is_full_catalogue=False, command="-", extra_refinements=0, level="trajectory",
-        progress=lambda *_: None, log=lambda _: None,
-    )  # fmt: skip
 
 
 def comparable_rows(rows, engine):
@@ -46,7 +37,9 @@ def test_every_fault_at_once_loses_exactly_its_own_cell(tmp_path, monkeypatch, c
     workers_of_other_tests = (
         find_plumbline_workers()
     )  # the pool of the matrix test lives as long as its session
-    result, place = run_nightly(tmp_path / "out", ["mujoco", *names])
+    (s,) = loader.load_scenarios(["planar-small"])
+    short, options = [replace(s, duration=0.5)], {"jobs": 2, "limits": LIMITS, "level": "trajectory"}
+    result, place = run_night(tmp_path / "out", "mujoco", *names, scenarios=short, **options)
     lost = {(row.engine, row.integrator): row.reason for row in result.rows if row.verdict == "failed"}
     expected = {
         (f.__name__, faulty.FAULTY_INTEGRATOR): words for f, words in faulty.ERROR_BY_FAULT.items() if words

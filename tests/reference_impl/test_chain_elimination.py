@@ -143,18 +143,6 @@ def test_singular_configurations_are_reported(mix):
             StructuredSystem([model.changed(**change)])
 
 
-def test_a_rod_of_length_zero_is_singular():
-    """Read literally, C = dᵀd on a ball joint has no gradient (E1)."""
-    rng = np.random.default_rng(24)
-    model, state = random_chain(rng, [False, False, True])
-    literal = model.changed(length=np.array([0.0, 0.0, 0.4]))
-    gap = state.u[2] * model.length[2]
-    r = state.r.copy()
-    r[2] -= gap
-    with pytest.raises(SingularSystem, match="rod above body 3 has length 0"):
-        StructuredSystem([literal]).solve(r, state.p, state.v, quaternion_rate(state.p, state.omega))
-
-
 @for_each_mix
 def test_constraints_are_gaps_of_balls_and_squares_of_rods(mix):
     """C and its rate along (ṙ, ṗ), where joints are open and p is a unit quaternion; a rod has one row."""

@@ -135,16 +135,6 @@ def test_rest_stays_at_rest():
     assert np.array_equal(ends.r[-1], state.r) and ends.steps == len(TIMES) - 1
 
 
-def test_a_long_chain_runs():
-    """300 bodies; the work per body does not grow."""
-    model, state = random_chain(np.random.default_rng(38), [False] * 300, rate=0.1)
-    moved = run(model, state, 1e-6, np.array([0.0, 0.02]))
-    gap = StructuredSystem([model]).joint_gaps(
-        np.vstack([moved.r[-1].T, moved.p[-1].T]), np.vstack([moved.v[-1].T, moved.pdot[-1].T])
-    )[0]
-    assert np.max(np.abs(gap)) < 1e-6
-
-
 @pytest.mark.parametrize("nodes", [4, collocation.DEFAULT_NODES])
 @pytest.mark.parametrize("dense", [True, False])
 @pytest.mark.parametrize("rods", [[False, False], [True, False]], ids=str)

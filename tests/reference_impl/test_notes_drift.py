@@ -41,20 +41,6 @@ def measure_drift(chain, state, rtol, decades, gamma_defect=0.0, samples=400):
     return errors.reshape(3, len(times), samples).max(axis=2), run.steps
 
 
-def test_an_injected_defect_has_exponents_1_and_2():
-    rng = np.random.default_rng(7)
-    chain = random_model(rng, [True], loads=True, drag=True)
-    decades = np.array([0.02, 0.2, 2.0])
-    (gap, gap_rate, _), _ = measure_drift(
-        chain, state_on_manifold(chain, rng), 1e-11, decades, GAMMA_DEFECT, samples=40
-    )
-    assert abs(np.log10(gap[1] / gap[0]) - 2) < 0.02
-    assert abs(np.log10(gap_rate[1] / gap_rate[0]) - 1) < 0.02
-    metres = 2 * chain.length[0]  # C = dᵀd − ℓ² is 2 ℓ times the gap
-    np.testing.assert_allclose(gap * metres, GAMMA_DEFECT * decades[1:] ** 2 / 2, rtol=0.01)
-    np.testing.assert_allclose(gap_rate * metres, GAMMA_DEFECT * decades[1:], rtol=0.01)
-
-
 def drift_falls_with_the_tolerance(rods, decades, tolerances):
     """Drift at each tolerance; every maximum falls by a decade at least for three decades of tolerance."""
     rng = np.random.default_rng(4)

@@ -100,7 +100,7 @@ def test_dead_points_and_dependent_rows_hold_no_joint(name):
 def test_engines_agree_on_mechanisms_that_cannot_move(name, engine):
     s = load_scenario_text(TEXTS[name])
     states = compared_states(s.model, s.state, s.seed, 3)
-    truth, answer = state_truth(s.model, states), evaluate_states(engine, s.model, states)
+    truth, answer = state_truth(s.model, states), evaluate_states(engine, s.model, states, ["surface"])
     rows = judge_states(RowContext(name, "own", engine, engine, "1"), truth, answer).rows
     assert {row.verdict for row in rows if row.level == "surface"} <= {"agrees"}
     assert [row.verdict for row in rows if row.level == "state"] == ["agrees"] * 7

@@ -15,10 +15,9 @@ import pytest
 from plumbline.cli import nightly
 from plumbline.execution import runner
 from plumbline.execution.plan import Plan
-from plumbline.processes.worker_pool import Limits
-from plumbline.scenario import loader
 from plumbline.storage.history_of_nights import History
 from tests.helpers.in_process import InProcessWorkers
+from tests.helpers.nights import run_night
 
 ROOT = Path(__file__).resolve().parents[2]
 DISK_ERRORS = [errno.ENOSPC, errno.EIO, errno.EROFS, errno.EDQUOT]
@@ -99,12 +98,7 @@ def faulty_disk(monkeypatch):
 
 
 def night(out):
-    chosen = loader.load_scenarios(["rest"])
-    result, place = nightly.run_nightly(
-        out, chosen, ["mujoco"], random_count=0, seed=1, jobs=1, limits=Limits(),
-        is_full_catalogue=False, command="-", extra_refinements=0, level="state",
-        progress=lambda *_: None, log=lambda _: None,
-    )  # fmt: skip
+    result, place = run_night(out, level="state")
     return [replace(row, cpu_time=0.0) for row in result.rows], place
 
 

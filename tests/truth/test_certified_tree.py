@@ -25,25 +25,6 @@ def test_the_rates_of_a_loop_are_those_that_its_state_gives():
         np.testing.assert_allclose(found, state.v, rtol=0, atol=1e-14 * np.max(np.abs(state.v)))
 
 
-def test_a_hinge_pendulum_obeys_its_equation():
-    rng = np.random.default_rng(2)
-    model = replace(random_tree(rng, 1, ("hinge",), loads=False), gravity=np.array([0.0, 0.0, -9.81]))
-    (state,) = random_states(model, 1, 5)
-    truth = certify_state(model, state).quantities
-    near, far = (q[0] for q in np.split(model.turn[0], 2))
-    z = state_axis(near)
-    arm = state.r[0] - model.point[0, 0]
-    rotation = rotation_of(state.p[0])
-    inertia = z @ (rotation @ model.inertia[0] @ rotation.T) @ z
-    inertia += model.mass[0] * (arm @ arm - (arm @ z) ** 2)
-    angle = z @ np.cross(arm, model.mass[0] * model.gravity) / inertia
-    np.testing.assert_allclose(truth.angular_acceleration[0], angle * state_axis(far), rtol=1e-12)
-
-
-def state_axis(q):
-    return rotation_of(q)[:, 2]
-
-
 def rotation_of(q):
     return Rotation.from_quat(np.roll(q, -1)).as_matrix()
 
@@ -96,19 +77,6 @@ def one_body(kind, **elements):
 def at(model, x, rate):
     (state,) = random_states(model, 1, 3)
     return complete_state(model, replace(state, x=np.array([[x, 0.0]]), xdot=np.array([[rate, 0.0]])))
-
-
-def test_a_sprung_and_damped_slide_is_the_damped_oscillator():
-    model = one_body("slide", armature=0.5, stiffness=3.0, damping=0.7, rest=0.2, effort=1.5)
-    state = at(model, 0.9, -2.0)
-    truth = certify_state(model, state).quantities
-    wanted = (1.5 - 3.0 * 0.7 + 0.7 * 2.0) / (model.mass[0] + 0.5)
-    axis = rotation_of(model.turn[0, 0])[:, 2]
-    np.testing.assert_allclose(truth.acceleration[0], wanted * axis, rtol=1e-14, atol=1e-14)
-    # the joint's whole force along the axis is what accelerates the body: the rotor's is taken off
-    np.testing.assert_allclose(truth.joint_reaction[0] @ axis, model.mass[0] * wanted, rtol=1e-14)
-    assert truth.potential_energy == pytest.approx(3.0 * 0.7**2 / 2)
-    assert truth.kinetic_energy == pytest.approx((model.mass[0] + 0.5) * 2.0)
 
 
 @pytest.mark.parametrize("turns", [-1, 0, 2])

@@ -5,9 +5,8 @@ from importlib.util import find_spec
 
 import numpy as np
 import pytest
-from scipy.optimize import brentq
 
-from plumbline.model.kinematics import complete_state, rotation_matrix
+from plumbline.model.kinematics import complete_state
 from plumbline.model.loops import assembled
 from plumbline.scenario.loader import find_scenario_file, load_scenario
 
@@ -91,67 +90,3 @@ def test_four_bars_accelerate_as_their_certified_equations_say(motions, time):
     pattern = np.array([1, -1, 1, -1, 1])
     found = certified_rates(scenario("four-bars-2"), tilt * pattern, rate * pattern)
     assert -(after - 2 * at + before) / h**2 == pytest.approx(found[0, 1], rel=1e-5)
-
-
-def test_a_furuta_pendulum_keeps_its_relative_equilibrium():
-    """Both angles stand where V − ½ I(angle) rate² has its minimum; I about the vertical."""
-    from plumbline.truth.taylor import simulate_taylor
-
-    s = scenario("furuta")
-    bare = {name: 0 * getattr(s.model, name) for name in ("force", "moment", "drag_force", "drag_moment")}
-    model = replace(s.model, **bare)
-    rate, step = 12.0, 1e-4
-
-    def at(angle, spin):
-        x, xdot = np.zeros((2, 2, 2))
-        x[1, 0], xdot[0, 0] = angle, spin
-        return complete_state(model, replace(s.state, x=x, xdot=xdot))
-
-    def amended_potential(angle):  # V − ½ I(angle) rate²: its minimum is the equilibrium
-        state = at(angle, rate)
-        A = rotation_matrix(state.p)
-        inertia = sum((A[k] @ model.inertia[k] @ A[k].T)[2, 2] for k in range(2))
-        inertia += float(np.sum(model.mass * np.sum(state.r[:, :2] ** 2, axis=1)))
-        return 9.81 * float(model.mass @ state.r[:, 2]) - inertia * rate**2 / 2
-
-    def slope(angle):
-        return (amended_potential(angle + step) - amended_potential(angle - step)) / (2 * step)
-
-    angle = brentq(slope, 0.9, 1.4, xtol=1e-14)
-    run = simulate_taylor(model, at(angle, rate), np.arange(5) * 0.25, "extended")
-    height = np.asarray(run.r[:, 1, 2], float)
-    assert abs(np.sin(angle)) > 0.1
-    assert np.ptp(height) < 1e-8 < np.max(np.abs(height))
-    turned = np.asarray(run.r[:, 0], float)
-    expected = np.cos(rate * np.arange(5) * 0.25)
-    np.testing.assert_allclose(turned @ turned[0] / (turned[0] @ turned[0]), expected, atol=1e-7)
-
-
-@pytest.mark.parametrize("mode", ["swing", "bounce"])
-def test_a_spring_pendulum_oscillates_in_its_small_modes(mode):
-    """√(g/L) across and √(k/m) along the stretched spring, up to the square of the amplitude."""
-    from plumbline.truth.taylor import simulate_taylor
-
-    s = scenario("spring-pendulum")
-    points = s.model.spring_point.copy()
-    points[0, 1] = 0.0  # at the centre of mass: the body does not turn
-    model = replace(s.model, spring_point=points, spring_damping=0 * s.model.spring_damping)
-    mass, stiffness, rest = (
-        float(model.mass[0]),
-        float(model.spring_stiffness[0]),
-        float(model.spring_length[0]),
-    )
-    length, times = rest + mass * 9.81 / stiffness, np.arange(17) * 0.0625
-    frequency = np.sqrt(9.81 / length if mode == "swing" else stiffness / mass)
-    along = np.array([1.0, 0, 0] if mode == "swing" else [0, 0, 1.0])
-    hanging = points[0, 0] - np.array([0, 0, length])
-    errors = []
-    for amplitude in (1e-3, 5e-4):
-        start = replace(
-            s.state, r=(hanging + amplitude * along)[None], v=np.zeros((1, 3)), omega=np.zeros((1, 3))
-        )
-        run = simulate_taylor(model, complete_state(model, start), times, "extended")
-        shift = np.asarray(run.r[:, 0], float) - hanging
-        errors.append(np.max(np.abs(shift @ along - amplitude * np.cos(frequency * times))) / amplitude)
-    assert errors[0] < 1e-4
-    assert errors[0] < 1e-11 or errors[0] / errors[1] == pytest.approx(4, rel=0.1)

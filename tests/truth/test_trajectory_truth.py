@@ -240,7 +240,7 @@ def test_the_truth_of_ten_bodies_fits_into_a_worker():
 
 
 def test_sympy_is_hidden_only_while_heyoka_is_imported():
-    """It would take two seconds; later it must be there for Kane's equations."""
+    """It would take two seconds; later it must be there for who needs it."""
     program = (
         "from plumbline.truth import taylor; taylor.load_heyoka(); import sys; print('sympy' in sys.modules)"
     )
