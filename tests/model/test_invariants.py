@@ -28,7 +28,7 @@ from plumbline.model.kinematics import (
 )
 from plumbline.model.random_mechanisms import random_tree
 from tests.helpers import newton_euler, pendulums
-from tests.helpers.nightly_tests import SLOW, some_fast
+from tests.helpers.nightly_tests import SLOW
 from tests.helpers.random_chains import random_chain
 
 TIMES = np.linspace(0.0, 1.0, 41)
@@ -178,7 +178,7 @@ def random_rate(rng, times):
     )
 
 
-@pytest.mark.parametrize("seed", some_fast(range(40), 5))
+@pytest.mark.parametrize("seed", [pytest.param(k, marks=SLOW if k % 5 else []) for k in range(40)])
 def test_the_work_of_random_motions_is_as_uncertain_as_it_is_wrong(seed):
     """Of a moment and of a drag, in motions that their samples resolve and in some that they do not."""
     rng = np.random.default_rng((1407, seed))
