@@ -108,14 +108,15 @@ def test_a_refusal_keeps_its_gap_between_processes():
 def test_every_refusal_in_the_catalogue_is_declared(engine):
     """The base class or the adapter refuses with a declared gap, or evaluates."""
     adapter = load_adapter(engine)
-    for name in [
+    names = (
         "double-tumbling-rods",
         "sprung-ball",
         "sprung-universal",
         "four-bar",
         "point-mass-arm",
         "furuta",
-    ]:
+    )
+    for name in names:
         s = load_scenario(catalogue()[name])
         found = engine_calls.evaluate_states(engine, s.model, [s.state], [])
         assert found.failure is None
