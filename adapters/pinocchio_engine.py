@@ -218,7 +218,7 @@ class PinocchioChain:
         for k, joint in self.moving:
             is_ball = model.kinds[k].is_spherical
             at, own = slice(joint.idx_v, joint.idx_v + joint.nv), slice(1 if is_ball else joint.nv)
-            self.pin_model.armature[at] = model.armature[k, own]
+            self.pin_model.armature[at] += model.armature[k, own]
             self.damping[at], self.effort[at] = model.damping[k, own], model.effort[k, own]
             self.stiffness[at] = model.stiffness[k, own]
             if not is_ball:

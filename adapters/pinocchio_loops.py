@@ -88,7 +88,8 @@ def closed_accelerations(
     yield False, (by, "Data.lambda_c"), rows.by_force(np.array(solved.lambda_c))
     yield False, (by, "Data.lambda_c_prox"), rows.by_force(np.array(solved.lambda_c_prox))
     yield from _by_derivatives(rows)
-    factors = solved.constraint_chol
+    # of version 3, with another name
+    factors = solved.constraint_chol if hasattr(solved, "constraint_chol") else solved.contact_chol
     a = rows.by(lambda b: np.ravel(factors.solve(b[:, None])), rows.bias, FINE.mu)
     yield False, (by, "Data.constraint_chol"), a
     yield from _by_anchors(rows)

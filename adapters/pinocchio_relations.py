@@ -191,12 +191,16 @@ def _add_body_forces(s: Probed) -> None:
     s.add_twists(("body_force_local", "body_moment_local"), ("computeCoriolisMatrix", "Data.B"), forces)
 
 
-def add_mimic(s: Probed) -> None:
-    """Add the torques where each screw is a turn, and a slide that mimics it."""
-    m = s.m
-    if not any(joint.shortname().startswith("JointModelH") for joint in m.joints):
-        return
-    other, last, mimics = pin.Model(), [0], list[tuple[int, int, float]]()
+def mimics(s: Probed) -> Sequence[Callable[[Probed], None]]:
+    """Return the parts of models where each screw is a turn and a slide that mimics it."""
+    has_screws = any(joint.shortname().startswith("JointModelH") for joint in s.m.joints)
+    parts = (_add_mimic_torques, _add_mimic_momenta) if has_screws else ()
+    return [partial(part, along_axis=given) for part in parts for given in (False, True)]
+
+
+def _with_mimics(s: Probed, along_axis: bool) -> tuple[Call, pin.Model]:
+    """The model, and the names that it uses; slides may be those along a given axis."""
+    m, other, last, slides = s.m, pin.Model(), [0], list[tuple[int, int, float]]()
     other.gravity = m.gravity
     for j in range(1, m.njoints):
         joint, place, name = m.joints[j], m.jointPlacements[j], m.names[j]
@@ -205,18 +209,28 @@ def add_mimic(s: Probed) -> None:
         made = getattr(pin, kind.replace("ModelH", "ModelR"))() if is_screw else joint
         number = other.addJoint(parent, made, place, name)
         if is_screw:
+            axis = np.eye(3)["XYZ".index(kind[-1])]
             slide = getattr(pin, kind.replace("ModelH", "ModelP"))()
+            slide = pin.JointModelPrismaticUnaligned(axis) if along_axis else slide
             beyond = other.addJoint(number, slide, pin.SE3.Identity(), f"slide of {name}")
-            mimics.append((number, beyond, joint.extract().pitch))
+            slides.append((number, beyond, joint.extract().pitch))
             number = beyond
         other.appendBodyToJoint(number, m.inertias[j], pin.SE3.Identity())
         last.append(number)
-    for turn, slide, pitch in mimics:
-        other = pin.transformJointIntoMimic(other, turn, slide, pitch, 0.0)
-    call = "transformJointIntoMimic", "JointModelMimic", "JointDataMimic"
-    data = other.createData()
-    s.add_forces("inverse_dynamics", {call: pin.rnea(other, data, *s.motion).copy()})
-    momentum = s.square(pin.crba(other, data, s.q)) @ s.v + m.armature * s.v
+    for turn, beyond, pitch in slides:
+        other = pin.transformJointIntoMimic(other, turn, beyond, pitch, 0.0)
+    kinds = ("JointModelPrismaticUnaligned",) if along_axis else ()
+    return ("transformJointIntoMimic", "JointModelMimic", "JointDataMimic", *kinds), other
+
+
+def _add_mimic_torques(s: Probed, along_axis: bool) -> None:
+    call, other = _with_mimics(s, along_axis)
+    s.add_forces("inverse_dynamics", {call: pin.rnea(other, other.createData(), *s.motion).copy()})
+
+
+def _add_mimic_momenta(s: Probed, along_axis: bool) -> None:
+    call, other = _with_mimics(s, along_axis)
+    momentum = s.square(pin.crba(other, other.createData(), s.q)) @ s.v + s.m.armature * s.v
     s.add_forces("generalized_momentum", {call: momentum})
 
 

@@ -13,7 +13,7 @@ by q and v, times v and v̇, are its rate; and v · ∂g/∂q v + g · v̇ is th
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -21,7 +21,7 @@ import numpy as np
 import pinocchio as pin
 
 from adapters.pinocchio_probes import Probed
-from adapters.pinocchio_relations import add_mimic, relations
+from adapters.pinocchio_relations import mimics, relations
 from plumbline.engines.missing_names import add_parts
 from plumbline.model.datatypes import Array, Call
 
@@ -58,6 +58,7 @@ OF_MOTIONS = ("exp6", "Jexp6")  # take a pin.Motion
 ANGULAR = {"velocity": "velocity", "acceleration": "acceleration", SPATIAL: "acceleration"}
 BY_RATE, BY_DERIVATIVE = "_by_jacobian_rate", "_by_derivative"
 Reading = tuple[str, str, str, Any]  # functions, what they return, by what, and the spatial vector
+Reader = Callable[[Probed, str, str, int, pin.Data, pin.Data], Iterator[Reading]]
 
 
 def add_surface(s: Probed, bodies: Sequence[pin.Inertia]) -> None:
@@ -67,8 +68,17 @@ def add_surface(s: Probed, bodies: Sequence[pin.Inertia]) -> None:
         bodies: inertias of the bodies, in their joints' frames.
 
     """
-    parts = _add_frames, _add_data, partial(_add_regressors, bodies=bodies), _add_centres, *relations(s)
-    of_trees = () if s.rates is None else (_add_torques, _add_batch, add_mimic)
+    parts = (
+        _add_frames,
+        _add_hessians,
+        _add_data,
+        partial(_add_regressors, bodies=bodies),
+        _add_centres,
+        *relations(s),
+    )
+    of_trees: Sequence[Callable[[Probed], None]] = (
+        () if s.rates is None else (_add_torques, _add_batch, *mimics(s))
+    )
     add_parts(s.found, *(partial(part, s) for part in (*parts, *of_trees)))
 
 
@@ -109,38 +119,47 @@ def _add_frames(s: Probed) -> None:
     pin.computeForwardKinematicsDerivatives(s.m, derived, s.q, s.v, s.a)
     pin.updateFramePlacements(s.m, derived)
     pin.computeJointJacobiansTimeVariation(s.m, data, s.q, s.v)
-    pin.computeJointKinematicHessians(s.m, derived, s.q)
-    for name, frame in FRAMES.items():
-        found = defaultdict[tuple[str, str, str], list[Any]](list)
-        for f, joint in zip(s.frames, s.joints, strict=True):
-            own = [*_readings(s, name, "Frame", f, data, derived), *_computed(s, name, f)]
-            of_joint = [*_readings(s, name, "Joint", joint, data, derived), *_of_joint_alone(s, name, joint)]
-            for function, what, by, twist in (*own, *(_at_frame(s, name, f, data, x) for x in of_joint)):
-                found[function, what, by].append(twist)
-        for (function, what, by), twists in found.items():
-            of_point, of_rotation = (
-                f"frame_{what}{frame.of_point}{by}",
-                f"{ANGULAR[what]}{frame.of_rotation}{by}",
-            )
-            call = *function.split(), f"ReferenceFrame.{name}"
-            s.add_twists((of_point, f"frame_angular_{of_rotation}"), call, twists)
+    for name in FRAMES:
+        _add_readings(s, name, data, derived, _readings)
         if name != "WORLD":
             _add_points(s, derived, name)
+    for name in FRAMES:
+        _add_readings(s, name, data, derived, _computed)
 
 
-def _computed(s: Probed, name: str, f: int) -> Iterator[Reading]:
-    """What functions of frames say that need no other before."""
+def _add_hessians(s: Probed) -> None:
+    data, derived = s.moved(), s.m.createData()
+    pin.computeJointJacobians(s.m, data, s.q)
+    pin.computeJointKinematicHessians(s.m, derived, s.q)
+    for name in FRAMES:
+        _add_readings(s, name, data, derived, _by_hessian)
+
+
+def _add_readings(s: Probed, name: str, data: pin.Data, derived: pin.Data, read: Reader) -> None:
+    """Add in one reference frame what is read of frames, and of joints as said of the frames on them."""
+    found, frame = defaultdict[tuple[str, str, str], list[Any]](list), FRAMES[name]
+    for f, joint in zip(s.frames, s.joints, strict=True):
+        of_joint = (_at_frame(s, name, f, data, x) for x in read(s, name, "Joint", joint, data, derived))
+        for function, what, by, twist in (*read(s, name, "Frame", f, data, derived), *of_joint):
+            found[function, what, by].append(twist)
+    for (function, what, by), twists in found.items():
+        of_point, of_rotation = f"frame_{what}{frame.of_point}{by}", f"{ANGULAR[what]}{frame.of_rotation}{by}"
+        call = *function.split(), f"ReferenceFrame.{name}"
+        s.add_twists((of_point, f"frame_angular_{of_rotation}"), call, twists)
+
+
+def _computed(s: Probed, name: str, of: str, f: int, *_: pin.Data) -> Iterator[Reading]:
+    """What functions say that need no other before."""
     other, reference = s.m.createData(), getattr(pin.ReferenceFrame, name)
+    if of == "Joint":
+        if name == "LOCAL":
+            J = s.square(pin.computeJointJacobian(s.m, other, s.q, f))
+            yield "computeJointJacobian", "velocity", "", J @ s.v
+        return
     J = s.square(pin.computeFrameJacobian(s.m, other, s.q, f, reference))
     rate = s.rate(pin.frameJacobianTimeVariation(s.m, other, s.q, s.v, f, reference), J)
     yield "computeFrameJacobian", "velocity", "", J @ s.v
     yield "frameJacobianTimeVariation", FRAMES[name].of_rate, BY_RATE, rate
-
-
-def _of_joint_alone(s: Probed, name: str, joint: int) -> Iterator[Reading]:
-    if name == "LOCAL":
-        J = s.square(pin.computeJointJacobian(s.m, s.m.createData(), s.q, joint))
-        yield "computeJointJacobian", "velocity", "", J @ s.v
 
 
 def _at_frame(s: Probed, name: str, f: int, data: pin.Data, reading: Reading) -> Reading:
@@ -180,10 +199,18 @@ def _readings(
     if name != "WORLD":
         function = f"get{plain}ClassicalAcceleration"
         yield function, "acceleration", "", read(function).copy()
-    # in C++'s order: docs/surface/pinocchio_kinematic_hessians.py
-    H = np.array(read(f"get{of}KinematicHessian", derived))
+
+
+def _by_hessian(
+    s: Probed, name: str, of: str, number: int, data: pin.Data, derived: pin.Data
+) -> Iterator[Reading]:
+    """What Hessians say, in C++'s order: docs/surface/pinocchio_kinematic_hessians.py."""
+    reference = getattr(pin.ReferenceFrame, name)
+    J = getattr(pin, f"get{of}Jacobian")(s.m, data, number, reference)
+    H = np.array(getattr(pin, f"get{of}KinematicHessian")(s.m, derived, number, reference))
     rate = s.rate(H.ravel().reshape(H.shape, order="F") @ s.v, J)
-    yield f"get{of}KinematicHessian computeJointKinematicHessians", of_rate, BY_RATE, rate
+    call = f"get{of}KinematicHessian computeJointKinematicHessians"
+    yield call, FRAMES[name].of_rate, BY_RATE, rate
 
 
 def _add_points(s: Probed, derived: pin.Data, name: str) -> None:

@@ -147,11 +147,15 @@ def _saved(form: str, end: str) -> Callable[[pin.Model], pin.Model]:
 
 
 def _with_locked_joint(model: pin.Model) -> pin.Model:
-    """Add a joint that carries nothing, and lock it."""
+    """Add a joint that carries nothing, and lock it; the others keep their rotors, which are taken off."""
     other = model.copy()
     joint = other.addJoint(other.njoints - 1, pin.JointModelRY(), pin.SE3.Identity(), "locked")
     other.addJointFrame(joint, 0)
-    return pin.buildReducedModel(other, [joint], pin.neutral(other))
+    rotors = 1.0 + np.arange(model.nv)
+    other.armature = np.append(rotors, 0.0)
+    reduced = pin.buildReducedModel(other, [joint], pin.neutral(other))
+    reduced.armature = reduced.armature - rotors
+    return reduced
 
 
 def _appended(model: pin.Model) -> pin.Model:
@@ -159,6 +163,28 @@ def _appended(model: pin.Model) -> pin.Model:
     other = pin.appendModel(pin.Model(), model, 0, pin.SE3.Identity())
     other.gravity = model.gravity  # which it does not take over (docs/surface/pinocchio_append_model.py)
     return other
+
+
+def _appended_to_first(model: pin.Model) -> pin.Model:
+    """Append all that the first joint carries to it, its own inertia as that of two frames away from it."""
+    first, rest = pin.Model(), pin.Model()
+    joint = first.addJoint(0, model.joints[1], model.jointPlacements[1], model.names[1])
+    place, own = first.addJointFrame(joint), model.inertias[1]
+    away = pin.SE3(pin.exp3(np.array([0.3, -0.5, 0.2])), np.array([0.1, 0.2, -0.3]))
+    for k, share in enumerate((0.25, 0.75)):
+        part = away.actInv(pin.Inertia(share * own.mass, own.lever, share * own.inertia))
+        rest.addFrame(pin.Frame(f"part {k}", 0, away, pin.FrameType.BODY, part))
+    for j in range(2, model.njoints):
+        number = rest.addJoint(
+            model.parents[j] - 1, model.joints[j], model.jointPlacements[j], model.names[j]
+        )
+        rest.addJointFrame(number)
+        rest.appendBodyToJoint(number, model.inertias[j], pin.SE3.Identity())
+    for frame in list(model.frames)[1:]:
+        rest.addFrame(pin.Frame(frame.name, frame.parentJoint - 1, frame.placement, frame.type))
+    whole = pin.appendModel(first, rest, place, pin.SE3.Identity())
+    whole.gravity = model.gravity  # as above
+    return whole
 
 
 def _with_limits(model: pin.Model) -> pin.Model:
@@ -204,6 +230,11 @@ def _cosines(q: Array) -> Array:
     return np.stack([np.cos(q), np.sin(q)], axis=1).ravel()
 
 
+def _has_one_root(model: Model) -> bool:
+    """Whether one joint carries all, and has an inertia that can be shared."""
+    return _is_tree(model) and int(np.sum(model.body[:, 0] < 0)) == 1 and not model.kinds[0].holds_distance
+
+
 def _is_short(model: Model) -> bool:
     """Whether `aba` keeps its digits; where it loses them is recorded of the column pinocchio-aba."""
     return _is_tree(model) and model.n <= 3
@@ -222,6 +253,7 @@ VARIANTS = (
     ),
     _option("buildReducedModel Model.addJointFrame", remake=_with_locked_joint),
     _option("appendModel", remake=_appended),
+    _spelling("appendModel FrameType.BODY", _has_one_root, remake=_appended_to_first),
     _option(" ".join(f"Model.{name}" for name in (*LIMITS, "referenceConfigurations")), remake=_with_limits),
     _spelling("PseudoInertia Symmetric3", remake=_with_other_inertias),
     _spelling(
