@@ -68,18 +68,16 @@ def add_surface(s: Probed, bodies: Sequence[pin.Inertia]) -> None:
         bodies: inertias of the bodies, in their joints' frames.
 
     """
-    parts = (
+    parts: list[Callable[[Probed], None]] = [
         _add_frames,
         _add_hessians,
         _add_data,
-        partial(_add_regressors, bodies=bodies),
         _add_centres,
         *relations(s),
-    )
-    of_trees: Sequence[Callable[[Probed], None]] = (
-        () if s.rates is None else (_add_torques, _add_batch, *mimics(s))
-    )
-    add_parts(s.found, *(partial(part, s) for part in (*parts, *of_trees)))
+    ]
+    parts += [partial(_add_regressors, bodies=bodies)]
+    parts += [] if s.rates is None else [_add_torques, _add_batch, *mimics(s)]
+    add_parts(s.found, *(partial(part, s) for part in parts))
 
 
 def pose_function(name: str, given: Sequence[Any], _: Sequence[str]) -> list[Any]:
