@@ -100,9 +100,6 @@ class _RevoluteGroup:
     first_angle: int  # index of the first angle
     angle_count: int  # 2 for a rod, 3 for a ball
     axes: Float[Array, "3 3"]  # world axes of the link at the start, columns x, y, z
-    body_axes: Float[
-        Array, "3 3"
-    ]  # the same in the frame of the body that it turns (of the one before, for a rod)
     body: int  # the body that hangs by it, for messages
 
 
@@ -133,12 +130,10 @@ class _Linkage:
         self.links: list[_Link] = []
         self.revolute_groups: list[_RevoluteGroup] = []
         self.link_of_body: list[int] = []
-        self.body_axes: list[Array] = []
         self.origins: list[Array] = []
         self.W = np.zeros((0, len(self.nu)))
         self.motions: list[tuple[int, int, int]] = []  # link, joint and its coordinate
-        self.link_axes: list[Array] = []  # as `_axes` and `_spin`, at each body
-        self.link_spins: list[Array] = []
+        self.link_axes: list[Array] = []  # as `_axes`, at each body
         self._body_spins = self.attitude @ velocity_jacobian(model, state).reshape(model.n, 6, -1)[:, 3:]
         # Of the last link: its number, its axes in the world, the point in it where the next one hangs, and
         # its angular velocity in the world as a matrix on ν.
@@ -147,7 +142,9 @@ class _Linkage:
         for k, (kind, own) in enumerate(zip(model.kinds, own_rates(model), strict=True)):
             self._go_to_far_body(k)
             if kind.is_rigid:
-                self._weld_body(k)
+                far = model.body[k, 0]
+                place = state.r[far] + self.attitude[far] @ self.origins[far]
+                self._carry_body(k, self.attitude[k].T @ (place - state.r[k]))
                 continue
             if kind.holds_distance:
                 self._add_rod(k)
@@ -158,6 +155,7 @@ class _Linkage:
             else:
                 self._add_jointed_body(k, own)
         self.start = self._coordinates_at_start()
+        self.body_axes = self.attitude.mT @ np.array(self.link_axes)
 
     def _coordinates_at_start(self) -> Array:
         """Where the links' coordinates of 0 are, as `Trajectory` counts them."""
@@ -175,12 +173,12 @@ class _Linkage:
         if far < 0:
             self._last, self._axes, self._hang, self._spin = -1, np.eye(3), point, 0 * self._spin
             return
-        B, origin = self.body_axes[far], self.origins[far]
         self._last, self._axes = self.link_of_body[far], self.link_axes[far]
-        self._hang, self._spin = B.T @ (point - origin), self.link_spins[far]
+        self._hang = self._axes.T @ self.attitude[far] @ (point - self.origins[far])
+        self._spin = self._body_spins[far]
 
     def _add_rod(self, k: int) -> None:
-        u, far = self.state.u[k], self.model.body[k, 0]
+        u = self.state.u[k]
         start = 3 * int(np.sum(self.model.rods[:k]))
         target = np.zeros_like(self._spin)  # the rod's u × u̇
         target[:, start : start + 3] = np.cross(u, np.eye(3)).T
@@ -188,7 +186,7 @@ class _Linkage:
         turning = relative @ self.nu
         z = _unit_vector(turning - u * (u @ turning), _fallback_axis(u, self.model.gravity))
         axes = np.stack([u, np.cross(z, u), z], axis=1)
-        self._add_revolutes(2, axes, self.attitude[far].T @ axes if far >= 0 else axes, relative, k)
+        self._add_revolutes(2, axes, relative, k)
         self._hang = np.array([self.model.length[k], 0.0, 0.0])
 
     def _add_shifts(self, own: slice) -> None:
@@ -204,9 +202,8 @@ class _Linkage:
         z = _unit_vector(relative @ self.nu, _fallback_axis(A @ near, model.gravity))
         x = _perpendicular_unit(z)
         axes = np.stack([x, np.cross(z, x), z], axis=1)
-        B = A.T @ axes
-        self._add_revolutes(3, axes, B, relative, k)
-        self._finish_body(k, B, near)
+        self._add_revolutes(3, axes, relative, k)
+        self._carry_body(k, near)
 
     def _add_jointed_body(self, k: int, own: slice) -> None:
         """Add one link per motion of a joint; all but the last are massless."""
@@ -226,7 +223,7 @@ class _Linkage:
             link_axes = above @ rotation_matrix(self.model.turn[k, 0]) if is_carried else axes
             self._add_link(name, link_axes, own.start + i)
             self.motions.append((self._last, k, i))
-        self._finish_body(k, A.T @ axes, self.model.proximal[k])
+        self._carry_body(k, self.model.proximal[k])
 
     def _add_link(self, joint: str, axes: Array, rate: int) -> None:
         """Add a link with these axes in the world on a joint whose rate is that one of ν."""
@@ -235,37 +232,22 @@ class _Linkage:
         self._last, self._axes, self._hang = len(self.links) - 1, axes, np.zeros(3)
         self.W = np.vstack([self.W, np.eye(len(self.nu))[rate]])
 
-    def _finish_body(self, k: int, B: Array, origin: Array) -> None:
-        """Give the last link the mass of body k, whose frame it has B and the link's origin in."""
-        self.link_of_body.append(len(self.links) - 1)
-        self.body_axes.append(B)
+    def _carry_body(self, k: int, origin: Array) -> None:
+        """Give the last link, whose origin is there in body k, the mass of the body besides its own."""
+        self.link_of_body.append(self._last)
         self.origins.append(origin)
         self.link_axes.append(self._axes)
-        self.link_spins.append(self._spin if self.model.kinds[k].has_attitude else self._body_spins[k])
-        link = self.links[-1]
-        link.centre, link.mass = -B.T @ origin, float(self.model.mass[k])
-        link.inertia = B.T @ self.model.inertia[k] @ B
-
-    def _weld_body(self, k: int) -> None:
-        """Merge body k into the link of its far body."""
-        far, A = self.model.body[k, 0], self.attitude[k]
-        B, index = A.T @ self._axes, self.link_of_body[far]
-        place = self.state.r[far] + self.attitude[far] @ self.origins[far]
-        self.link_of_body.append(index)
-        self.body_axes.append(B)
-        self.link_axes.append(self._axes)
-        self.link_spins.append(self._spin)
-        self.origins.append(A.T @ (place - self.state.r[k]))
-        link, mass, centre = self.links[index], float(self.model.mass[k]), -B.T @ self.origins[k]
-        arm = centre - link.centre
-        parallel = link.mass * mass / (link.mass + mass) * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+        link, mass, B = self.links[self._last], float(self.model.mass[k]), self.attitude[k].T @ self._axes
+        arm = -B.T @ origin - link.centre
+        share = mass / (link.mass + mass)
+        parallel = link.mass * share * (arm @ arm * np.eye(3) - np.outer(arm, arm))
         link.inertia = link.inertia + B.T @ self.model.inertia[k] @ B + parallel
-        link.centre = (link.mass * link.centre + mass * centre) / (link.mass + mass)
+        link.centre = link.centre + share * arm
         link.mass += mass
 
-    def _add_revolutes(self, count: int, axes: Array, body_axes: Array, relative: Array, body: int) -> None:
+    def _add_revolutes(self, count: int, axes: Array, relative: Array, body: int) -> None:
         """Add massless revolutes that turn ``axes`` against the link before at the rate ``relative`` ν."""
-        self.revolute_groups.append(_RevoluteGroup(len(self.links), count, axes, body_axes, body))
+        self.revolute_groups.append(_RevoluteGroup(len(self.links), count, axes, body))
         twist, offset = self._axes.T @ axes, self._hang
         for i, joint in enumerate(("RevoluteZ", "RevoluteY", "RevoluteX")[:count]):
             axis = axes[:, 2 - i]
@@ -288,7 +270,7 @@ class _KinematicTree:
         add_tree = change.add_tree or self._add_tree
         self.node, self.tree = add_tree(self.mbs, self.linkage.links, model.gravity, self.initial_angle_rates)
         self._add_joint_elements()
-        self.body_axes_of_links = np.array(self.linkage.body_axes)  # (N, 3, 3) B
+        self.body_axes_of_links = self.linkage.body_axes  # (N, 3, 3) B
         self.sensors: dict[Any, list[Any]] = {output: [] for output in SENSOR_OUTPUTS}
         ground = self.mbs.AddObject(items.ObjectGround())
         pivot = self.mbs.AddMarker(items.MarkerBodyRigid(bodyNumber=ground))
@@ -432,23 +414,18 @@ def _perpendicular_unit(unit: Array) -> Array:
     return np.asarray(across / np.linalg.norm(across))
 
 
+def _alone(name: str, order: int, method: str | JointSpaceMethod, note: str) -> Any:
+    """An integrator that is compared by single steps alone, of a method or one with a tableau."""
+    by = runge_kutta(method, "joint angles") if isinstance(method, str) else method
+    names = f"DynamicSolverType.{name}", "TimeIntegrationSettings.absoluteTolerance"
+    return {"order": order, "method": by, "note": note, "has_motions": False, "names": names}
+
+
 _EULER = JointSpaceMethod("Runge-Kutta", "joint angles", stages=((),), weights=(1.0,))
-_MIDPOINT, _HEUN, _BOGACKI_SHAMPINE, _DORMAND_PRINCE, _BUTCHER = (
-    runge_kutta(name, "joint angles")
-    for name in (
-        "the explicit midpoint rule (order 2)", "Heun's method of order 3",
-        "Bogacki and Shampine's method of order 3", "Dormand and Prince's method of order 5",
-        "Butcher's method of order 6",
-    )
-)  # fmt: skip
 _VERLET = JointSpaceMethod("velocity Verlet", "joint angles", reuses_acceleration=True)
-
-
-def _alone(name: str) -> Any:
-    return {
-        "has_motions": False,
-        "names": (f"DynamicSolverType.{name}", "TimeIntegrationSettings.absoluteTolerance"),
-    }
+_MIDPOINT, _HEUN = "the explicit midpoint rule (order 2)", "Heun's method of order 3"
+_ODE23, _DOPRI5 = "Bogacki and Shampine's method of order 3", "Dormand and Prince's method of order 5"
+_TO_SECOND = "velocity Verlet; of order 2 without terms of velocities"
 
 
 # Names of Exudyn that all rows of the column are by, by class or module.
@@ -494,29 +471,13 @@ class ExudynTree(ExudynAdapter):
                 "DynamicSolverType",
             ),
         ),
-        Integrator(
-            "ExplicitEuler", "step", 1, note="explicit Euler", method=_EULER, **_alone("ExplicitEuler")
-        ),
-        Integrator(
-            "ExplicitMidpoint",
-            "step",
-            2,
-            note="midpoint rule",
-            method=_MIDPOINT,
-            **_alone("ExplicitMidpoint"),
-        ),
-        Integrator("RK33", "step", 3, note="Heun, order 3", method=_HEUN, **_alone("RK33")),
-        Integrator("ODE23", "step", 3, note="steps as given", method=_BOGACKI_SHAMPINE, **_alone("ODE23")),
-        Integrator("DOPRI5", "step", 5, note="steps as given", method=_DORMAND_PRINCE, **_alone("DOPRI5")),
-        Integrator("RK67", "step", 6, note="Butcher, order 6", method=_BUTCHER, **_alone("RK67")),
-        Integrator(
-            "VelocityVerlet",
-            "step",
-            1,
-            note="velocity Verlet; of order 2 without terms of velocities",
-            method=_VERLET,
-            **_alone("VelocityVerlet"),
-        ),
+        Integrator("ExplicitEuler", "step", **_alone("ExplicitEuler", 1, _EULER, "explicit Euler")),
+        Integrator("ExplicitMidpoint", "step", **_alone("ExplicitMidpoint", 2, _MIDPOINT, "midpoint rule")),
+        Integrator("RK33", "step", **_alone("RK33", 3, _HEUN, "Heun, order 3")),
+        Integrator("ODE23", "step", **_alone("ODE23", 3, _ODE23, "steps as given")),
+        Integrator("DOPRI5", "step", **_alone("DOPRI5", 5, _DOPRI5, "steps as given")),
+        Integrator("RK67", "step", **_alone("RK67", 6, "Butcher's method of order 6", "Butcher, order 6")),
+        Integrator("VelocityVerlet", "step", **_alone("VelocityVerlet", 1, _VERLET, _TO_SECOND)),
     )
     unsupported: ClassVar[Mapping[str, str]] = {
         "joint_reaction": "minimal coordinates have no forces at the joints"

@@ -6,6 +6,7 @@ Each takes over, for one evaluation, what the joints have: the forces are the sa
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import mujoco
@@ -193,22 +194,26 @@ def _accelerate_by_sensors(m: Any, d: Any, kind: str) -> None:
     d.qacc[:] = through_inverse(m, d, d.qfrc_smooth - d.qfrc_actuator + force)
 
 
+@contextmanager
+def callbacks(**functions: Callable[..., Any]) -> Iterator[None]:
+    """Let the engine call functions, by the name of each callback."""
+    for name, function in functions.items():
+        getattr(mujoco, f"set_mjcb_{name}")(function)
+    try:
+        yield
+    finally:
+        for name in functions:
+            getattr(mujoco, f"set_mjcb_{name}")(None)
+
+
 def forward_by_callbacks(m: Any, d: Any) -> None:
     """Exert the efforts by gains, biases and activations that callbacks return."""
-
-    def gain(_: Any, data: Any, a: int) -> float:
-        return 2.0
 
     def bias(_: Any, data: Any, a: int) -> float:
         return float(-data.ctrl[_control(m, a)])
 
-    for name, given in zip(CALLBACKS, (gain, bias, lambda *_: 0.5), strict=True):
-        getattr(mujoco, name)(given)
-    try:
+    with callbacks(act_gain=lambda *_: 2.0, act_bias=bias, act_dyn=lambda *_: 0.5):
         forward_by_actuators(BY_CALLBACK)(m, d)
-    finally:
-        for name in CALLBACKS:
-            getattr(mujoco, name)(None)
 
 
 # -- tendons -----------------------------------------------------------------------------------------

@@ -110,7 +110,6 @@ TENDON_MOTIONS = (
 )
 SOFTNESS = ("body_invweight0", "dof_invweight0", "tendon_invweight0")  # R is proportional to
 JOINT_TYPES = {"turn": mujoco.mjtJoint.mjJNT_HINGE, "slide": mujoco.mjtJoint.mjJNT_SLIDE}
-FIRST_ORDER_POWERS = (1, 2, 3, 4, 5, 6)
 MAX_IMPEDANCE = 0.9999  # of soft constraints: the largest that MuJoCo accepts
 # of MuJoCo's own R, which is made for the tree at its reference pose: the largest (the next where answers are
 # not yet linear in it), how they fall, and how many
@@ -128,10 +127,15 @@ ROD_AXIAL_INERTIA = 0.01  # J_z of a rod over the mean principal inertia of the 
 IDENTITY_QUATERNION = np.array([1.0, 0.0, 0.0, 0.0])
 
 
-def _euler(implicit_forces: Literal["joint dampers", "applied", "all"]) -> JointSpaceMethod:
-    return JointSpaceMethod(
-        "semi-implicit Euler", "joint rotations", ROD_AXIAL_INERTIA / 3, implicit_forces=implicit_forces
-    )
+def _euler(implicit_forces: Literal["joint dampers", "applied", "all"], note: str) -> Any:
+    """An integrator of order 1."""
+    rods = ROD_AXIAL_INERTIA / 3
+    method = JointSpaceMethod("semi-implicit Euler", "joint rotations", rods, implicit_forces=implicit_forces)
+    return {"order": 1, "error_exponents": (1, 2, 3, 4, 5, 6), "note": note, "method": method}
+
+
+PLAIN = "semi-implicit Euler, implicit in joint dampers"
+FAST = "implicit in velocity without Coriolis terms: equals Euler bit for bit unless there is drag"
 
 
 class Mujoco(MetamorphicHooks):
@@ -143,31 +147,9 @@ class Mujoco(MetamorphicHooks):
     reproduction_template = "mujoco"
     supported_versions = ">=3.2,<5"
     integrators = (
-        Integrator(
-            "Euler",
-            "step",
-            1,
-            FIRST_ORDER_POWERS,
-            note="semi-implicit Euler, implicit in joint dampers",
-            method=_euler("joint dampers"),
-        ),
-        Integrator(
-            "implicit",
-            "step",
-            1,
-            FIRST_ORDER_POWERS,
-            note="Euler, implicit in velocity with Coriolis terms",
-            method=_euler("all"),
-        ),
-        Integrator(
-            "implicitfast",
-            "step",
-            1,
-            FIRST_ORDER_POWERS,
-            alias_of="Euler",
-            note="implicit in velocity without Coriolis terms: equals Euler bit for bit unless there is drag",
-            method=_euler("applied"),
-        ),
+        Integrator("Euler", "step", **_euler("joint dampers", PLAIN)),
+        Integrator("implicit", "step", **_euler("all", "Euler, implicit in velocity with Coriolis terms")),
+        Integrator("implicitfast", "step", **_euler("applied", FAST), alias_of="Euler"),
         Integrator(
             "RK4",
             "step",

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import pickle
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
@@ -149,11 +150,16 @@ def _forward_with_skips(m: Any, d: Any) -> None:
     mujoco.mj_forwardSkip(m, d, mujoco.mjtStage.mjSTAGE_VEL, 0)
 
 
+def _state_of(m: Any, d: Any, kind: int) -> Array:
+    state = np.empty(mujoco.mj_stateSize(m, kind))
+    mujoco.mj_getState(m, d, state, kind)
+    return state
+
+
 def _forward_after_set_state(m: Any, d: Any) -> None:
     """Carry the state and the loads over to data that a reset has emptied."""
     kind = mujoco.mjtState.mjSTATE_INTEGRATION
-    state = np.empty(mujoco.mj_stateSize(m, kind))
-    mujoco.mj_getState(m, d, state, kind)
+    state = _state_of(m, d, kind)
     mujoco.mj_resetData(m, d)
     mujoco.mj_setState(m, d, state, kind)
     mujoco.mj_forward(m, d)
@@ -162,12 +168,10 @@ def _forward_after_set_state(m: Any, d: Any) -> None:
 def _forward_after_copied_state(m: Any, d: Any) -> None:
     """Carry the state and the loads over to other data and back, positions and velocities once more alone."""
     kind, part = mujoco.mjtState.mjSTATE_INTEGRATION, mujoco.mjtState.mjSTATE_PHYSICS
-    other, state = mujoco.MjData(m), np.empty(mujoco.mj_stateSize(m, kind))
+    other, own = mujoco.MjData(m), np.empty(mujoco.mj_stateSize(m, part))
     mujoco.mj_copyState(m, d, other, kind)
     mujoco.mj_resetData(m, d)
-    mujoco.mj_getState(m, other, state, kind)
-    own = np.empty(mujoco.mj_stateSize(m, part))
-    mujoco.mj_extractState(m, state, kind, own, part)
+    mujoco.mj_extractState(m, _state_of(m, other, kind), kind, own, part)
     mujoco.mj_copyState(m, other, d, kind)
     d.qpos[:], d.qvel[:] = m.qpos0, 0.0
     mujoco.mj_setState(m, d, own, part)
@@ -198,17 +202,26 @@ def _forward_from_reference(m: Any, d: Any) -> None:
     mujoco.mj_forward(m, d)
 
 
+@contextmanager
+def _one_second(m: Any) -> Iterator[None]:
+    """Set a step of 1 s, semi-implicit with explicit dampers, by which velocities change by accelerations."""
+    flags = m.opt.disableflags
+    m.opt.integrator, m.opt.timestep = mujoco.mjtIntegrator.mjINT_EULER, 1.0
+    m.opt.disableflags = flags | int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
+    yield
+    m.opt.disableflags = flags
+
+
 def _forward_by_step(*functions: str) -> Callable[[Any, Any], None]:
-    """Take the acceleration from the velocity after a step of 1 s, semi-implicit with explicit dampers."""
+    """Take the acceleration from the velocity after a step of 1 s."""
 
     def forward(m: Any, d: Any) -> None:
-        flags, (q, v, t) = m.opt.disableflags, (d.qpos.copy(), d.qvel.copy(), d.time)
-        m.opt.integrator, m.opt.timestep = mujoco.mjtIntegrator.mjINT_EULER, 1.0
-        m.opt.disableflags = flags | int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
-        for function in functions:
-            getattr(mujoco, function)(m, d)
+        q, v, t = d.qpos.copy(), d.qvel.copy(), d.time
+        with _one_second(m):
+            for function in functions:
+                getattr(mujoco, function)(m, d)
         a = d.qvel - v
-        d.qpos[:], d.qvel[:], d.time, m.opt.disableflags = q, v, t, flags
+        d.qpos[:], d.qvel[:], d.time = q, v, t
         mujoco.mj_forward(m, d)
         d.qacc[:] = a
 
@@ -226,11 +239,8 @@ def _forward_by_callback(name: str) -> Callable[[Any, Any], None]:
             place[:] = place + force if name == "passive" else force
 
         d.qfrc_applied[:] = 0.0
-        getattr(mujoco, f"set_mjcb_{name}")(apply)
-        try:
+        with actuation.callbacks(**{name: apply}):
             mujoco.mj_forward(m, d)
-        finally:
-            getattr(mujoco, f"set_mjcb_{name}")(None)
         d.qfrc_applied[:] = force
 
     return forward
@@ -240,16 +250,11 @@ def _forward_by_rollout(m: Any, d: Any) -> None:
     """The same by a batch of one step, under the loads as controls."""
     full, loads = mujoco.mjtState.mjSTATE_FULLPHYSICS, mujoco.mjtState.mjSTATE_QFRC_APPLIED
     loads = int(loads) | int(mujoco.mjtState.mjSTATE_XFRC_APPLIED)
-    flags, size = m.opt.disableflags, mujoco.mj_stateSize(m, full)
-    state, control = np.empty(size), np.empty(mujoco.mj_stateSize(m, loads))
-    mujoco.mj_getState(m, d, state, full)
-    mujoco.mj_getState(m, d, control, loads)
-    m.opt.integrator, m.opt.timestep = mujoco.mjtIntegrator.mjINT_EULER, 1.0
-    m.opt.disableflags = flags | int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
+    state, control = _state_of(m, d, full), _state_of(m, d, loads)
     other = mujoco.MjData(m)
-    after, _ = mujoco.rollout.rollout(m, other, state[None], control[None, None], control_spec=loads)
-    mujoco.mj_setState(m, other, np.ravel(after), full)
-    m.opt.disableflags = flags
+    with _one_second(m):
+        after, _ = mujoco.rollout.rollout(m, other, state[None], control[None, None], control_spec=loads)
+        mujoco.mj_setState(m, other, np.ravel(after), full)
     mujoco.mj_forward(m, d)
     d.qacc[:] = other.qvel - d.qvel
 

@@ -203,56 +203,61 @@ class _Body:
         return found
 
     def _attitude(self, form: str, value: Array) -> Array | None:
-        inverse, form = form.startswith("-"), form.removeprefix("-")
-        match form:
-            case "R":
-                return value.reshape(3, 3)
-            case "p" | "rp" | "xyzw" | "rxyzw":
-                return rotation_matrix(np.roll(value[-4:], form.endswith("w")))
-            case "phi" | "xi" | "rphi":
-                return rotation_matrix(quaternion_exponential(value[-3:] / 2))
-            case "skew" | "log":
-                return rotation_matrix(quaternion_exponential(_vector_of(value) / 2))
-            case "xyz" | "rxyz":
-                return _turned(value[-3:])
-            case "rpy":
-                return _turned(-value).T
-            case "zyz":
-                return _about(2, value[0]) @ _about(1, value[1]) @ _about(2, value[2])
-            case "H" | "G":
-                return value[:3, :3]
-            case "X" | "XI":  # both blocks are the turn
-                turn = (value[:3, :3] + value[3:, 3:]) / 2
-                return turn if form == "X" else turn.T
-            case "Rx" | "Ry" | "Rz":
-                turns = [_about(axis, angle) for axis, angle in enumerate(self.pose.forms["xyz"])]
-                turns["xyz".index(form[1])] = value[:3, :3].T if inverse else value[:3, :3]
-                return np.asarray(turns[0] @ turns[1] @ turns[2])
-        return None
+        name = form.removeprefix("-")
+        if name in ("Rx", "Ry", "Rz"):
+            turns = [_about(axis, angle) for axis, angle in enumerate(self.pose.forms["xyz"])]
+            turns["xyz".index(name[1])] = value[:3, :3].T if name != form else value[:3, :3]
+            return np.asarray(turns[0] @ turns[1] @ turns[2])
+        return ATTITUDES[name](value) if name in ATTITUDES else None
 
     def _place(self, form: str, value: Array) -> Array | None:
-        sign = -1 if form.startswith("-") else 1
-        match form.removeprefix("-"):
-            case "r" | "rp" | "rxyzw" | "rphi" | "rxyz":
-                return value[:3]
-            case "H" | "T":
-                return sign * (value[:3, 3] if len(value) == 4 else _vector_of(value[3:]))
-            case "G":
-                return value[3:6, 6]
-            case "S":
-                return _vector_of(value)
-            case "X" | "XI":
-                turn = value[:3, :3]
-                return _vector_of(value[3:, :3] @ turn.T if form == "X" else -turn.T @ value[3:, :3])
-            case "xi":
-                return _place_on_se3(value)
-            case "log":
-                return _place_on_se3(np.append(value[:3, 3], _vector_of(value)))
-            case "Tx" | "Ty" | "Tz":
-                moved = value[:3, 3] if len(value) == 4 else _vector_of(value[3:])
-                is_other = np.arange(3) != "xyz".index(form[-1])
-                return np.asarray(sign * moved + is_other * self.pose.r)
-        return None
+        sign, name = (-1 if form.startswith("-") else 1), form.removeprefix("-")
+        if name in ("Tx", "Ty", "Tz"):
+            is_other = np.arange(3) != "xyz".index(name[1])
+            return np.asarray(sign * _shift(value) + is_other * self.pose.r)
+        return sign * PLACES[name](value) if name in PLACES else None
+
+
+def _shift(value: Array) -> Array:
+    """The shift of a pose, or of a Plücker matrix without a turn."""
+    return value[:3, 3] if len(value) == 4 else _vector_of(value[3:])
+
+
+def _turn(phi: Array) -> Array:
+    return rotation_matrix(quaternion_exponential(phi / 2))
+
+
+Reader = Callable[[Array], Array]
+
+
+def _by_form(*readers: tuple[str, Reader]) -> dict[str, Reader]:
+    return {form: read for forms, read in readers for form in forms.split()}
+
+
+# By form what takes a result to an attitude, and to a place.
+ATTITUDES = _by_form(
+    ("R", lambda x: x.reshape(3, 3)),
+    ("p rp", lambda x: rotation_matrix(x[-4:])),
+    ("xyzw rxyzw", lambda x: rotation_matrix(np.roll(x[-4:], 1))),
+    ("phi xi rphi", lambda x: _turn(x[-3:])),
+    ("skew log", lambda x: _turn(_vector_of(x))),
+    ("xyz rxyz", lambda x: _turned(x[-3:])),
+    ("rpy", lambda x: _turned(-x).T),
+    ("zyz", lambda x: _about(2, x[0]) @ _about(1, x[1]) @ _about(2, x[2])),
+    ("H G", lambda x: x[:3, :3]),
+    ("X", lambda x: (x[:3, :3] + x[3:, 3:]) / 2),  # both blocks are the turn
+    ("XI", lambda x: (x[:3, :3] + x[3:, 3:]).T / 2),
+)
+PLACES = _by_form(
+    ("r rp rxyzw rphi rxyz", lambda x: x[:3]),
+    ("H T", _shift),
+    ("G", lambda x: x[3:6, 6]),
+    ("S", lambda x: _vector_of(x)),
+    ("X", lambda x: _vector_of(x[3:, :3] @ x[:3, :3].T)),
+    ("XI", lambda x: _vector_of(-x[:3, :3].T @ x[3:, :3])),
+    ("xi", _place_on_se3),
+    ("log", lambda x: _place_on_se3(np.append(x[:3, 3], _vector_of(x)))),
+)
 
 
 def _vector_of(matrix: Array) -> Array:
