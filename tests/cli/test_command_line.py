@@ -24,6 +24,7 @@ from plumbline.judging.rows import RowContext, Verdict
 from plumbline.scenario import loader
 from plumbline.storage.results_store import SCHEMA_VERSION
 from tests.helpers.commands import ROOT, invoke, run_plumbline, run_python
+from tests.helpers.tables import table
 
 CONTEXT = RowContext("scenario", "family", "engine", "Engine", "1.0")
 
@@ -278,36 +279,7 @@ def test_a_name_stays_text_on_the_terminal_in_html_and_in_junit(tmp_path):
 
 @pytest.mark.parametrize(
     ("words", "expected"),
-    [
-        (["run", "tumbling-bal"], "tumbling-ball"),
-        (["run", "--engine", "mujocco"], "did you mean 'mujoco'"),
-        (["run", "rest", "--family", "singel"], "did you mean 'single'"),
-        (["run", "--level", "all of them"], "level"),
-        (["run", "--jobs", "0"], "jobs"),
-        (["run", "--user-rtol", "-1"], "user-rtol"),
-        (["rnu"], "did you mean 'run'"),
-        (["check"], "FILE"),
-        (["report", "nowhere"], "no results here"),
-        (["check", "nowhere.yaml"], "nowhere.yaml"),
-        (["run", "--memory", "nan"], "nan is not a finite number"),
-        (["run", "--memory", "inf"], "inf is not a finite number"),
-        (["run", "--memory", "0.1"], "0.1 is not in the range 1.0<=x<=1000000.0"),
-        (["run", "--jobs", "1000000"], "1000000 is not in the range 1<=x<=1024"),
-        (["run", "--scheduler", "somewhere"], "'somewhere' is no address such as tcp://HOST:8786"),
-        (["nightly", "--random", "9" * 30], "is not in the range 0<=x<=1000000"),
-        (["nightly", "--timeout", "nan"], "nan is not a finite number"),
-        (["run", "--timeout", "0.01"], "0.01 is not in the range 1.0<=x<=10000000.0"),
-        (["run", "--user-rtol", "nan"], "nan is not a finite number"),
-        (["run", "--user-rtol", "1e-300"], "1e-300 is not in the range"),
-        (["nightly", "--long-run-seconds", "inf"], "inf is not a finite number"),
-        (["nightly", "--extra-refinement", "1"], "Did you mean '--extra-refinements'"),
-        (["run", "--out", ""], "the path is empty"),
-        (["report", ""], "the path is empty"),
-        (["history", "nowhere"], "`python -m plumbline nightly` makes one"),
-        (["run", "dubble"], "did you mean `--family double`?"),
-        (["prove", "no-such-scenario"], "no-such-scenario: unknown scenario"),
-        (["prove", "tumbling-ball", "--precision", "half"], "--precision"),
-    ],
+    table(__file__),
 )
 def test_bad_usage_ends_with_2_and_a_suggestion(words, expected):
     result = invoke(*words)

@@ -10,8 +10,6 @@ from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
-from ruamel.yaml import YAML
-
 from plumbline.engines.registry import ENGINES, load_adapter
 from plumbline.execution.plan import Plan
 from plumbline.execution.scenario_verdicts import ScenarioRun
@@ -19,6 +17,7 @@ from plumbline.judging.rows import Row
 from plumbline.processes.worker_pool import run_task
 from plumbline.scenario.generator import RandomScenarios
 from plumbline.scenario.loader import load_scenarios
+from tests.helpers.tables import table
 
 ROOT = Path(__file__).parents[2]
 BETWEEN = {  # modules that hold parts of the edited one and are loaded between it and the adapter
@@ -41,7 +40,7 @@ class Edit:
     is_control: bool = False  # another computation of the same numbers
 
 
-EDITS = [Edit(**entry) for entry in YAML(typ="safe").load(Path(__file__).with_suffix(".yaml"))]
+EDITS = [Edit(**entry) for entry in table(__file__)]
 
 
 @contextmanager

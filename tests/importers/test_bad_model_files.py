@@ -8,12 +8,11 @@ import pytest
 from plumbline.importers.xml_tree import ModelFileError, parse_xml, write_xml, write_xml_in_place
 from plumbline.model_files.prepared_file import prepare_file
 from tests.helpers.random_robots import random_mjcf, random_urdf
+from tests.helpers.tables import table
 
 INERTIAL = '<inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
 LINKS = f'<link name="a">{INERTIAL}</link>\n<link name="b">{INERTIAL}</link>\n'
 JOINT = '<joint name="j" type="revolute"><parent link="a"/><child link="b"/></joint>'
-BOMB = '<!DOCTYPE r [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;&a;&a;">]>\n<robot name="r">&b;</robot>'
-EXTERNAL = '<!DOCTYPE r [<!ENTITY x SYSTEM "file:///etc/passwd">]>\n<robot name="r">&x;</robot>'
 
 
 def robot(old="", new="", more=""):
@@ -21,72 +20,9 @@ def robot(old="", new="", more=""):
     return f"<robot>{LINKS}{JOINT}{more}</robot>".replace(old, new, 1)
 
 
-def with_mesh(name):
-    return robot("</link>", f'<visual><geometry><mesh filename="{name}"/></geometry></visual></link>')
-
-
-CIRCLE = (
-    "\n<link name='c'/><link name='d'/>"
-    '<joint name="k" type="fixed"><parent link="c"/><child link="d"/></joint>'
-    '<joint name="l" type="fixed"><parent link="d"/><child link="c"/></joint>'
-)
-SECOND_JOINT = "\n" + JOINT.replace('"j"', '"k"')
-# name → content, and what the message must contain
-BAD_FILES = {
-    "empty": ("", "not well-formed XML"),
-    "no XML": ("hello", ":1:1: is not well-formed"),
-    "unclosed": ("<robot>\n<link>\n</robot>", ":3:3: is not well-formed XML: mismatched tag"),
-    "entity bomb": (BOMB, ":1:1: declares or uses an entity"),
-    "external entity": (EXTERNAL, ":1:1: declares or uses an entity"),
-    "too deep": ("<robot>" + "<a>" * 1000 + "</a>" * 1000 + "</robot>", "nested more than 500 deep"),
-    "no links": ('<robot name="r"/>', ":1:1: <robot name='r'>: has no <link>"),
-    "another root": ("<html/>", "<robot> (URDF) or <mujoco> (MJCF)"),
-    "SDF": (
-        '<sdf version="1.7"/>',
-        "is an SDF file; valid would be <robot> (URDF) or <mujoco> (MJCF); convert it to URDF",
-    ),
-    "xacro": (
-        '<robot xmlns:xacro="http://x"><xacro:property name="a" value="1"/></robot>',
-        "is a xacro file; expand it first: xacro",
-    ),
-    "include file": ("<mujocoinclude/>", "name the file that includes it"),
-    "duplicate link": (robot(more="\n" + LINKS), ":4:1: <link name='a'> name: has the name of the link at"),
-    "no name": (robot(more="<link/>"), ":3:76: <link> name: has no name"),
-    "missing link": (robot('link="b"', 'link="c"'), ":3:51: <child> link: there is no link 'c'"),
-    "no parent": (robot('<parent link="a"/>'), ":3:1: <joint name='j'>: has no <parent>"),
-    "two parents": (
-        robot(more=SECOND_JOINT),
-        ":4:1: <joint name='k'>: link 'b' is the child of joint 'j' too",
-    ),
-    "two roots": (robot(JOINT), "has 2 links that are no joint's child: 'a'"),
-    "circle": (robot(more=CIRCLE), "is in a circle of joints, with the links 'c', 'd'"),
-    "unknown type": (
-        robot("revolute", "revolte"),
-        ":3:1: <joint name='j'> type: is 'revolte'; valid would be one of revolute",
-    ),
-    "zero axis": (
-        robot("</joint>", '<axis xyz="0 0 0"/></joint>'),
-        ":3:68: <axis> xyz: is zero; valid would be a direction",
-    ),
-    "NaN": (
-        robot("</joint>", '<axis xyz="0 nan 0"/></joint>'),
-        ":3:68: <axis> xyz: 'nan' is no finite number; valid would be 3 finite numbers",
-    ),
-    "overflow": (robot('value="1"', 'value="1e999"'), "'1e999' is no finite number"),
-    "two numbers": (
-        robot("</joint>", '<origin xyz="0 1"/></joint>'),
-        ":3:68: <origin> xyz: has 2 numbers; valid would be 3 finite numbers",
-    ),
-    "negative mass": (
-        robot('value="1"', 'value="-2"'),
-        ":1:33: <mass> value: is -2 kg; valid would be a mass, at least 0",
-    ),
-    "no mass": (robot('<mass value="1"/>'), ":1:23: <inertial>: has no <mass value=…>"),
-    "mesh on the network": (with_mesh("http://x/y.stl"), "is on the network"),
-    "mesh outside": (with_mesh("/etc/passwd"), "'/etc/passwd' is outside"),
-    "missing mesh": (with_mesh("package://p/no.stl"), "--strip-geometry leaves meshes out"),
-    "include outside": ('<mujoco>\n<include file="../../etc/passwd"/></mujoco>', ":2:1: <include> file:"),
-    "include itself": ('<mujoco>\n<include file="robot.xml"/></mujoco>', "twice or in a circle"),
+BAD_FILES = {  # content, and what the message must contain
+    "too deep": ["<robot>" + "<a>" * 1000 + "</a>" * 1000 + "</robot>", "nested more than 500 deep"],
+    **table(__file__),
 }
 
 

@@ -20,6 +20,7 @@ from plumbline.judging.rows import RowContext
 from plumbline.processes.cpu_time import CpuTimes
 from plumbline.scenario.line_and_column_errors import ScenarioError
 from plumbline.storage.results_store import ResultTables
+from tests.helpers.tables import table
 
 ROOT = Path(__file__).resolve().parents[2]
 CONTEXT = RowContext("tumbling-ball", "single", "mujoco", "MuJoCo", "4.0.0")
@@ -117,45 +118,7 @@ def test_a_malformed_file_is_a_problem_with_a_position(tmp_path, text, at, words
 
 @pytest.mark.parametrize(
     ("changes", "words"),
-    [
-        ({"verdict": "agrees"}, "verdict: is 'agrees'"),
-        ({"quantitty": "z"}, "quantitty: unknown field. did you mean 'quantity'?"),
-        ({"versions": "new"}, "versions: is 'new'; valid would be a version range, written like '>=1.13,<2'"),
-        ({"id": "a\n[red]"}, "id: is 'a\\n[red]'; valid would be one line of printable text"),
-        ({"id": 3}, "id: is the number 3"),
-        ({"engine": "mujocoo"}, "engine: no engine matches 'mujocoo'; did you mean 'mujoco'?"),
-        ({"engine": "muj0*"}, "engine: no engine matches 'muj0*'"),
-        (
-            {"scenario": "tumbling-bal"},
-            "scenario: no scenario matches 'tumbling-bal'; did you mean 'tumbling-ball'?",
-        ),
-        ({"scenario": ["rest", "rset"]}, "scenario[1]: no scenario matches 'rset'; did you mean 'rest'?"),
-        ({"scenario": []}, "scenario: has 0 entries; valid would be at least 1"),
-        ({"level": "sate"}, "level: no level matches 'sate'; did you mean 'state'?"),
-        ({"integrator": "RK5"}, "integrator: no integrator matches 'RK5'"),
-        (
-            {"quantity": "aceleration"},
-            "quantity: no quantity matches 'aceleration'; did you mean 'acceleration'?",
-        ),
-        ({"quantity": "by crbaa"}, "quantity: no quantity matches 'by crbaa'; did you mean 'by crba'?"),
-        ({"verdict": "disagrees"}, "expects a disagreement without max_ratio and cause or mechanism"),
-        ({"rows": [OFF | {"mechanism": "rounding"}]}, "rows[0].mechanism: unknown field"),
-        ({"rows": [{"verdict": "failed", "quantity": "acelleration"}]}, "did you mean 'acceleration'?"),
-        ({"cause": {"kind": "nunber"}}, "cause.kind: is 'nunber'"),
-        (OFF | {"mechanism": "magic"}, "mechanism: is 'magic'"),
-        (OFF | {"max_ratio": -1}, "max_ratio: is -1"),
-        (OFF | {"max_ratio": "much"}, "max_ratio"),
-        (OFF | {"max_ratio": {"ten": 3}}, "max_ratio.ten"),
-        (OFF | {"max_ratio": None}, "max_ratio"),
-        (OFF | {"engine": "*"}, "expects a disagreement of every engine; valid would be the engine that"),
-        (
-            OFF | {"shown_by": "pinochio"},
-            "shown_by: no shown_by matches 'pinochio'; did you mean 'pinocchio'?",
-        ),
-        ({"intermittent": True}, "intermittent: is the word true"),
-        ({"intermittent": "now and then"}, "is intermittent; valid would be"),
-        (OFF | {"mechanism": "equations", "intermittent": "at times"}, "is intermittent"),
-    ],
+    table(__file__),
 )
 def test_a_mistake_in_an_entry_is_a_problem_of_its_field(tmp_path, changes, words):
     with pytest.raises(ScenarioError) as caught:

@@ -13,7 +13,6 @@ from typing import get_args
 
 import pytest
 from pydantic_core.core_schema import ErrorType
-from ruamel.yaml import YAML
 
 from plumbline.scenario.line_and_column_errors import Problem, ScenarioError, did_you_mean
 from plumbline.scenario.loader import (
@@ -27,6 +26,7 @@ from plumbline.scenario.schema import Document
 from plumbline.scenario.validation_messages import problems_from_validation
 from plumbline.scenario.yaml_source import YamlSource
 from plumbline.studies.sweep_file import Sweep
+from tests.helpers.tables import table
 
 VALID_SCENARIO = """\
 schema_version: 1
@@ -40,7 +40,7 @@ bodies:
     attitude: {quaternion: [1, 0, 0, 0]}
 """
 PRINCIPAL = "{principal: [0.02, 0.03, 0.04]}"
-ERROR_CASES = YAML(typ="safe").load((Path(__file__).parent / "mistakes.yaml").read_text(encoding="utf-8"))
+ERROR_CASES = table(Path(__file__).with_name("mistakes"))
 VALID_BODY = (
     "{mass: 1, inertia: {principal: [1, 1, 1]}, joint: {kind: ball}, proximal: [0, 0, 1], distal: [0, 0, 0], "
     "attitude: {quaternion: [1, 0, 0, 0]}}"

@@ -10,6 +10,7 @@ from plumbline.scenario.line_and_column_errors import ScenarioError
 from plumbline.scenario.loader import load_scenario_text
 from plumbline.storage.results_schema import _Scenario
 from reference_impl.mechanism import Mechanism
+from tests.helpers.tables import table
 
 HEAD = "schema_version: 1\ntitle: t\npurpose: p\nbodies:\n"
 BODY = "mass: 1, inertia: {principal: [1, 1, 1]}, proximal: [0, 0, 1]"
@@ -61,63 +62,13 @@ def test_an_axis_may_point_anywhere(axis):
 
 
 BALL = "joint: {kind: ball}, attitude: {quaternion: [1, 0, 0, 0]}"
-MISTAKES = {
-    "unknown": (
-        (f"name: arm, {BALL}", f"parent: amr, {BALL}"),
-        ["6:", "parent: is 'amr', no body's name", "'arm'"],
-    ),
-    "itself": ((f"name: a, parent: a, {BALL}",), ["5:", "parent: is 'a', which is not above this body"]),
-    "later": ((f"parent: b, {BALL}", f"name: b, parent: world, {BALL}"), ["5:", "which is not above"]),
-    "twice": (
-        (f"name: a, {BALL}", f"name: a, parent: world, {BALL}", f"parent: a, anchor: [0, 0, 0], {BALL}"),
-        ["7:", "the name of 2 bodies"],
-    ),
-    "branch": (
-        (
-            f"name: a, {BALL}", f"name: b, parent: a, anchor: [0, 0, 0], {BALL}",
-            f"name: c, parent: a, anchor: [0, 0, 0], {BALL}", f"parent: b, anchor: [0, 0, 0], {BALL}",
-        ),
-        ["8:", "whose branch ended above"],
-    ),
-    "no distal": (
-        (f"name: a, {BALL}", f"parent: a, {BALL}"),
-        ["6:", "anchor: is missing: the parent has no distal"],
-    ),
-    "no axis": (("joint: {kind: hinge, axis: [0, 0, 0]}",), ["5:", "axis: is all zeros"]),
-    "two axes": (
-        ("joint: {kind: hinge, axis: [0, 0, 1], frame: {quaternion: [1, 0, 0, 0]}}",),
-        ["gives axis and a frame"],
-    ),
-    "axis of a weld": (
-        (f"{BALL}, distal: [0, 0, 0]", "joint: {kind: weld, axis: [0, 0, 1]}"),
-        ["6:", "gives an axis"],
-    ),
-    "weld to the world": (("joint: {kind: weld}",), ["5:", "welds a body to the world"]),
-    "coordinates": (
-        ("joint: {kind: hinge, coordinates: [1, 2]}",),
-        ["5:", "coordinates: has 2 numbers", "1 for a hinge"],
-    ),
-    "attitude": (
-        ("joint: {kind: hinge}, attitude: {quaternion: [1, 0, 0, 0]}",),
-        ["5:", "attitude: is given for a body on a hinge"],
-    ),
-    "no attitude": (("joint: {kind: ball}",), ["5:", "attitude: is missing"]),
-    "rates": (
-        ("joint: {kind: hinge}, angular_velocity: [1, 0, 0]",),
-        ["5:", "angular_velocity: is given for a body"],
-    ),
-    "free on a body": (
-        (f"name: a, {BALL}", "parent: a, joint: {kind: free}, attitude: {quaternion: [1, 0, 0, 0]}"),
-        ["6:", "parent: is given for a free body"],
-    ),
-}  # fmt: skip
+MISTAKES, ELEMENT_MISTAKES = (table(__file__, name) for name in ("mistakes", "elements"))
 
 
 @pytest.mark.parametrize("name", MISTAKES)
 def test_mistakes_are_named_with_their_place(name):
-    bodies, words = MISTAKES[name]
-    found = "\n".join(problems(*bodies))
-    assert all(word in found for word in words), found
+    found = "\n".join(problems(*MISTAKES[name]["bodies"]))
+    assert all(word in found for word in MISTAKES[name]["words"]), found
 
 
 ARM = "name: arm, joint: {kind: hinge, axis: [0, 0, 1]}, distal: [0, 0, -1]"
@@ -161,29 +112,11 @@ def spring(bodies, more="stiffness: 1", points="[[0, 0, 1], [0, 1, 0]]"):
     return (f"bodies: {bodies}, points: {points}, {more}",)
 
 
-ELEMENT_MISTAKES = {
-    "too many": (ARM.replace("1]}", "1], damping: [1, 2]}"), (), ["5:", "has 2 numbers", "1 for a hinge"]),
-    "too few": ("joint: {kind: universal, armature: 1}", (), ["5:", "has 1 number", "2 for a univ"]),
-    "negative": (BALL.replace("ball", "ball, stiffness: -1"), (), ["5:", "stiffness: is -1.0, below 0"]),
-    "of a weld": ("parent: bob, joint: {kind: weld, damping: 1}", (), ["given for a weld"]),
-    "effort of a ball": (BALL.replace("ball", "ball, effort: 1"), (), ["5:", "effort: unknown field"]),
-    "rest alone": (ARM.replace("1]}", "1], rest: 1}"), (), ["gives rest without stiffness"]),
-    "a word": (ARM.replace("1]}", "1], damping: high}"), (), ["damping: is the text 'high'"]),
-    "no such body": (ARM, spring("[arm, bbo]"), ["8:", "springs[0].bodies[1]: is 'bbo', no body's name"]),
-    "one body": (ARM, spring("[arm, arm]"), ["springs[0].bodies[1]: is 'arm' like the other end"]),
-    "the world twice": (ARM, spring("[world, world]"), ["is 'world' like the other end"]),
-    "a single body": (ARM, spring("[arm]"), ["springs[0].bodies: has 1 entries", "exactly 2"]),
-    "a name twice": (f"name: bob, {BALL}", spring("[world, bob]"), ["is 'bob', the name of 2 bodies"]),
-    "no distance": (ARM, spring("[world, bob]", points="[[0, 0, 0], [0, 0, 1]]"), ["8:", "coincide"]),
-    "negative length": (ARM, spring("[world, bob]", "length: -1"), ["springs[0].length: is -1"]),
-}  # fmt: skip
-
-
 @pytest.mark.parametrize("name", ELEMENT_MISTAKES)
 def test_mistakes_in_elements_are_named_with_their_place(name):
-    first, springs, words = ELEMENT_MISTAKES[name]
-    found = "\n".join(problems(first, f"parent: world, {BOB}", springs=springs))
-    assert all(word in found for word in words), found
+    case = ELEMENT_MISTAKES[name]
+    found = "\n".join(problems(case["first"], f"parent: world, {BOB}", springs=case["springs"]))
+    assert all(word in found for word in case["words"]), found
 
 
 def test_stored_models_need_no_elements_and_check_those_they_have():

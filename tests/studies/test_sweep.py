@@ -24,6 +24,7 @@ from plumbline.studies.parquet_files import write_table
 from tests.helpers.mutations import limited_time
 from tests.helpers.planted_defects import MOTION_DEFECTS
 from tests.helpers.planting import Defect, motion_subject, planted
+from tests.helpers.tables import table
 
 SWEEP_FILE = """\
 schema_version: 1
@@ -179,43 +180,13 @@ def test_a_missing_engine_and_a_truth_that_fails_are_rows(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (("points: 3, log: true", "log: true"), r":4:.*bodies\[0\]\.mass: a range needs"),
-        (("from: 0.5", "from: -0.5"), r":4:.*log needs"),
-        (("bodies[0].mass", "bodies[0].mas"), r":4:.*no number"),
-        (("bodies[0].mass", "bodies[7].mass"), r":4:.*no number"),
-        (("uniform: [-0.05, 0.05]", "uniform: [0.05, -0.05]"), r":6:.*low ≤ high"),
-        (("uniform: [-0.05, 0.05]", "normal: [0, -1]"), r":6:.*standard deviation"),
-        (("values: [-1, 1]", "values: [-1, 1], uniform: [0, 1]"), r":5:.*exactly one"),
-        (("mujoco: RK4", "mujoko: RK4"), r":10:.*no engine"),
-        (("scenario: double", "scenario: duble"), r":2:11: scenario: unknown scenario"),
-        (
-            ("scenario: double-", "scenario: ../"),
-            r":2:11: scenario: is '\.\./tumbling-balls', and there is no",
-        ),
-        (("seed: 7", "seeds: 7"), r":8:1: seeds: unknown field. did you mean 'seed'"),
-        (("points: 3", "points: 90000"), r":4:.*points: is 90000; valid would be a number at most 10000"),
-        (("points: 3", "points: three"), r":4:.*points: is the text 'three', not a whole number"),
-        (
-            ("values: [-1, 1]", "values: 3"),
-            r":5:.*values: is the number 3; valid would be a list: the values",
-        ),
-        (("uniform: [-0.05, 0.05]", "uniform: [1, 2, 3]"), r":6:.*uniform: has 3 entries"),
-        (("uniform: [-0.05, 0.05]", "uniform: 1 cm"), r":6:.*uniform: is the text '1 cm'"),
-        (("scenario: double-tumbling-balls", "scenario: ''"), r":2:.*scenario: has 0 characters"),
-        (("scenario: double-tumbling-balls\n", ""), r":1:1: scenario: is missing; valid would be a name of"),
-        (("duration: 0.25", "duration: long"), r":9:.*duration: is the text 'long', not a number"),
-        (("duration: 0.25", "step: 1e-9"), r":9:7: step: is 1e-09; valid would be at least"),
-        (("engines: {mujoco: RK4}", "engines: [mujoco]"), r":10:.*engines: is a list"),
-        (("count: 2", "count: 90000"), r"540000 cells"),
-        (("schema_version: 1", "schema_version: 2"), r":1:.*is 2; this version of Plumbline reads 1"),
-        ((SWEEP_FILE, "- 3"), r":1:1: is a list; valid would be a mapping that starts with schema_version"),
-    ],
+    ("old", "new", "words"),
+    table(__file__),
 )
-def test_mistakes_in_the_file_are_named_with_their_place(tmp_path, change, words):
+def test_mistakes_in_the_file_are_named_with_their_place(tmp_path, old, new, words):
+    text = new if old == "FILE" else SWEEP_FILE.replace(old, new)
     with pytest.raises(ScenarioError, match=words):
-        sweep_file.load(write_sweep_file(tmp_path, SWEEP_FILE.replace(*change)))
+        sweep_file.load(write_sweep_file(tmp_path, text))
 
 
 def test_an_integrator_that_the_engine_has_not_is_named_with_its_place(tmp_path):
