@@ -15,6 +15,7 @@ from plumbline.model.sampling import random_states
 from plumbline.truth.ground_truth import state_truth
 from tests.helpers.nightly_tests import SLOW
 from tests.helpers.planting import every_joint
+from tests.helpers.tables import table
 
 pytest.importorskip("flint")
 STATES = 3
@@ -154,29 +155,7 @@ def test_other_differences_are_no_force_at_one_place(answer):
     assert [cause.kind for cause in causes] == ["unexplained"]
 
 
-READINGS = [
-    ("coordinates", "joint 3", "exchanged"),
-    ("rate 1", "joint 3", "its absolute value"),
-    ("applied moment", "all bodies", "taken in the world frame"),
-    ("damping", "every joint", "that of the joint before"),
-    ("inertia", "body 2", "turned against its joint's axes"),
-    ("stiffness of the two coordinates", "joint 3", "exchanged"),
-    ("drag force and drag moment", "all bodies", "exchanged"),
-    ("products of inertia yz, xz, xy", "all bodies", "xy, xz, yz"),
-    ("products of inertia yz, xz, xy", "body 2", "-yz, -xy, -xz"),
-    ("drag moment", "all bodies", "taken with the world-frame angular velocity"),
-    ("drag force", "body 3", "taken with the velocity of its joint's point"),
-    ("drag force", "body 3", "taken with the body-frame velocity"),
-    ("world's point", "spring 1", "reversed"),
-    ("first point", "spring 2", "left out"),
-    ("spring 1", "joint 2", "without its coordinate"),
-    ("inertia", "every body", "that of the first body"),
-    ("springs, dampers and efforts", "all joints", "missing"),
-    ("attitude", "body 1", "turned the other way"),
-    ("angular velocity", "body 1", "in the world frame"),
-    ("far point", "joint 2", "reversed"),
-    ("axes", "joint 3 in the far body", "not turned"),
-]
+READINGS = [tuple(case) for case in table(__file__)]
 
 
 @pytest.mark.parametrize(

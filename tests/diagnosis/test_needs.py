@@ -15,6 +15,7 @@ from plumbline.model.sampling import random_loop_states, random_states
 from plumbline.truth.ground_truth import state_truth
 from tests.helpers import pendulums
 from tests.helpers.nightly_tests import SLOW
+from tests.helpers.tables import table
 
 FIELDS = {
     "gravity": "gravity", "an applied force": "force", "an applied moment": "moment", "drag": "drag_force",
@@ -33,32 +34,7 @@ HAS = {
     **{f"{n} bodies": partial(lambda n, m, s: m.n >= n, n) for n in range(2, 6)},
     **{f"a {kind} joint": partial(lambda kind, m, s: kind in m.kind, kind) for kind in KINDS},
 }
-PLANTED = [
-    ("chain", "drag", "motion"),
-    ("chain", "an applied moment", "gravity"),
-    ("chain", "3 bodies"),
-    ("chain", "a rod joint", "motion"),
-    ("chain", "a rod joint", "a ball joint"),
-    ("tree", "a hinge joint"),
-    ("tree", "a hinge joint", "an effort"),
-    ("tree", "a slide joint", "a damper"),
-    ("tree", "4 bodies", "motion"),
-    ("tree", "turned axes of joints"),
-    ("tree", "turned axes of joints", "a joint spring"),
-    ("tree", "a rotor", "a universal joint"),
-    ("tree", "a spring between points", "3 bodies"),
-    ("tree", "a branch", "gravity"),
-    ("tree", "an applied force", "products of inertia"),
-    ("tree", "a planar joint", "a hinge joint"),
-    ("tree", "3 bodies", "a weld joint"),
-    ("tree", "a free joint", "drag"),
-    ("tree", "5 bodies", "a branch"),
-    ("loop", "a closing joint"),
-    ("loop", "a closing joint", "motion"),
-    ("loop", "a hinge joint", "a closing joint"),
-    ("loop", "a cylindrical joint", "an applied force"),
-    ("loop", "a spring between points", "a closing joint"),
-]
+PLANTED = [tuple(case) for case in table(__file__)]
 
 
 def mechanism(family, conditions):

@@ -17,6 +17,7 @@ from plumbline.model.kinematics import angular_velocity
 from plumbline.processes.line_process import LineProcess
 from plumbline.processes.worker_pool import Limits, Task, WorkerPool
 from tests.helpers import pendulums
+from tests.helpers.tables import table
 
 ROOT = Path(__file__).resolve().parents[2]
 SERVER = ROOT / "tests" / "helpers" / "lying_server.py"
@@ -62,48 +63,7 @@ def test_an_honest_program_is_an_adapter_like_any_other():
         adapter.evaluate(sprung, STATES)
 
 
-LIES = {  # what the failure says
-    "another protocol": "protocol is the int 2, known is 1",
-    "no protocol": "protocol is None, known is 1",
-    "unknown joint": "no kind of joint is called elbow",
-    "unknown quantity": "no quantity is called colour",
-    "single precision": "precision: input should be 'double'",
-    "unknown field": "colour: ",
-    "rounded": "its reader or writer of JSON rounds",
-    "echo too short": "echo returns other numbers",
-    "order zero": "has order 0",
-    "an integrator twice": "has a name twice: still",
-    "endless name": "must be a line of 1 to 200 characters",
-    "not a number": "instead of an answer: NaN is not a number",
-    "text for a number": "kinetic_energy: input should be a valid number",
-    "numbers in texts": "acceleration is an array of .* must hold numbers",
-    "ragged rows": "acceleration has rows of different lengths",
-    "another shape": r"acceleration has shape \(3,\), expected \(2, 3\)",
-    "a missing quantity": "acceleration is None",
-    "an undeclared quantity": "potential_energy that its hello does not declare",
-    "an unknown quantity": "colour: ",
-    "too few answers": "a value of type list of 1 as answers, must be 2",
-    "no list": "a value of type dict of 1 as answers, must be 2",
-    "no record": "must be quantities by name",
-    "an error": "the factorisation failed",
-    "an undeclared refusal": "not today",
-    "exit": "exited with code 7: cannot allocate, when asked to evaluate",
-    "signal": "died of SIGSEGV, when asked to evaluate",
-    "half a line": "exited with code 0, when asked to evaluate",
-    "words": "wrote 'Loading …' instead of an answer",
-    "late": "which is no answer with the id 4",
-    "no record at all": r"wrote '\[1, 2\]', which is no answer",
-    "deep": "instead of an answer",
-    "not UTF-8": "instead of an answer: 'utf-8' codec",
-    "huge": "wrote a line of more than 67108864 bytes",
-    "infinity": "answers, must be 2|is not finite",
-    "closed output": "closed its output",
-    "other steps": "steps is 3, but 2 steps",
-    "other times": "sampled 2 of 3 times",
-    "other shapes": "have the shapes",
-    "no steps": "steps: field required",
-    "another model": "expected",
-}
+LIES = table(__file__)
 
 
 @pytest.mark.parametrize("lie", LIES)

@@ -31,6 +31,7 @@ from tests.helpers.reproduction import (
     step_evidence,
     stored_row,
 )
+from tests.helpers.tables import table
 
 for name in ("mujoco", "pinocchio", "exudyn", "flint"):
     pytest.importorskip(name)
@@ -110,19 +111,7 @@ def test_what_a_script_cannot_show_is_a_sentence():
 
 
 # every integrator, on trees, loops and mechanisms with springs
-MOTIONS = [
-    ("mujoco", "Euler", "loaded-tree"),
-    ("mujoco", "implicit", "sprung-hinge"),
-    ("mujoco", "implicitfast", "loaded-tree"),
-    ("mujoco", "RK4", "four-bar"),
-    ("pinocchio", "rkmk4", "loaded-tree"),
-    ("pinocchio", "semi-implicit-euler", "four-bar"),
-    ("pinocchio", "rkmk4", "sprung-hinge"),
-    ("exudyn", "trapezoidal", "loaded-tree"),
-    ("exudyn", "generalized-alpha", "four-bar"),
-    ("exudyn-tree", "RK44", "loaded-tree"),
-    ("exudyn-tree", "RK44", "sprung-hinge"),
-]
+MOTIONS = table(__file__)
 
 
 @pytest.mark.parametrize(("engine", "integrator", "scenario"), MOTIONS)

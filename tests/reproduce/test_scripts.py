@@ -34,6 +34,7 @@ from tests.helpers.reproduction import (
     step_evidence,
     step_methods,
 )
+from tests.helpers.tables import table
 
 for name in ("mujoco", "pinocchio", "exudyn", "flint"):
     pytest.importorskip(name)
@@ -200,23 +201,7 @@ def test_literals_are_exact_and_hostile_names_stay_text(tmp_path):
 
 @pytest.mark.parametrize(
     ("engine", "level", "quantity", "integrator", "words"),
-    [
-        ("exudyn", "relations", "reversed in time", "trapezoidal", "relations of runs have no script"),
-        ("exudyn", "relations", "two welded halves", "-", "cannot show 'two welded halves'"),
-        ("pinocchio-maximal", "relations", "by inverse of the KKT matrix", "-", "cannot show 'by inverse"),
-        ("exudyn", "relations", "something new", "-", "cannot show 'something new'"),
-        ("exudyn", "invariants", "energy_drift_long", "trapezoidal", "long runs have no script"),
-        ("reference", "state", "acceleration", "-", "no template"),
-        ("pinocchio", "relations", "as reference", "-", "engine reference has no template"),
-        ("exudyn", "state", "acceleration", "-", ""),
-        ("exudyn", "relations", "rotated world", "-", ""),
-        ("pinocchio", "relations", "by cholesky", "-", ""),
-        ("mujoco", "relations", "two welded halves", "-", ""),
-        ("exudyn", "relations", "as exudyn-tree", "-", ""),
-        ("mujoco", "step", "step_rate", "RK4", ""),
-        ("exudyn", "step", "step_quadrature", "trapezoidal", "steps with constraints have no script"),
-        ("mine", "state", "acceleration", "-", "engine mine is not registered here"),
-    ],
+    table(__file__),
 )
 def test_what_has_no_script_is_explained_in_a_sentence(engine, level, quantity, integrator, words):
     row = {"level": level, "quantity": quantity, "integrator": integrator}

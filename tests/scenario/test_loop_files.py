@@ -12,6 +12,7 @@ from plumbline.model.sampling import random_loop_states
 from plumbline.scenario.line_and_column_errors import ScenarioError
 from plumbline.scenario.loader import find_scenario_file, load_scenario, load_scenario_text
 from plumbline.truth.certified_state import certify_state
+from tests.helpers.tables import table
 
 FOUR_BAR = find_scenario_file("four-bar").read_text(encoding="utf-8")
 PUBLISHED_SQUEEZER = [14222.4439199541138706, -10666.8329399655854029]  # β̈(0), Θ̈(0): IVP test set
@@ -43,19 +44,7 @@ def test_the_rates_that_are_given_stay_and_the_others_follow():
 
 @pytest.mark.parametrize(
     "old, new, message",
-    [
-        (
-            "proximal: [0.2, 0, 0]",
-            "proximal: [0.21, 0, 0]",
-            "does not close: points or axes are apart by 0.0",
-        ),
-        ("axis: [0, 1, 0]}\n", "axis: [0, 1, 0.01]}\n", "does not close"),
-        ("body: rocker", "body: rockr", "is 'rockr', no body's name. did you mean"),
-        ("body: rocker\n    parent: coupler", "body: rocker\n    parent: rocker", "like the parent"),
-        ("anchor: [0.25, 0, 0.02]", "anchor: [0.25, 0, -0.02]", "does not close"),
-        ("axis: [0, 1, 0]}\n", "axis: [0, 1, 0], coordinates: [1]}\n", "gives coordinates, which follow"),
-        ("parent: world\n    anchor: [0.45", "parent: rocker\n    anchor: [0.45", "not above this body"),
-    ],
+    table(__file__),
 )
 def test_a_loop_that_cannot_be_is_refused_with_its_place(old, new, message):
     if old.startswith("axis"):  # the closing joint's is the last
