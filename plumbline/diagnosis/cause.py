@@ -81,15 +81,19 @@ class Cause:
         return self.kind, self.general or self.term, self.change
 
     def with_amount(self, amount: np.ndarray, uncertainty: float) -> Cause:
-        """State a fitted amount: as a factor in words where it is one, else with the digits that it has."""
+        """State a fitted amount: as a factor in words where it is one, else with the digits that it has.
+
+        Of what has a change in words it stands there in place of braces.
+        """
         given = tuple(float(x) for x in amount)
-        if len(given) == 1 and (self.unit == "×" or self.nominal[0]):
+        if not self.change and len(given) == 1 and (self.unit == "×" or self.nominal[0]):
             size = abs(self.nominal[0])
             for factor, change in FACTORS.items():
                 if abs(given[0] - factor * self.nominal[0]) <= max(uncertainty, 1e-9 * size):
                     return replace(self, change=change, amount=(factor * self.nominal[0],))
         digits = [significant(x, near, uncertainty) for x, near in zip(given, self.nominal, strict=True)]
-        return replace(self, amount=tuple(digits), uncertainty=uncertainty)
+        change = self.change.format(*(f"{x:.15g}" for x in digits))
+        return replace(self, change=change, amount=tuple(digits), uncertainty=uncertainty)
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,22 @@ from dataclasses import replace
 import numpy as np
 
 from plumbline.diagnosis.cause import Cause, Diagnosis, quantity_words
-from plumbline.diagnosis.digit_loss import Evaluate, Problem, find_digit_loss, measure_scatter, scatter_cause
+from plumbline.diagnosis.digit_loss import (
+    Evaluate,
+    find_digit_loss,
+    measure_scatter,
+    scatter_cause,
+    worst_difference,
+)
 from plumbline.diagnosis.edits import Edit
-from plumbline.diagnosis.fit import ACCEPTED_RATIO, Difference, Explanation, Mask, Search
+from plumbline.diagnosis.fit import (
+    ACCEPTED_RATIO,
+    MIN_DIAGNOSABLE_RATIO,
+    Difference,
+    Explanation,
+    Mask,
+    Search,
+)
 from plumbline.diagnosis.needs import find_needs
 from plumbline.diagnosis.outputs import Outputs
 from plumbline.diagnosis.prediction import (
@@ -39,7 +52,6 @@ from plumbline.model.datatypes import Array, Model, State, StateQuantities
 from plumbline.model.kinematics import complete_state, stack_states
 from plumbline.truth.ground_truth import StateTruth
 
-MIN_DIAGNOSABLE_RATIO = 8.0  # in bounds: of hundreds of fitted causes, some explain less by chance
 MAX_LOCATED = 4  # states at which the difference is looked for with one thing taken away
 BODIES_KEPT = View(are_bodies_kept=True)
 # an engine's forces that close an open loop act on both ends, its own wrenches count them at one
@@ -59,9 +71,9 @@ def explain_disagreement(
     evaluate = load_adapter(engine).evaluate
     if not is_known:
         return diagnose(model, engine_quantities, truth, evaluate)
-    problem = Problem.worst(model, engine_quantities, truth)
+    problem = worst_difference(model, engine_quantities, truth)
     scatter = measure_scatter(problem, evaluate)
-    causes = () if scatter is None else (scatter_cause(list(problem.right), scatter),)
+    causes = () if scatter is None else (scatter_cause(problem.names, scatter),)
     return Diagnosis(causes, scatter=scatter)
 
 
@@ -179,7 +191,7 @@ class _Diagnosing:
     def _digit_loss(self, quantities: Sequence[str]) -> Cause | None:
         if not self.evaluate or self.model.has_loops:
             return None
-        problem = Problem.worst(self.model, self.reported, self.truth, quantities)
+        problem = worst_difference(self.model, self.reported, self.truth, quantities)
         loss = find_digit_loss(problem, self.evaluate)
         return None if loss is None else loss.cause(quantities)
 
@@ -337,7 +349,7 @@ class _Diagnosing:
         if candidate.change is None:
             return None, right
         case = candidate.change(difference.predictor.case, found.amounts)
-        model, state = case
+        model, state = case.model, case.state
         if any(
             np.ndim(x) > np.ndim(getattr(self.model, name))
             for name, x in vars(model).items()

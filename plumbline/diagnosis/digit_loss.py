@@ -14,7 +14,17 @@ from typing import ParamSpec, TypeVar
 import numpy as np
 
 from plumbline.diagnosis.cause import Cause, CauseKind, quantity_words
-from plumbline.diagnosis.prediction import QUANTITIES, Answers, Predictor, View, error_ratio, error_ratios
+from plumbline.diagnosis.fit import Difference
+from plumbline.diagnosis.prediction import (
+    QUANTITIES,
+    Answers,
+    Predictor,
+    View,
+    error_ratio,
+    error_ratios,
+    tolerances,
+    values_of,
+)
 from plumbline.model.datatypes import Array, EngineFailure, Model, State, StateQuantities, StepRun
 from plumbline.model.equivalent import (
     BODY_VECTORS,
@@ -27,7 +37,7 @@ from plumbline.model.equivalent import (
 from plumbline.model.step_methods import JointSpaceMethod
 from plumbline.processes.exceptions import PlumblineError, describe_exception
 from plumbline.truth.ground_truth import StateTruth
-from plumbline.truth.rounding_bound import RoundingBound, state_rounding_bound
+from plumbline.truth.rounding_bound import rounding_bounds
 from plumbline.truth.step_comparison import RESIDUAL_STEPS, FormulaSteps
 
 COPIES = 8
@@ -86,51 +96,19 @@ class DigitLoss:
         return replace(found, change=found.change + text)
 
 
-@dataclass(frozen=True, eq=False)
-class Problem:
-    """The state at which an engine's error is largest, the truth and its bounds, for some quantities."""
-
-    model: Model
-    state: State
-    error: Answers
-    right: Answers
-    bound: RoundingBound
-
-    @classmethod
-    def worst(
-        cls,
-        model: Model,
-        reported: Sequence[StateQuantities],
-        truth: StateTruth,
-        quantities: Sequence[str] = QUANTITIES,
-    ) -> Problem:
-        """Choose the state and the quantities that the engine offers."""
-        ratios = np.max([error_ratios(reported, truth, q) for q in quantities], axis=0)
-        at = int(np.argmax(np.nan_to_num(ratios, posinf=0.0)))
-        answer, true = reported[at], truth.quantities[at]
-        names = [q for q in quantities if all(getattr(x, q) is not None for x in (answer, true))]
-        right = {q: np.asarray(getattr(true, q), float) for q in names}
-        error = {q: np.asarray(getattr(answer, q), float) - right[q] for q in names}
-        return cls(model, truth.states[at], error, right, truth.bounds[at])
-
-    def ratio(self) -> float:
-        """The largest error in bounds."""
-        return max(_ratio(error, q, self.bound) for q, error in self.error.items())
-
-    def weighted(self, errors: Answers) -> Array:
-        """All entries in bounds."""
-        found = []
-        for q, error in errors.items():
-            bound = np.maximum(self.bound.tolerance(q), np.finfo(float).tiny)
-            found.append((error / (bound[..., None] if np.ndim(error) else bound)).ravel())
-        return np.concatenate(found)
+def worst_difference(
+    model: Model,
+    reported: Sequence[StateQuantities],
+    truth: StateTruth,
+    quantities: Sequence[str] = QUANTITIES,
+) -> Difference:
+    """Return the difference at the state where it is largest, of the quantities that the engine offers."""
+    ratios = np.max([error_ratios(reported, truth, q) for q in quantities], axis=0)
+    at = int(np.argmax(np.nan_to_num(ratios, posinf=0.0)))
+    return Difference(model, reported, truth, View(tuple(quantities)), [at])
 
 
-def _ratio(error: Array, quantity: str, bound: RoundingBound) -> float:
-    return error_ratio(error[None], np.asarray(bound.tolerance(quantity))[None])
-
-
-def find_digit_loss(problem: Problem, evaluate: Evaluate) -> DigitLoss | None:
+def find_digit_loss(problem: Difference, evaluate: Evaluate) -> DigitLoss | None:
     """Test whether the error at the worst state scatters when all axes are turned by a tiny angle.
 
     Returns:
@@ -143,23 +121,22 @@ def find_digit_loss(problem: Problem, evaluate: Evaluate) -> DigitLoss | None:
     return DigitLoss(scatter, _ratios(problem, evaluate))
 
 
-def measure_scatter(problem: Problem, evaluate: Evaluate) -> float | None:
+def measure_scatter(problem: Difference, evaluate: Evaluate) -> float | None:
     """Measure how the error at the worst state scatters when all axes are turned by a tiny angle.
 
     Returns:
         The median distance of the errors from their mean, over their size; None where the engine fails.
 
     """
+    model, (state,) = problem.model, problem.predictor.states
 
     def error(turns: Turns | None) -> Array:
         if turns is None:
-            ask(evaluate, problem.model, [problem.state])  # what an engine keeps is then of this problem
-            return problem.weighted(problem.error)
-        turned, state = _turned(problem.model, problem.state, turns)
-        (answer,) = ask(evaluate, turned, [state])
-        values = {name: np.asarray(getattr(answer, name), float)[None] for name in problem.right}
-        values = unrotate(unrotate(values, WORLD_VECTORS, turns[0]), BODY_VECTORS, turns[1])
-        return problem.weighted({name: x[0] - problem.right[name] for name, x in values.items()})
+            ask(evaluate, model, [state])  # what an engine keeps is then of this problem
+            return problem.values
+        turned, at = _turned(model, state, turns)
+        values = _values(ask(evaluate, turned, [at]), problem.names)
+        return problem.off(unrotate(unrotate(values, WORLD_VECTORS, turns[0]), BODY_VECTORS, turns[1]))
 
     return _scatter(error)
 
@@ -218,18 +195,19 @@ def _tiny_rotation(rng: np.random.Generator) -> Array:
     return np.array([np.cos(TURN / 2), *(np.sin(TURN / 2) * axis / np.linalg.norm(axis))])
 
 
-def _ratios(problem: Problem, evaluate: Evaluate) -> dict[int, float]:
+def _values(answers: Sequence[StateQuantities], names: Sequence[str]) -> Answers:
+    return {q: values_of(answers, q) for q in names}
+
+
+def _ratios(problem: Difference, evaluate: Evaluate) -> dict[int, float]:
     """Worst error, in rounding bounds, of the whole mechanism and of its first half and quarter."""
-    model = problem.model
-    ratios = {model.n: problem.ratio()}
-    for n in sorted({-(-model.n // 2), -(-model.n // 4)} - {model.n}, reverse=True):
-        short, at = bodies_between(model, problem.state, 0, n)
+    model, (state,), ratios = problem.model, problem.predictor.states, dict[int, float]()
+    for n in sorted({model.n, -(-model.n // 2), -(-model.n // 4)}, reverse=True):
+        short, at = bodies_between(model, state, 0, n)
         try:
-            right, (answer,) = Predictor(short, [at], View()).right, ask(evaluate, short, [at])
-            bound = state_rounding_bound(short, at)
+            right = Predictor(short, [at], View()).right
+            answers, bounds = _values(ask(evaluate, short, [at]), problem.names), rounding_bounds(short, [at])
         except REFUSALS:  # of a part of the mechanism
             continue
-        ratios[n] = max(
-            _ratio(np.asarray(getattr(answer, q), float) - right[q][0], q, bound) for q in problem.right
-        )
+        ratios[n] = max(error_ratio(x - right[q], tolerances(bounds, q)) for q, x in answers.items())
     return ratios

@@ -5,8 +5,9 @@ An edit replaces one number or three, or multiplies fields by a factor: of one p
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from plumbline.diagnosis.prediction import TRAILING, Case
 from plumbline.model.datatypes import JOINT_ELEMENTS, SPRING_FIELDS, Array, Model
 from plumbline.model.kinematics import quaternion_exponential, quaternion_product, rotation_matrix
 
+AXES: tuple[tuple[Any, str], ...] = ((0, " x"), (1, " y"), (2, " z"), (slice(None), ""))  # and all three
 ASKEW = 1e-6  # of a direction: it lies along an axis but for rounding
 NumberChange = Callable[[Case, Array], Case]
 LENGTHS = (" m", " rad")  # units of a mechanism's geometry, by which loops may open
@@ -54,7 +56,7 @@ def with_fields(case: Case, **fields: Any) -> Case:
     """Replace fields of the model or of the state."""
     of_state = {name: fields.pop(name) for name in list(fields) if hasattr(case.state, name)}
     model = replace(case.model, **fields) if fields else case.model
-    return Case(model, replace(case.state, **of_state) if of_state else case.state)
+    return replace(case, model=model, state=replace(case.state, **of_state) if of_state else case.state)
 
 
 def field(case: Case, name: str) -> Array:
@@ -75,16 +77,12 @@ def at_place(name: str, at: tuple[Any, ...]) -> NumberChange:
     return change
 
 
-def scaled(names: Sequence[str], where: Array, part: Any = 1.0) -> NumberChange:
-    """Multiply fields by a factor: at places of a mask, and there only parts of them."""
+def scaled(masks: Mapping[str, Any]) -> NumberChange:
+    """Multiply fields by a factor where masks that broadcast against them are 1."""
 
     def change(case: Case, x: Array) -> Case:
-        changes = {}
-        for name in names:
-            values = field(case, name)
-            mask = np.reshape(np.asarray(where, float), (-1, *(1,) * TRAILING[name]))
-            changes[name] = values * (1 + (x[0] - 1) * mask * part)
-        return with_fields(case, **changes)
+        fields = {name: field(case, name) * (1 + (x[0] - 1) * mask) for name, mask in masks.items()}
+        return with_fields(case, **fields)
 
     return change
 
@@ -94,23 +92,14 @@ def added(name: str, where: Array) -> NumberChange:
     return lambda case, x: with_fields(case, **{name: field(case, name) + x[0] * where})
 
 
-def turned(k: int, side: int, axes: Array) -> NumberChange:
-    """Turn the axes of a joint in one body by a rotation vector in themselves, of components along axes."""
+def turned(name: str, at: tuple[int, ...], axes: Array) -> NumberChange:
+    """Turn quaternions by a rotation vector in themselves, of components along axes."""
 
     def change(case: Case, x: Array) -> Case:
-        values = case.model.turn.copy()
-        by = quaternion_exponential(np.asarray(x) @ axes / 2)
-        values[..., k, side, :] = quaternion_product(values[..., k, side, :], by)
-        return with_fields(case, turn=values)
-
-    return change
-
-
-def _turned_attitude(k: int, axis: int) -> NumberChange:
-    def change(case: Case, x: Array) -> Case:
-        values = case.state.p.copy()
-        values[:, k] = quaternion_product(values[:, k], quaternion_exponential(x[0] * np.eye(3)[axis] / 2))
-        return with_fields(case, p=values)
+        values, by = field(case, name).copy(), quaternion_exponential(np.asarray(x) @ axes / 2)
+        where: tuple[Any, ...] = (..., *at, slice(None))
+        values[where] = quaternion_product(values[where], by)
+        return with_fields(case, **{name: values})
 
     return change
 
@@ -159,7 +148,7 @@ def _gyroscopic(where: Array) -> NumberChange:
 
 
 def number_edits(case: Case) -> Iterator[Edit]:
-    """List the edits of one number."""
+    """List the edits of one number, and of vectors: points, turns of axes, loads and gravity."""
     yield from _gravity(case.model)
     yield from _bodies(case.model)
     yield from _joints(case.model)
@@ -167,37 +156,35 @@ def number_edits(case: Case) -> Iterator[Edit]:
     yield from _absent(case.model)
 
 
+def _edit(
+    term: str, place: str, change: NumberChange, nominal: Any, scale: float = 1.0, unit: str = "",
+    general: str = "", can_vanish: bool = True, kind: CauseKind = "number",
+) -> Edit:  # fmt: skip
+    numbers = tuple(float(x) for x in np.ravel(nominal))
+    return Edit(
+        Cause(kind, term, place, nominal=numbers, unit=unit, general=general), change, scale, can_vanish
+    )
+
+
 def _number(
-    term: str, place: str, name: str, at: tuple[Any, ...], value: float, scale: float, unit: str = "",
-    can_vanish: bool = True, general: str = "",
+    term: str, place: str, name: str, at: tuple[Any, ...], value: Any, scale: float, unit: str = "",
+    general: str = "", can_vanish: bool = True,
 ) -> Edit:  # fmt: skip
     general = general or WORDS.get(name, name)
-    cause = Cause("number", term, place, nominal=(value,), unit=unit, general=general)
-    return Edit(cause, at_place(name, at), scale, can_vanish)
+    return _edit(term, place, at_place(name, at), value, scale, unit, general, can_vanish)
 
 
-def _shift(
-    term: str, place: str, change: NumberChange, scale: float, unit: str = "", general: str = ""
-) -> Edit:  # fmt: skip
-    """What is 0 where it is right."""
-    return Edit(Cause("number", term, place, nominal=(0.0,), unit=unit, general=general), change, scale)
-
-
-def _factor(
-    term: str, place: str, change: NumberChange, can_vanish: bool = True, general: str = "",
-    kind: CauseKind = "number",
-) -> Edit:  # fmt: skip
-    cause = Cause(kind, term, place, nominal=(1.0,), unit="×", general=general)
-    return Edit(cause, change, 1.0, can_vanish)
+def _factor(term: str, place: str, change: NumberChange, **more: Any) -> Edit:
+    return _edit(term, place, change, 1.0, unit="×", **more)
 
 
 def _gravity(model: Model) -> Iterator[Edit]:
     size = float(np.linalg.norm(model.gravity)) or 1.0
     if np.count_nonzero(model.gravity) > 1:  # else it is a component
-        yield _factor("size of gravity", "", _all(("gravity",)), general="gravity")
-    for i, axis in enumerate("xyz"):
-        value = float(model.gravity[i])
-        yield _number(f"{axis} component of gravity", "", "gravity", (i,), value, size, UNITS["gravity"])
+        yield _factor("size of gravity", "", scaled({"gravity": 1.0}), general="gravity")
+    for i, axis in AXES:
+        term = f"{axis.strip()} component of gravity" if axis else "vector of gravity"
+        yield _number(term, "", "gravity", (i,), model.gravity[i], size, UNITS["gravity"])
 
 
 def _bodies(model: Model) -> Iterator[Edit]:
@@ -208,18 +195,18 @@ def _bodies(model: Model) -> Iterator[Edit]:
         yield _number("mass", place, "mass", (k,), mass, mass, UNITS["mass"], can_vanish=False)
         trace = float(np.trace(model.inertia[k])) or mass * length**2  # a point mass may be given one
         for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)):
-            term, value = f"inertia {'xyz'[i]}{'xyz'[j]}", float(model.inertia[k, i, j])
-            yield _number(term, place, "inertia", (k, i, j), value, trace, UNITS["inertia"], i != j)
-        for i, axis in enumerate("xyz"):
+            term, at, unit = f"inertia {'xyz'[i]}{'xyz'[j]}", (k, i, j), UNITS["inertia"]
+            yield _number(term, place, "inertia", at, model.inertia[at], trace, unit, can_vanish=i != j)
+        for a, axis in AXES:
             for name, weight in (("force", mass * size), ("moment", mass * size * length)):
-                value = float(getattr(model, name)[k, i])
-                yield _number(f"{WORDS[name]} {axis}", place, name, (k, i), value, weight, UNITS[name])
-            if not model.kinds[k].holds_nothing:
+                value = getattr(model, name)[k, a]
+                yield _number(f"{WORDS[name]}{axis}", place, name, (k, a), value, weight, UNITS[name])
+            if axis and not model.kinds[k].holds_nothing:
                 term = "centre of mass"
-                yield _shift(f"{term} {axis}", place, _shifted_centre(k, i), length, " m", term)
-            if model.kinds[k].has_attitude:
-                change = _turned_attitude(k, i)
-                yield _shift(f"attitude about {axis}", place, change, 1.0, " rad", "attitude")
+                yield _edit(f"{term}{axis}", place, _shifted_centre(k, a), 0.0, length, " m", term)
+            if axis and model.kinds[k].has_attitude:
+                change = turned("p", (k,), np.eye(3)[[a]])
+                yield _edit(f"attitude about{axis}", place, change, 0.0, 1.0, " rad", "attitude")
         for name, weight in (("drag_force", mass), ("drag_moment", trace)):
             if not getattr(model, name)[k]:
                 yield _number(WORDS[name], place, name, (k,), 0.0, weight, UNITS[name])
@@ -255,18 +242,16 @@ def _joints(model: Model) -> Iterator[Edit]:
         if own := kind.own_number:
             value, unit = float(model.length[k]), " m" if kind.holds_distance else " m/rad"
             size, can_vanish = abs(value) or 0.1, not kind.holds_distance
-            yield _number(own, place, "length", (k,), value, size, unit, can_vanish, general=own)
+            yield _number(own, place, "length", (k,), value, size, unit, own, can_vanish)
         if kind.motions and kind.motions[0][0] == "slide" and _shift_is_askew(model, k):
-            yield _shift("origin of the slide", place, _shifted_slide(k), 0.1, " m")
-        for side, where in enumerate(("far", "near")):
-            for axis in range(3):
-                value = float(model.point[k, side, axis])
-                term, at = f"{where} point", (k, side, axis)
-                yield _number(f"{term} {'xyz'[axis]}", place, "point", at, value, 0.1, " m", general=term)
-                if not kind.has_attitude and (side == 0 or not kind.is_rigid):  # equal to a far turn
-                    term, side_place = f"turn about {'xyz'[axis]} of the axes", f"{place} in the {where} body"
-                    change = turned(k, side, np.eye(3)[[axis]])
-                    yield _shift(term, side_place, change, 0.1, " rad", "turn of the axes")
+            yield _edit("origin of the slide", place, _shifted_slide(k), 0.0, 0.1, " m")
+        for (side, where), (a, axis) in product(enumerate(("far", "near")), AXES):
+            term, at = f"{where} point", (k, side, a)
+            yield _number(f"{term}{axis}", place, "point", at, model.point[at], 0.1, " m", term)
+            if not kind.has_attitude and (side == 0 or not kind.is_rigid):  # equal to a far turn
+                axes, term = np.atleast_2d(np.eye(3)[a]), f"turn{axis and ' about' + axis} of the axes"
+                change, side_place = turned("turn", (k, side), axes), f"{place} in the {where} body"
+                yield _edit(term, side_place, change, np.zeros(len(axes)), 0.1, " rad", "turn of the axes")
 
 
 def _shift_is_askew(model: Model, k: int) -> bool:
@@ -319,40 +304,38 @@ def _factors(case: Case) -> Iterator[Edit]:
         counts = [_entries(case, name, one.part) for name in one.names]
         has = np.all([count > 0 for count in counts], axis=0)
         has = has & of_attitude if one.names == ("omega",) else has
-        places = np.flatnonzero(has).tolist()
+        number, places = np.arange(len(has)), np.flatnonzero(has).tolist()
         # of a vector or products with one entry it is a number's
         is_several = np.sum(counts, axis=0) > (2 if np.ndim(one.part) == 2 else 1)
         is_number = one.things == "bodies" and TRAILING[one.names[0]] and one.names[0] != "omega"
-        for k in places if one.is_of_each else []:
-            if is_several[k] or not is_number:
-                change = scaled(one.names, np.arange(len(has)) == k, one.part)
-                place = f"{SINGULAR[one.things]} {k + 1}"
-                yield _factor(one.term, place, change, one.can_vanish, one.general)
+        chosen = [
+            (f"{SINGULAR[one.things]} {k + 1}", number == k)
+            for k in (places if one.is_of_each else [])
+            if is_several[k] or not is_number
+        ]
         for first in places[: len(places) - 1 if one.is_from_one_on else min(len(places) - 1, 1)]:
-            where = has & (np.arange(len(has)) >= first)
             which = f"all {one.things}" if first == places[0] else f"{one.things} {first + 1} to {len(has)}"
-            change = scaled(one.names, where, one.part)
-            yield _factor(one.term, which, change, one.can_vanish, one.general)
-    for name in JOINT_ELEMENTS:
-        values = getattr(model, name)
-        for what in ("slide", "turn"):
-            chosen = [at for at in coordinates(model) if values[at] and _what(model, at) == what]
-            if 1 < len(chosen) < np.count_nonzero(values):
-                mask = np.zeros(values.shape)
-                mask[tuple(np.transpose(chosen))] = 1.0
-                change = scaled((name,), np.ones(len(mask)), mask)
-                yield _factor(WORDS.get(name, name), f"all {what}s", change)
+            chosen.append((which, has & (number >= first)))
+        for place, where in chosen:
+            masks = {name: where.reshape(-1, *(1,) * TRAILING[name]) * one.part for name in one.names}
+            more = {"can_vanish": one.can_vanish, "general": one.general}
+            yield _factor(one.term, place, scaled(masks), **more)
+    for name, what in product(JOINT_ELEMENTS, ("slide", "turn")):
+        values, mask = getattr(model, name), np.zeros(getattr(model, name).shape)
+        for k, i in coordinates(model):
+            mask[k, i] = values[k, i] != 0 and [*model.kinds[k].motions, ("turn", 0)][i][0] == what
+        if 1 < np.sum(mask) < np.count_nonzero(values):
+            yield _factor(WORDS.get(name, name), f"all {what}s", scaled({name: mask}))
     rates = [name for name in ("omega", "udot", "xdot") if np.any(_entries(case, name, 1.0))]
     if len(rates) > 1:
-        yield _factor("rates of every kind", "", scaled(rates, np.ones(model.n)))
+        yield _factor("rates of every kind", "", scaled(dict.fromkeys(rates, 1.0)))
     sized = ("point", "length", *(("spring_point", "spring_length") if len(model.spring_body) else ()))
     if not any(kind.slide_axes for kind in model.kinds):
-        yield _factor("lengths", "the mechanism", _all(sized), can_vanish=False)
+        yield _factor("lengths", "the mechanism", scaled(dict.fromkeys(sized, 1.0)), can_vanish=False)
     spins = np.any(gyroscopic_moment(case), axis=(0, 2))
-    for k in np.flatnonzero(spins).tolist():
-        yield _factor("gyroscopic term", f"body {k + 1}", _gyroscopic(np.arange(model.n) == k), kind="term")
-    if np.sum(spins) > 1:
-        yield _factor("gyroscopic term", "all bodies", _gyroscopic(spins), kind="term")
+    spinning = [(f"body {k + 1}", np.arange(model.n) == k) for k in np.flatnonzero(spins).tolist()]
+    for place, where in spinning + [("all bodies", spins)] * (len(spinning) > 1):
+        yield _factor("gyroscopic term", place, _gyroscopic(where), kind="term")
 
 
 def _entries(case: Case, name: str, part: Any) -> Array:
@@ -363,51 +346,15 @@ def _entries(case: Case, name: str, part: Any) -> Array:
     return np.asarray(np.count_nonzero(values * part, axis=tuple(range(1, values.ndim))))
 
 
-def _all(names: Sequence[str]) -> NumberChange:
-    return lambda case, x: with_fields(case, **{name: x[0] * field(case, name) for name in names})
-
-
-def _what(model: Model, at: tuple[int, int]) -> str:
-    """Whether a coordinate is a slide or a turn."""
-    motions = model.kinds[at[0]].motions
-    return motions[at[1]][0] if motions else "turn"
-
-
 def _absent(model: Model) -> Iterator[Edit]:
     """One amount in all places of what the mechanism has nowhere."""
     sizes = {"drag_force": float(np.max(model.mass)), "drag_moment": float(np.max(model.inertia))}
     for name, scale in sizes.items():
         if model.n > 1 and not np.any(getattr(model, name)):
-            yield _shift(WORDS[name], "all bodies", added(name, np.ones(model.n)), scale, UNITS[name])
+            yield _edit(WORDS[name], "all bodies", added(name, np.ones(model.n)), 0.0, scale, UNITS[name])
     where = np.zeros(model.armature.shape)
     for at in coordinates(model):
         where[at] = 1.0
     for name in ("armature", "damping"):
         if np.sum(where) > 1 and not np.any(getattr(model, name)):
-            yield _shift(name, "all joints", added(name, where), float(np.max(model.inertia)))
-
-
-def vector_edits(model: Model) -> Iterator[Edit]:
-    """List the edits of three numbers: points and turns of axes of joints, loads of bodies, gravity."""
-
-    def vector(term: str, place: str, name: str, at: tuple[Any, ...], scale: float) -> Edit:
-        x = tuple(float(value) for value in getattr(model, name)[at])
-        general = term if name == "point" else WORDS.get(name, name)
-        cause = Cause("number", term, place, nominal=x, unit=UNITS[name], general=general)
-        return Edit(cause, at_place(name, at), scale)
-
-    for k, kind in enumerate(model.kinds):
-        if kind.holds_nothing:
-            continue
-        for side, where in enumerate(("far", "near")):
-            if not kind.has_attitude and (side == 0 or not kind.is_rigid):
-                zeros = (0.0, 0.0, 0.0)
-                place = f"joint {k + 1} in the {where} body"
-                cause = Cause("number", "turn of the axes", place, nominal=zeros, unit=" rad")
-                yield Edit(cause, turned(k, side, np.eye(3)), 0.1)
-            yield vector(f"{where} point", f"joint {k + 1}", "point", (k, side, slice(None)), 0.1)
-    size = float(np.linalg.norm(model.gravity)) or 1.0
-    for k in range(model.n):
-        for name in ("force", "moment"):
-            yield vector(WORDS[name], f"body {k + 1}", name, (k, slice(None)), float(model.mass[k]) * size)
-    yield vector("vector of gravity", "", "gravity", (slice(None),), size)
+            yield _edit(name, "all joints", added(name, where), 0.0, float(np.max(model.inertia)))

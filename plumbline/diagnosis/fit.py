@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import product
 from typing import Any
 
@@ -16,13 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plumbline.diagnosis.cause import FACTORS, Cause
-from plumbline.diagnosis.edits import LENGTHS, Edit, number_edits, vector_edits
+from plumbline.diagnosis.edits import LENGTHS, Edit, number_edits
 from plumbline.diagnosis.prediction import (
     VECTORS,
     Answers,
     Case,
     Predictor,
     View,
+    per_entry,
     tolerances,
     values_of,
 )
@@ -31,6 +33,7 @@ from plumbline.diagnosis.terms import Terms
 from plumbline.model.datatypes import Array, Model, State, StateQuantities
 from plumbline.truth.ground_truth import StateTruth
 
+MIN_DIAGNOSABLE_RATIO = 8.0  # in bounds: of hundreds of fitted causes, some explain less by chance
 ACCEPTED_RATIO = 4.0  # in bounds
 ACCEPTED_PART = 0.25  # of the difference, where it is small
 ACCEPTED_SHARE = 1e-6  # of the difference; evaluating in doubles leaves 1e-10 of it and less
@@ -54,6 +57,7 @@ Mask = NDArray[np.bool_]
 
 
 Combination = tuple[Edit, ...]
+Lane = tuple[Combination, Array]  # edits with their amounts
 
 
 class Difference:
@@ -70,18 +74,16 @@ class Difference:
         """Compare at the states of some places."""
         given, true = ([x[i] for i in places] for x in (reported, truth.quantities))
         self.names = [q for q in view.quantities if all(getattr(x, q) is not None for x in (*given, *true))]
-        off = [values_of(given, q) - values_of(true, q) for q in self.names]
-        weights = [tolerances([truth.bounds[i] for i in places], q, given) for q in self.names]
-        weights = [x[..., None] if wrong.ndim > x.ndim else x for x, wrong in zip(weights, off, strict=True)]
-        flat = [np.broadcast_to(x, wrong.shape).ravel() for x, wrong in zip(weights, off, strict=True)]
-        self.quantity = np.repeat(self.names, [x.size for x in flat])
-        self.state = np.concatenate([np.repeat(range(len(places)), x.size // len(places)) for x in flat])
-        bounds = np.concatenate(flat)
-        self.weight = np.where(bounds > 0, bounds, np.inf)  # 0 explains nothing
-        self.values = np.concatenate([x.ravel() for x in off]) / self.weight
+        self.true = {q: values_of(true, q) for q in self.names}
+        self.quantity = np.repeat(self.names, [x.size for x in self.true.values()])
+        states = [np.repeat(range(len(places)), x.size // len(places)) for x in self.true.values()]
+        self.state = np.concatenate(states)
+        bounds = {q: tolerances([truth.bounds[i] for i in places], q, given) for q in self.names}
+        each = {q: np.broadcast_to(per_entry(bounds[q], x), x.shape) for q, x in self.true.items()}
+        self.weight = self._flat(each)
+        self.values = self.off({q: values_of(given, q) for q in self.names})
         self.view, self.model = view, model
         self.predictor = Predictor(model, [truth.states[i] for i in places], view)
-        self._right = self._flat(self.predictor.right)
 
     @property
     def everything(self) -> Mask:
@@ -97,10 +99,18 @@ class Difference:
         size = float(np.max(np.abs(self.values[mask]), initial=0.0))
         return max(min(ACCEPTED_RATIO, ACCEPTED_PART * size), ACCEPTED_SHARE * size)
 
-    def _flat(self, answers: Answers) -> Array:
-        """(…, m) of quantities (…, S, …)."""
-        lead = answers["kinetic_energy"].shape[:-1]
-        return np.concatenate([answers[q].reshape(*lead, -1) for q in self.names], axis=-1)
+    def off(self, answers: Answers) -> Array:
+        """Return how quantities (S, …) differ from the truth, (m,) in bounds."""
+        return np.asarray((self._flat(answers) - self._flat(self.true)) / self.weight)
+
+    def _flat(self, answers: Answers, lead: int = 0) -> Array:
+        """(…, m) of quantities (…, S, …), of so many axes before that of the states."""
+        each = [answers[q].reshape(*answers[q].shape[:lead], -1) for q in self.names]
+        return np.concatenate(each, axis=-1)
+
+    @cached_property
+    def _right(self) -> Array:
+        return self._flat(self.predictor.right)
 
     def flat_vectors(self, answers: Answers) -> Array:
         """Return changes of vectors (S, …) as an effect (m,); the sums do not change."""
@@ -111,7 +121,7 @@ class Difference:
         """Return what engines that evaluate other cases return besides the truth, (cases, m)."""
         if not cases:
             return np.zeros((0, len(self.values)))
-        return np.asarray((self._flat(self.predictor.predict(cases)) - self._right) / self.weight)
+        return np.asarray((self._flat(self.predictor.predict(cases), 1) - self._right) / self.weight)
 
     def effect_elsewhere(self, pose: Callable[[State], State], s: int) -> Array:
         """Return the effect (m,) of another pose of loops at one state; not numbers where there is none."""
@@ -125,22 +135,18 @@ class Difference:
             found[name][s] = x[0]
         return np.asarray((self._flat(found) - self._right) / self.weight)
 
-    def evaluate(self, lanes: Sequence[tuple[Combination, Array]]) -> Array:
+    def evaluate(self, lanes: Sequence[Lane]) -> Array:
         """Return the effects of combinations of candidates with their amounts, (lanes, m)."""
-        cases, linear = list[Case](), np.zeros((len(lanes), len(self.values)))
-        for i, (combination, x) in enumerate(lanes):
-            case = self.predictor.case
-            for one, own in _split(combination, x):
+        linear = np.zeros((len(lanes), len(self.values)))
+        with np.errstate(all="ignore"):
+            cases = [changed(self.predictor.case, *lane) for lane in lanes]
+        for i, lane in enumerate(lanes):
+            for one, own in _split(*lane):
                 if one.effect is not None:
                     linear[i] += one.effect * (own[0] - one.nominal[0] if len(own) else 1.0)
-                else:
-                    assert one.change is not None
-                    with np.errstate(all="ignore"):
-                        case = one.change(case, own)
-            cases.append(case)
-        changed = [i for i, case in enumerate(cases) if case is not self.predictor.case]
-        if changed:
-            linear[changed] += self.effects([cases[i] for i in changed])
+        others = [i for i, case in enumerate(cases) if case is not self.predictor.case]
+        if others:
+            linear[others] += self.effects([cases[i] for i in others])
         return linear
 
 
@@ -163,12 +169,9 @@ class Explanation:
 
     def mechanism(self, right: Case) -> object:
         """Return a key that is equal for explanations by the same mechanism; linear terms describe none."""
-        case = right
-        for one, x in _split(self.combination, self.amounts):
-            if one.change is None:
-                return id(self)
-            case = one.change(case, x)
-        return change_key(case, right)
+        if any(one.change is None for one in self.combination):
+            return id(self)
+        return change_key(changed(right, self.combination, self.amounts), right)
 
 
 def _split(combination: Combination, *arrays: Array) -> Iterator[tuple[Any, ...]]:
@@ -176,6 +179,43 @@ def _split(combination: Combination, *arrays: Array) -> Iterator[tuple[Any, ...]
     ends = np.cumsum([len(one.cause.nominal) for one in combination])
     for one, end in zip(combination, ends, strict=True):
         yield one, *(x[end - len(one.cause.nominal) : end] for x in arrays)
+
+
+def changed(case: Case, combination: Combination, x: Array) -> Case:
+    """Return a case with the changes of edits; those that have an effect alone change nothing of it."""
+    for one, own in _split(combination, x):
+        if one.change is not None:
+            case = one.change(case, own)
+    return case
+
+
+def most_similar(slopes: Array, wanted: Array, least: float, most: int) -> list[int]:
+    """Return which slopes (k, m) point along a difference (m,): the most similar ones first."""
+    with np.errstate(all="ignore"):
+        size = np.linalg.norm(slopes, axis=1) * np.linalg.norm(wanted)
+        cosine = np.nan_to_num(np.abs(slopes @ wanted) / np.maximum(size, 1e-300))
+    return [int(i) for i in np.argsort(-cosine, kind="stable")[:most] if cosine[i] > least]
+
+
+def fit_amounts(
+    evaluate: Callable[[Sequence[Lane]], Array],
+    wanted: Array | float,
+    accepted: float,
+    starts: Sequence[Lane],
+) -> list[Explanation]:
+    """Fit amounts by Newton's method in one batch; keep combinations that leave what is accepted."""
+    fits = [_Fit(*start) for start in starts]
+    for _ in range(MAX_STEPS):
+        active = [one for one in fits if one.is_active]
+        if not active:
+            break
+        lanes = [lane for one in active for lane in one.lanes()]
+        effects, first = evaluate(lanes), 0
+        for one in active:
+            count = 1 + len(one.x)
+            one.advance(wanted, effects[first : first + count], accepted)
+            first += count
+    return [found for one in fits if (found := one.result(accepted)) is not None]
 
 
 class Search:
@@ -188,8 +228,14 @@ class Search:
         case = difference.predictor.case
         # other numbers act as in joint coordinates, and without loops all do
         is_of_lengths = view.are_bodies_kept or view.end_rows == "twists"
-        every = () if of_terms_alone or (is_of_lengths and not model.has_loops) else number_edits(case)
-        self.numbers = [one for one in every if not is_of_lengths or one.cause.unit in LENGTHS]
+        every = (
+            []
+            if of_terms_alone
+            else [one for one in number_edits(case) if not is_of_lengths or one.cause.unit in LENGTHS]
+        )
+        self.vectors = [one for one in every if len(one.nominal) > 1]
+        is_of_numbers = model.has_loops or not is_of_lengths
+        self.numbers = [one for one in every if len(one.nominal) == 1 and is_of_numbers]
         self.fixed = list[Edit]()
         if not is_of_lengths:
             self.fixed = [] if of_terms_alone else list(reading_edits(case))
@@ -220,7 +266,7 @@ class Search:
             cause = Cause("term", "γ of the rows", place, "missing")
             yield Edit(cause, effect=self.difference.flat_vectors(change))
 
-    def _whole_numbers(self) -> list[tuple[Combination, Array]]:
+    def _whole_numbers(self) -> list[Lane]:
         """The amounts of words of numbers that may vanish."""
         return [
             ((one,), factor * one.nominal)
@@ -240,11 +286,7 @@ class Search:
             for i in np.flatnonzero(left <= accepted)
         ]
         known = {id(one.combination[0]) for one in found}
-        slopes = self.slopes[:, mask]
-        cosine = np.abs(slopes @ wanted) / np.maximum(
-            np.linalg.norm(slopes, axis=1) * np.linalg.norm(wanted), 1e-300
-        )
-        order = [int(i) for i in np.argsort(-cosine)[:MAX_CANDIDATES] if cosine[i] > MIN_SIMILARITY]
+        order = most_similar(self.slopes[:, mask], wanted, MIN_SIMILARITY, MAX_CANDIDATES)
         starts = [
             ((self.numbers[i],), self.numbers[i].nominal) for i in order if id(self.numbers[i]) not in known
         ]
@@ -257,30 +299,17 @@ class Search:
         # a reading that makes the same mechanism as a number is no other cause
         return [one for one in every if one.amounts.size or one.mechanism(right) not in by_numbers]
 
-    def fit(self, starts: Sequence[tuple[Combination, Array]], mask: Mask) -> list[Explanation]:
-        """Fit amounts by Newton's method in one batch; keep combinations that explain the difference."""
-        fits = [_Fit(*start) for start in starts]
+    def fit(self, starts: Sequence[Lane], mask: Mask) -> list[Explanation]:
+        """Fit amounts to the difference of some quantities."""
         wanted, accepted = self.difference.values[mask], self.difference.accepted(mask)
-        for _ in range(MAX_STEPS):
-            active = [one for one in fits if one.is_active]
-            if not active:
-                break
-            lanes = [lane for one in active for lane in one.lanes()]
-            effects = self.difference.evaluate(lanes)[:, mask]
-            first = 0
-            for one in active:
-                count = 1 + len(one.x)
-                one.advance(wanted, effects[first : first + count], accepted)
-                first += count
-        return [found for one in fits if (found := one.result(accepted)) is not None]
+        return fit_amounts(lambda lanes: self.difference.evaluate(lanes)[:, mask], wanted, accepted, starts)
 
     def explain_by_vectors(self, mask: Mask) -> list[Explanation]:
         """Return every cause of three numbers that explains the difference of some quantities."""
         difference, wanted = self.difference, self.difference.values[mask]
         if np.max(np.abs(wanted), initial=0.0) < MIN_RATIO_OF_VECTORS:
             return []
-        is_of_lengths = difference.view != View(difference.view.quantities)
-        every = [e for e in vector_edits(difference.model) if not is_of_lengths or e.cause.unit in LENGTHS]
+        every = self.vectors
         lanes = [((one,), one.nominal + STEP * one.scale * e) for one in every for e in np.eye(3)]
         slopes = difference.evaluate(lanes)[:, mask].reshape(len(every), 3, -1).mT
         slopes = np.where(np.isfinite(slopes), slopes, 0.0)
@@ -308,7 +337,7 @@ class Search:
         with np.errstate(all="ignore"):
             gain = (along[:, None] ** 2 + along**2 - 2 * gram * along[:, None] * along) / (1 - gram**2)
         gain = np.triu(np.where(np.abs(gram) < 1 - 1e-9, gain, 0.0), 1)
-        starts = list[tuple[Combination, Array]]()
+        starts = list[Lane]()
         for i, j in zip(*np.unravel_index(np.argsort(-gain, axis=None)[:MAX_PAIRS], gain.shape), strict=True):
             (one, x), (other, y) = every[seen[i]], every[seen[j]]
             if one != other:
@@ -321,19 +350,18 @@ class _Fit:
 
     def __init__(self, combination: Combination, start: Array) -> None:
         self.combination, self.x, self.is_active = combination, np.asarray(start, float), True
-        self.nominal = np.concatenate([one.nominal for one in combination])
         scales = [np.full(len(one.cause.nominal), one.scale) for one in combination]
         self.scale: Array = np.concatenate(scales)
         self.length, self.left, self.halvings = np.inf, np.inf, 0
         self.step = np.zeros_like(self.x)
         self.resolution = np.full(len(self.x), np.inf)
 
-    def lanes(self) -> list[tuple[Combination, Array]]:
+    def lanes(self) -> list[Lane]:
         """The amounts, and those beside them for slopes."""
         beside = self.x + STEP * np.diag(self.scale)
         return [(self.combination, self.x), *((self.combination, x) for x in beside)]
 
-    def advance(self, wanted: Array, effects: Array, accepted: float) -> None:
+    def advance(self, wanted: Array | float, effects: Array, accepted: float) -> None:
         """Go one step on, or half of the last step back."""
         with np.errstate(all="ignore"):
             off = wanted - effects[0]
@@ -375,6 +403,6 @@ class _Fit:
         for one, x, resolution in _split(self.combination, self.x, uncertainty):
             if len(x) and np.max(np.abs(x - one.nominal) / resolution) < MIN_SIGNIFICANT:
                 return None
-            if not one.can_vanish and np.any(x * one.nominal <= 0):
+            if not one.can_vanish and np.any(x * np.where(one.nominal, one.nominal, 1.0) <= 0):
                 return None  # no mass or length
         return Explanation(self.combination, self.x, uncertainty, self.left)

@@ -1,7 +1,7 @@
 """Find what explains steps that differ from the declared formula: an integrator, numbers, samples.
 
 The engine's steps are compared with those of other formulas, of the declared one with another parameter, and
-of mechanisms with one number wrong (`edits`), as states are; amounts are fitted to the first steps.  What
+of mechanisms with one number wrong: edits, as of states, whose amounts are fitted to the first steps.  What
 explains the steps from all states, of all sizes and numbers, to rounding is named: all formulas that do; else
 the first parameter that does; else all numbers that do.  Of a run it has to explain every step that differs,
 and `occurrence` finds what these have in common.
@@ -10,16 +10,17 @@ and `occurrence` finds what these have in common.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Literal, Protocol
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import replace
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from plumbline.diagnosis.cause import Cause, Diagnosis, significant
+from plumbline.diagnosis.cause import Cause, Diagnosis
 from plumbline.diagnosis.digit_loss import MIN_SCATTER, measure_step_scatter, scatter_cause
-from plumbline.diagnosis.edits import Edit, number_edits
+from plumbline.diagnosis.edits import Edit, NumberChange, number_edits
+from plumbline.diagnosis.fit import MIN_DIAGNOSABLE_RATIO, STEP, Lane, changed, fit_amounts, most_similar
 from plumbline.diagnosis.occurrence import occurrence_in_run
 from plumbline.diagnosis.prediction import Case
 from plumbline.engines.engine_calls import StepEvaluation
@@ -47,49 +48,42 @@ from plumbline.truth.step_comparison import (
     quadrature_residuals,
 )
 
-MIN_DIAGNOSABLE_RATIO = 8.0  # in bounds: a smaller difference may be explained by chance
 SCREENING_RATIO = 4.0  # of first steps, in bounds of the declared formula
 STEPS_OF_A_RUN = 4  # that are screened, the worst
-FIT_ITERATIONS = 15
-FIT_STEP = 1e-6
-SIMPLE_VALUES = (0.0, 0.25, 0.5, 1.0, 2.0, -1.0, 1 / 3, 1 / 6)
 MIN_SIMILARITY, MAX_NUMBERS = 0.5, 12  # cosine of a number's effect and the difference; so many are fitted
 UNEXPLAINED = Cause("unexplained", "steps", "", "no other integrator, parameter of this one or number")
 CLOSE = Cause("unexplained", "steps", "", "close")
 
-Read = Callable[[StepRun], StepRun]  # samples as an engine may hold them → right ones
 
+class _Steps:
+    """Steps of an engine as what is explained: by cases whose first steps differ from them by nothing."""
 
-@dataclass(frozen=True)
-class Alternative:
-    """A formula, mechanism or reading of samples, or a family of them with one parameter x that is fitted."""
+    def __init__(self, model: Model, states: Sequence[State], method: StepMethod) -> None:
+        self.case, self.states = Case(model, stack_states(states[:1]), method), states
 
-    cause: Callable[[float, float], Cause]  # of x and its resolution
-    method: Callable[[float], StepMethod]
-    declared: float | None = None  # x of what is declared; None: nothing is fitted
-    start: float = 0.0  # x where the fit starts
-    model: Callable[[float], Model] | None = None
-    read: Callable[[float], Read] | None = None
-
-
-class Evidence(Protocol):
-    """Steps of an engine, and how far they are from those of an alternative."""
-
-    def residuals(self, alternative: Alternative, x: float) -> Array:
+    def residuals(self, case: Case) -> Array:
         """Return the differences of first or worst steps, in rounding bounds of the declared formula."""
+        raise NotImplementedError
 
-    def left(self, alternative: Alternative, x: float) -> float:
+    def left(self, case: Case) -> float:
         """Return the largest difference of all steps, in rounding bounds."""
+        raise NotImplementedError
+
+    def evaluate(self, lanes: Sequence[Lane]) -> Array:
+        """Return what edits leave of the first steps, (lanes, m)."""
+        with np.errstate(all="ignore"):
+            return np.array([self.residuals(changed(self.case, *lane)) for lane in lanes])
 
 
-class _SingleSteps:
+class _SingleSteps(_Steps):
     """Steps from given states."""
 
     def __init__(
         self, model: Model, states: Sequence[State], method: JointSpaceMethod, answer: StepEvaluation
     ) -> None:
+        super().__init__(model, states, method)
         found = [(a.state, a.step, a.run) for a in answer.attempts if a.run is not None]
-        self.model, self.states, self.runs = model, states, [run for *_, run in found]
+        self.runs = [run for *_, run in found]
         self.starts = [(index, h, run.angle_axes) for index, h, run in found]
         self.steps = FormulaSteps(method, model, states, self.starts)
         compared = self.steps.compare(self.runs).values()
@@ -100,32 +94,24 @@ class _SingleSteps:
         wrong = {(at.state, at.step) for ratio, at in pairs if not ratio <= 1}
         self.differing = [a for a in answer.attempts if (a.state, a.step) in wrong]
 
-    def _ratios(self, steps: FormulaSteps, runs: Sequence[StepRun]) -> list[float]:
-        return [ratio for c in steps.compare(runs).values() for ratio in c.ratios]
+    def residuals(self, case: Case) -> Array:
+        return self.steps.residuals(case.method, [case.right_samples(run) for run in self.runs], case.model)
 
-    def _runs(self, alternative: Alternative, x: float) -> list[StepRun]:
-        return [alternative.read(x)(run) for run in self.runs] if alternative.read else self.runs
-
-    def residuals(self, alternative: Alternative, x: float) -> Array:
-        method, model = alternative.method(x), alternative.model
-        assert isinstance(method, JointSpaceMethod)
-        return self.steps.residuals(method, self._runs(alternative, x), model(x) if model else self.model)
-
-    def left(self, alternative: Alternative, x: float) -> float:
-        method, runs, steps = alternative.method(x), self._runs(alternative, x), self.steps
-        assert isinstance(method, JointSpaceMethod)
-        if alternative.read is None:
-            model = alternative.model(x) if alternative.model else self.model
-            steps = FormulaSteps(method, model, self.states, self.starts)
-        ratios = self._ratios(steps, runs)
+    def left(self, case: Case) -> float:
+        steps = self.steps
+        if case.read is None:
+            steps = FormulaSteps(case.method, case.model, self.states, self.starts)
+        compared = steps.compare([case.right_samples(run) for run in self.runs])
+        ratios = [ratio for c in compared.values() for ratio in c.ratios]
         # a step that leads another formula into a singularity is compared with nothing: not explained
         return max(ratios) if len(ratios) and len(ratios) >= len(self.ratios) else np.inf
 
 
-class _StepsOfRun:
+class _StepsOfRun(_Steps):
     """The steps of a run that differ, each from the engine's sample before."""
 
-    def __init__(self, steps: RunSteps, run: StepRun) -> None:
+    def __init__(self, steps: RunSteps, states: Sequence[State], run: StepRun) -> None:
+        super().__init__(steps.model, states, steps.method)
         self.steps, self.run = steps, run
         found = steps.compare()
         self.deviations = [found[name] for name in found if name not in ("run_mean", "run_samples")]
@@ -133,18 +119,14 @@ class _StepsOfRun:
         self.differs = np.flatnonzero(self.ratios > 1)
         self.worst = np.sort(np.argsort(self.ratios)[-STEPS_OF_A_RUN:])
 
-    def residuals(self, alternative: Alternative, x: float) -> Array:
-        return self._vectors(alternative, x, self.worst[self.ratios[self.worst] > 1]).ravel()
+    def residuals(self, case: Case) -> Array:
+        return self._vectors(case, self.worst[self.ratios[self.worst] > 1]).ravel()
 
-    def left(self, alternative: Alternative, x: float) -> float:
-        vectors = self._vectors(alternative, x, self.differs)
-        return float(np.max(np.linalg.norm(vectors, axis=-1), initial=0.0))
+    def left(self, case: Case) -> float:
+        return float(np.max(np.linalg.norm(self._vectors(case, self.differs), axis=-1), initial=0.0))
 
-    def _vectors(self, alternative: Alternative, x: float, at: NDArray[np.intp]) -> Array:
-        method, model = alternative.method(x), alternative.model
-        run = alternative.read(x)(self.run) if alternative.read else self.run
-        assert isinstance(method, JointSpaceMethod)
-        return self.steps.differences_from(method, model(x) if model else self.steps.model, run, at)
+    def _vectors(self, case: Case, at: NDArray[np.intp]) -> Array:
+        return self.steps.differences_from(case.method, case.model, case.right_samples(self.run), at)
 
 
 def explain_disagreeing_steps(
@@ -177,9 +159,9 @@ def explain_disagreeing_steps(
         return Diagnosis(_with_occurrence(causes, model, run, [joined(some) for some in parts.values()]))
     of_run: _StepsOfRun | None = None
     if answer.run is not None and run is not None and run.trajectory.coordinates is not None:
-        of_run = _StepsOfRun(RunSteps(method, model, states[0], answer.run.step, run), run)
+        of_run = _StepsOfRun(RunSteps(method, model, states[0], answer.run.step, run), states, run)
         if not is_known and not any(cause.is_explained for cause in causes):
-            found = _explained(of_run, float(np.max(of_run.ratios)), model, states[:1], method)
+            found = _explained(of_run, float(np.max(of_run.ratios)))
             causes = found if causes in ((), (CLOSE,)) or found[0].is_explained else causes
     is_named = causes not in ((), (UNEXPLAINED,))
     if of_run is not None:
@@ -236,43 +218,71 @@ def explain_steps(
         found = [(a.state, a.step, a.run) for a in answer.attempts if a.run is not None]
         return _explain_constrained_steps(model, states, method, found)
     steps = _SingleSteps(model, states, method, answer)
-    causes = _explained(steps, max(steps.ratios, default=0.0), model, states, method)
+    causes = _explained(steps, max(steps.ratios, default=0.0))
     if causes == (UNEXPLAINED,) and len(steps.differing) < len(steps.runs):
         steps = _SingleSteps(model, states, method, replace(answer, attempts=steps.differing))
-        causes = _explained(steps, max(steps.ratios), model, states, method)
+        causes = _explained(steps, max(steps.ratios))
     return causes
 
 
-def _explained(
-    steps: Evidence, worst: float, model: Model, states: Sequence[State], method: JointSpaceMethod
-) -> tuple[Cause, ...]:
+def _explained(steps: _Steps, worst: float) -> tuple[Cause, ...]:
     """The causes of steps in joint coordinates that are off by so many bounds."""
     if worst <= MIN_DIAGNOSABLE_RATIO:
         return (CLOSE,)
-    read = [cause for cause in sample_readings(method, model) if steps.left(cause, 0.0) <= 1.0]
-    if read:
-        first, *others = [one.cause(0.0, 0.0) for one in read]
-        return (replace(first, equal=tuple(others)),)
+    model, method = steps.case.model, steps.case.method
     if method.implicit_forces == "joint dampers" and not np.any(model.damping):
         method = replace(method, implicit_forces="none")  # the same step
-    found = _best(_joint_space_alternatives(method, model), steps)
-    if not found.is_explained:
-        found = _best(_similar(_wrong_numbers(method, model, states), steps), steps, are_all_named=True)
+    for edits, are_all_named in (
+        (sample_readings(model), True),
+        (_joint_space_edits(method, model), False),
+        (_wrong_numbers(steps), True),
+    ):
+        found = _best(list(edits), steps, are_all_named=are_all_named)
+        if found.is_explained:
+            break
     return (found,)
 
 
-def sample_readings(method: StepMethod, model: Model) -> Iterator[Alternative]:
+def _best(edits: Sequence[Edit], steps: _Steps, term: str = "steps", *, are_all_named: bool = False) -> Cause:
+    """The edits that explain all steps, as one cause: all without an amount, else the first with one."""
+    batches = [[edit for edit in edits if not edit.cause.nominal]]
+    with_amounts = [edit for edit in edits if edit.cause.nominal]
+    batches += [with_amounts] if are_all_named else [[edit] for edit in with_amounts]
+    found = list[Cause]()
+    for batch in batches:
+        starts = [((edit,), edit.nominal) for edit in batch]
+        for one in fit_amounts(steps.evaluate, 0.0, SCREENING_RATIO, starts) if not found else ():
+            with np.errstate(all="ignore"):
+                left = steps.left(changed(steps.case, one.combination, one.amounts))
+            if left <= 1.0:
+                (cause,) = replace(one, left=left).causes(0)
+                found.append(replace(cause, term=term) if cause.kind == "method" else cause)
+    return replace(found[0], equal=tuple(found[1:])) if found else replace(UNEXPLAINED, term=term)
+
+
+def _sample_change(change: Callable[[StepRun, Array], dict[str, Any]]) -> NumberChange:
+    """Correct the motion of an engine's samples, by amounts or by none."""
+
+    def of_case(case: Case, x: Array) -> Case:
+        def read(run: StepRun) -> StepRun:
+            return replace(run, trajectory=replace(run.trajectory, **change(run, x)))
+
+        return replace(case, read=read)
+
+    return of_case
+
+
+def sample_readings(model: Model) -> Iterator[Edit]:
     """List in which other frames, or at which other points, an engine's samples may hold the velocities."""
     frames, arms = rotation_matrix(model.turn[: model.n, 1]), model.proximal[: model.n]
 
-    def reading(term: str, words: str, change: Callable[[Array, Array, Array], Any]) -> Alternative:
-        def correct(run: StepRun) -> StepRun:
+    def reading(term: str, words: str, right: Callable[[Array, Array, Array], Any]) -> Edit:
+        def correct(run: StepRun, _: Array) -> dict[str, Any]:
             motion = run.trajectory
-            v, omega = change(rotation_matrix(motion.p), motion.v, angular_velocity(motion.p, motion.pdot))
-            return replace(run, trajectory=replace(motion, v=v, pdot=quaternion_rate(motion.p, omega)))
+            v, omega = right(rotation_matrix(motion.p), motion.v, angular_velocity(motion.p, motion.pdot))
+            return {"v": v, "pdot": quaternion_rate(motion.p, omega)}
 
-        cause = Cause("frame", f"{term} of samples", "", words)
-        return Alternative(lambda *_: cause, lambda _: method, read=lambda _: correct)
+        return Edit(Cause("frame", f"{term} of samples", "", words), _sample_change(correct))
 
     of_points, angular = "those of the joints' points", "angular velocities"
     yield reading("velocities", "in the body frame", lambda a, v, w: (np.matvec(a, v), w))
@@ -281,96 +291,25 @@ def sample_readings(method: StepMethod, model: Model) -> Iterator[Alternative]:
     yield reading(angular, "in the joints' axes", lambda a, v, w: (v, np.matvec(frames, w)))
 
 
-def _wrong_numbers(method: JointSpaceMethod, model: Model, states: Sequence[State]) -> Iterator[Alternative]:
-    """The declared step of a mechanism with another number, and samples that are multiplied by a factor."""
-    case = Case(model, stack_states(states[:1]))
-
-    def of_edit(edit: Edit, change: Callable[[Case, Array], Case]) -> Alternative:
-        def amount(x: float) -> Array:
-            return edit.nominal + x * edit.scale
-
-        def cause(x: float, resolution: float) -> Cause:
-            return edit.cause.with_amount(amount(x), resolution * edit.scale)
-
-        return Alternative(cause, lambda _: method, 0.0, 0.0, lambda x: change(case, amount(x)).model)
-
-    yield _parameter(method, "acceleration_factor", "all accelerations were multiplied by {}", 1.0)
-    yield _parameter(method, "rate_factor", "it multiplied the velocities after the step by {}", 1.0)
-    for edit in number_edits(case):
-        if edit.change is not None and edit.change(case, edit.nominal).state is case.state:
-            yield of_edit(edit, edit.change)
+def _wrong_numbers(steps: _Steps) -> list[Edit]:
+    """Other numbers of the mechanism, and factors of samples, whose effect points along the difference."""
+    case = steps.case
+    edits = [
+        _parameter(case.method, "acceleration_factor", "all accelerations were multiplied by {}"),
+        _parameter(case.method, "rate_factor", "it multiplied the velocities after the step by {}"),
+        *(
+            e
+            for e in number_edits(case)
+            if len(e.nominal) == 1 and changed(case, (e,), e.nominal).state is case.state
+        ),
+    ]
     for name, what in {"r": "positions", "v": "velocities", "pdot": "rates of quaternions"}.items():
         cause = Cause("output", f"{what} of samples", "", "multiplied by", (), (1.0,))
-
-        def read(x: float, name: str = name) -> Read:
-            def correct(run: StepRun) -> StepRun:
-                motion = run.trajectory
-                return replace(run, trajectory=replace(motion, **{name: getattr(motion, name) / (1 + x)}))
-
-            return correct
-
-        yield Alternative(
-            lambda x, resolution, cause=cause: replace(  # type: ignore[misc]
-                cause, amount=(significant(1 + x, 1.0, resolution),), uncertainty=resolution
-            ),
-            lambda _: method, 0.0, 0.0, read=read,
-        )  # fmt: skip
-
-
-def _similar(alternatives: Iterable[Alternative], steps: Evidence) -> Iterator[Alternative]:
-    """Those whose effect points along the difference, the most similar ones first."""
-    found = list[tuple[float, int, Alternative]]()
-    with np.errstate(all="ignore"):
-        for one in alternatives:
-            here = steps.residuals(one, 0.0)
-            slope = steps.residuals(one, FIT_STEP) - here
-            cosine = abs(float(slope @ here)) / max(
-                float(np.linalg.norm(slope) * np.linalg.norm(here)), 1e-300
-            )
-            if cosine > MIN_SIMILARITY:  # not where it is no number
-                found.append((-cosine, len(found), one))
-    for _, _, one in sorted(found)[:MAX_NUMBERS]:
-        yield one
-
-
-def _best(
-    alternatives: Iterable[Alternative], steps: Evidence, term: str = "steps", *, are_all_named: bool = False
-) -> Cause:
-    """The alternatives that explain all steps, as one cause; formulas come before families."""
-    found: list[Cause] = []
-    for alternative in alternatives:
-        if found and alternative.declared is not None and not are_all_named:
-            continue
-        x, resolution = _fit(alternative, steps)
-        with np.errstate(all="ignore"):
-            if not np.max(np.abs(steps.residuals(alternative, x))) <= SCREENING_RATIO:
-                continue
-            left = steps.left(alternative, x)
-        if left <= 1.0:
-            cause = replace(alternative.cause(x, resolution), left=left)
-            found.append(replace(cause, term=term) if cause.kind == "method" else cause)
-    return replace(found[0], equal=tuple(found[1:])) if found else replace(UNEXPLAINED, term=term)
-
-
-def _fit(alternative: Alternative, steps: Evidence) -> tuple[float, float]:
-    """Parameter and its resolution, by Gauss–Newton iterations; a simple value where it is as good."""
-    if alternative.declared is None:
-        return 0.0, 0.0
-    x, resolution = alternative.start, 0.0
-    with np.errstate(all="ignore"):
-        for _ in range(FIT_ITERATIONS):
-            here = steps.residuals(alternative, x)
-            slope = (steps.residuals(alternative, x + FIT_STEP) - here) / FIT_STEP
-            square = float(slope @ slope)
-            if not 0 < square < np.inf:
-                return alternative.declared, 0.0
-            resolution = 1 / float(np.max(np.abs(slope)))
-            change = float(slope @ here) / square
-            x -= float(np.clip(change, -1.0, 1.0))
-            if abs(change) < resolution / 100:
-                break
-    near = min(SIMPLE_VALUES, key=lambda value: abs(value - x))
-    return (near if abs(near - x) <= max(2 * resolution, 1e-12) else x), resolution
+        divided = _sample_change(lambda run, x, name=name: {name: getattr(run.trajectory, name) / x[0]})  # type: ignore[misc]
+        edits.append(Edit(cause, divided))
+    at, *beside = steps.evaluate([((), np.zeros(0)), *(((e,), e.nominal + STEP * e.scale) for e in edits)])
+    chosen = most_similar(np.array(beside) - at, at, MIN_SIMILARITY, MAX_NUMBERS)
+    return [edits[i] for i in chosen]
 
 
 # -- joint coordinates -------------------------------------------------------------------------------
@@ -378,26 +317,27 @@ def _fit(alternative: Alternative, steps: Evidence) -> tuple[float, float]:
 CLASSICAL = classical_runge_kutta("joint rotations")
 
 
-def _joint_space_alternatives(declared: JointSpaceMethod, model: Model) -> Iterator[Alternative]:
+def _joint_space_edits(declared: JointSpaceMethod, model: Model) -> Iterator[Edit]:
     """Other formulas in the same coordinates, then the declared one with another parameter."""
-    seen = [declared]
-    for words, method in _other_formulas(declared, model):
-        if method not in seen:
-            seen.append(method)
-            yield _formula(words, method)
-    yield _parameter(declared, "step_factor", "it took a step {} times as long as asked", 1.0)
+    yield from _formulas([declared], _other_formulas(declared, model))
+    yield _parameter(declared, "step_factor", "it took a step {} times as long as asked")
     if model.rods.any() and declared.coordinates == "joint rotations":
         words = "the axial inertia of rods were {} of the trace of the inertia that they carry"
-        yield _parameter(declared, "rod_axial_inertia", words, declared.rod_axial_inertia)
+        yield _parameter(declared, "rod_axial_inertia", words)
     if declared.implicit_forces != "none":
         words = "the derivatives of forces in the matrix were {} times as large"
-        yield _parameter(declared, "damping_factor", words, 1.0)
+        yield _parameter(declared, "damping_factor", words)
     if declared.formula == "semi-implicit Euler":
         words = "it moved positions by {} of the new velocity and the rest of the old one"
-        yield _parameter(declared, "new_velocity_share", words, 1.0)
-    for i in range(len(declared.weights)):
-        for j in range(i):
-            yield _exchanged_weights(declared, i, j)
+        yield _parameter(declared, "new_velocity_share", words)
+    for i, j in itertools.permutations(range(len(declared.weights)), 2):
+        words = f"the weight of stage {i + 1} were larger by {{}} and that of stage {j + 1} smaller"
+        moved = np.eye(len(declared.weights))[i] - np.eye(len(declared.weights))[j]
+        yield _family(
+            words, 0.0,
+            lambda x, moved=moved: replace(declared, weights=tuple(declared.weights + x * moved)),  # type: ignore[misc]
+            can_vanish=False,
+        )  # fmt: skip
 
 
 def _other_formulas(declared: JointSpaceMethod, model: Model) -> Iterator[tuple[str, JointSpaceMethod]]:
@@ -461,74 +401,49 @@ def _runge_kutta_formulas(declared: JointSpaceMethod) -> Iterator[tuple[str, Joi
             yield f"it {words}", replace(base, correction_terms=count)
 
 
-def _formula(words: str, method: StepMethod) -> Alternative:
-    """A formula without a free parameter."""
-    return Alternative(lambda *_: Cause("method", "steps", "", words), lambda _: method)
+def _formulas(known: list[Any], others: Iterator[tuple[str, Any]]) -> Iterator[Edit]:
+    """Formulas without a free parameter, each once."""
+    for words, method in others:
+        if method not in known:
+            known.append(method)
+            cause = Cause("method", "steps", "", words)
+            yield Edit(cause, lambda case, _, method=method: replace(case, method=method))  # type: ignore[misc]
 
 
 def _family(
-    describe: Callable[[float, float], str],
-    method: Callable[[float], StepMethod],
-    declared: float,
-    start: float,
-) -> Alternative:
-    """Formulas with a parameter: from it and its resolution to the completion of "behaves as if"."""
-
-    def cause(x: float, resolution: float) -> Cause:
-        return Cause("method", "steps", "", describe(x, resolution), (x,), (declared,), "", resolution)
-
-    return Alternative(cause, method, declared, start)
+    words: str, declared: float, method: Callable[[float], StepMethod], can_vanish: bool = True
+) -> Edit:
+    """Formulas with a parameter, that stands in words which complete "behaves as if"."""
+    cause = Cause("method", "steps", "", words, nominal=(declared,))
+    return Edit(cause, lambda case, x: replace(case, method=method(float(x[0]))), can_vanish=can_vanish)
 
 
-def _parameter(
-    declared: StepMethod, name: str, words: str, value: float, start: float | None = None
-) -> Alternative:
+def _parameter(declared: StepMethod, name: str, words: str) -> Edit:
     """The declared formula with another value of one field."""
+    value = getattr(declared, name)
     return _family(
-        lambda x, resolution: (
-            words.format(f"{significant(x, value, resolution):.15g}") + f" (declared: {value:.6g})"
-        ),
+        f"{words} (declared: {value:.6g})", value,
         lambda x: replace(declared, **{name: x}),  # type: ignore[arg-type]
-        value,
-        value if start is None else start,
-    )
-
-
-def _exchanged_weights(declared: JointSpaceMethod, i: int, j: int) -> Alternative:
-    """Weight i by x more, weight j by x less."""
-
-    def method(x: float) -> JointSpaceMethod:
-        weights = list(declared.weights)
-        weights[i] += x
-        weights[j] -= x
-        return replace(declared, weights=tuple(weights))
-
-    def describe(x: float, resolution: float) -> str:
-        size = f"{significant(abs(x), 0.0, resolution):.15g}"
-        more, less = (i, j) if x > 0 else (j, i)
-        return f"the weight of stage {more + 1} were larger by {size} and that of stage {less + 1} smaller"
-
-    return _family(describe, method, 0.0, 0.0)
+    )  # fmt: skip
 
 
 # -- constraints -------------------------------------------------------------------------------------
 
 
-class _ConstrainedSteps:
+class _ConstrainedSteps(_Steps):
     """Steps of an iterative engine, compared in parts."""
 
-    def __init__(self, model: Model, states: Sequence[State], runs: Runs, parts: Collection[str]) -> None:
-        self.model, self.states, self.runs, self.parts = model, states, runs, parts
+    def __init__(
+        self, model: Model, states: Sequence[State], method: StepMethod, runs: Runs, parts: Collection[str]
+    ) -> None:
+        super().__init__(model, states, method)
+        self.runs, self.parts = runs, parts
 
-    def residuals(self, alternative: Alternative, x: float) -> Array:
-        method = alternative.method(x)
-        assert isinstance(method, ConstrainedMethod)
-        return quadrature_residuals(method, self.runs, self.model.has_loops)
+    def residuals(self, case: Case) -> Array:
+        return quadrature_residuals(case.method, self.runs, case.model.has_loops)
 
-    def left(self, alternative: Alternative, x: float) -> float:
-        method = alternative.method(x)
-        assert isinstance(method, ConstrainedMethod)
-        found = compare_parts(method, self.model, self.states, self.runs)
+    def left(self, case: Case) -> float:
+        found = compare_parts(case.method, case.model, self.states, self.runs)
         return max(max(found[name].ratios) for name in self.parts)
 
 
@@ -545,20 +460,18 @@ def _explain_constrained_steps(
         else:
             parts.append(Cause("unexplained", "first accelerations", "", "no other integrator"))
     if max(ratios.values()) > MIN_DIAGNOSABLE_RATIO:
-        steps = _ConstrainedSteps(model, states, runs, ratios)
-        cause = _best(_constrained_alternatives(declared), steps)
+        cause = _best(_constrained_edits(declared), _ConstrainedSteps(model, states, declared, runs, ratios))
         if not cause.is_explained and ratios["step_quadrature"] > MIN_DIAGNOSABLE_RATIO:
-            same_level = _constrained_alternatives(declared, is_level_fixed=True)
-            of_quadrature = _ConstrainedSteps(model, states, runs, ["step_quadrature"])
-            alone = _best(same_level, of_quadrature, "quadrature alone")
+            of_quadrature = _ConstrainedSteps(model, states, declared, runs, ["step_quadrature"])
+            alone = _best(
+                _constrained_edits(declared, is_level_fixed=True), of_quadrature, "quadrature alone"
+            )
             cause = alone if alone.is_explained else cause
         parts.append(cause)
     return tuple(parts) or (CLOSE,)
 
 
-def _constrained_alternatives(
-    declared: ConstrainedMethod, *, is_level_fixed: bool = False
-) -> Iterator[Alternative]:
+def _constrained_edits(declared: ConstrainedMethod, *, is_level_fixed: bool = False) -> list[Edit]:
     """Other formulas with constraints on both levels, then the declared one with another parameter."""
     other: Literal["position", "velocity"] = (
         "velocity" if declared.constraint_level == "position" else "position"
@@ -566,33 +479,29 @@ def _constrained_alternatives(
     words = {"position": " with constraints on positions (index 3)",
              "velocity": " with constraints on velocities (index 2)"}[other]  # fmt: skip
     levels = [(declared, ""), (replace(declared, constraint_level=other), words)][: 2 - is_level_fixed]
-    seen = [declared]
+    formulas, families = list[tuple[str, ConstrainedMethod]](), list[Edit]()
     for base, at_level in levels:
         newmark = replace(base, alpha_m=0.5, alpha_f=0.5, beta=0.25, gamma=0.5)
-        for text, method in {
-            "it took its declared step": base,
-            "it took the step of the trapezoidal rule (Newmark, β = ¼, γ = ½)": newmark,
-            "αm had the opposite sign": replace(base, alpha_m=-base.alpha_m),
-            "αm and αf were exchanged": replace(base, alpha_m=base.alpha_f, alpha_f=base.alpha_m),
-            "a were q̈ (αm = αf = 0)": replace(base, alpha_m=0.0, alpha_f=0.0),
-        }.items():
-            if method not in seen and not (base.alpha_m == base.alpha_f and "αf" in text):
-                seen.append(method)
-                yield _formula(text + at_level, method)
-    for base, at_level in levels:
-        yield _generalized_alpha_family(base, at_level)
-        for name, symbol in (("alpha_m", "αm"), ("alpha_f", "αf"), ("beta", "β"), ("gamma", "γ")):
-            value = getattr(declared, name)
-            yield _parameter(base, name, f"{symbol} were {{}}{at_level}", value, start=value + 0.01)
+        formulas += [
+            (text + at_level, method)
+            for text, method in {
+                "it took its declared step": base,
+                "it took the step of the trapezoidal rule (Newmark, β = ¼, γ = ½)": newmark,
+                "αm had the opposite sign": replace(base, alpha_m=-base.alpha_m),
+                "αm and αf were exchanged": replace(base, alpha_m=base.alpha_f, alpha_f=base.alpha_m),
+                "a were q̈ (αm = αf = 0)": replace(base, alpha_m=0.0, alpha_f=0.0),
+            }.items()
+            if not (base.alpha_m == base.alpha_f and "αf" in text)
+        ]
+        families.append(_of_spectral_radius(base, at_level))
+        families += [
+            _parameter(base, name, f"{symbol} were {{}}{at_level}")
+            for name, symbol in (("alpha_m", "αm"), ("alpha_f", "αf"), ("beta", "β"), ("gamma", "γ"))
+        ]
+    return [*_formulas([declared], iter(formulas)), *families]
 
 
-def _generalized_alpha_family(base: ConstrainedMethod, at_level: str) -> Alternative:
-    declared = base.alpha_f / (1 - base.alpha_f)
-
-    def describe(x: float, resolution: float) -> str:
-        radius = f"{significant(x, declared, resolution):.15g}"
-        return f"it took the generalised-α step with spectral radius {radius}{at_level}"
-
+def _of_spectral_radius(base: ConstrainedMethod, at_level: str) -> Edit:
     def method(x: float) -> ConstrainedMethod:
         other = generalized_alpha(
             x,
@@ -602,4 +511,5 @@ def _generalized_alpha_family(base: ConstrainedMethod, at_level: str) -> Alterna
         )
         return replace(other, constraint_level=base.constraint_level)
 
-    return _family(describe, method, declared, 0.95)
+    words = f"it took the generalised-α step with spectral radius {{}}{at_level}"
+    return _family(words, base.alpha_f / (1 - base.alpha_f), method)

@@ -21,6 +21,7 @@ from plumbline.diagnosis.prediction import (
     Case,
     determinate,
     error_ratio,
+    per_entry,
     projectors_at,
     single_states,
 )
@@ -130,7 +131,7 @@ class Outputs:
         for change, value in self._whole(quantity):
             if matches(chosen(value)):
                 return cause(change)
-        weight = 1 / _per_entry(bound, given)
+        weight = 1 / per_entry(bound, given)
         square = max(float(np.sum((right * weight) ** 2)), TINY)
         factor = float(np.sum(given * right * weight**2) / square)
         uncertainty = 1 / np.sqrt(square)
@@ -157,7 +158,7 @@ class Outputs:
 
     def _whole(self, quantity: str) -> Iterator[tuple[str, Array]]:
         """What a quantity may be as a whole, in words, with its value."""
-        model, state = self.case
+        model, state = self.case.model, self.case.state
         right = self.right[quantity]
         turns = self._turns
         if quantity == "acceleration":
@@ -203,7 +204,7 @@ class Outputs:
     def _lacking(self, quantity: str, given: Array, chosen: Choose, cause: MakeCause) -> Cause | None:
         """One part that has another share in a quantity, or two."""
         bound, right = chosen(self.bounds[quantity]), chosen(self.right[quantity])
-        weight = 1 / _per_entry(bound, given)
+        weight = 1 / per_entry(bound, given)
         off = ((given - right) * weight).ravel()
         if not np.all(np.isfinite(off)):
             return None
@@ -262,7 +263,7 @@ class Outputs:
 
     @cached_property
     def _kinetic(self) -> list[Part]:
-        model, state = self.case
+        model, state = self.case.model, self.case.state
         moving = 0.5 * model.mass * np.sum(state.v**2, -1)
         turning = 0.5 * np.sum(state.omega * rotate_vectors(model.inertia, state.omega), -1)
         parts = {"{}": moving + turning, "the rotation of {}": turning, "the translation of {}": moving}
@@ -270,7 +271,7 @@ class Outputs:
 
     @cached_property
     def _potential(self) -> list[Part]:
-        model, state = self.case
+        model, state = self.case.model, self.case.state
         weight = -model.mass * np.sum(state.r * model.gravity[..., None, :], -1)
         between = self._energies(1, "", "spring_stiffness")
         parts = _of_bodies({"the weight of {}": weight}) + self._energies(1, "spring", "stiffness") + between
@@ -282,7 +283,7 @@ class Outputs:
 
     @cached_property
     def _momentum(self) -> list[Part]:
-        model, state = self.case
+        model, state = self.case.model, self.case.state
         orbital = cross(state.r, model.mass[..., None] * state.v)
         spin = np.matvec(self._turns, rotate_vectors(model.inertia, state.omega))
         return _of_bodies({"{}": orbital + spin, "the spin of {}": spin, "the translation of {}": orbital})
@@ -327,7 +328,7 @@ class Outputs:
 
     def _carried(self, loads: Array) -> Array:
         """What joints carry (2, S, J, 3) of forces and moments (2, S, N, 3) at the centres of mass."""
-        model, state = self.case
+        model, state = self.case.model, self.case.state
         carried = np.zeros((2, *self._near.shape))
         for body in range(model.n):
             force, moment = loads[:, :, body]
@@ -340,7 +341,7 @@ class Outputs:
 
     @cached_property
     def _wrench_parts(self) -> list[Part]:
-        model, state = self.case
+        model, state = self.case.model, self.case.state
         weight = np.zeros((2, *state.v.shape))
         weight[0] = model.mass[..., None] * model.gravity[..., None, :]
         parts = self._of_loads("weight", weight)
@@ -377,7 +378,7 @@ class Outputs:
 
     def _element_parts(self) -> list[Part]:
         """Parts along the joints' own motions, which their elements have."""
-        model, state = self.case
+        model, state = self.case.model, self.case.state
         efforts = {"springs": -model.stiffness[: model.n] * (state.x - model.rest[: model.n]),
                    "dampers": -model.damping[: model.n] * state.xdot,
                    "efforts": np.broadcast_to(model.effort[: model.n], state.x.shape)}  # fmt: skip
@@ -409,7 +410,7 @@ class Outputs:
 
     def _joint_parts(self) -> list[Part]:
         """What closing joints and children have in the wrenches of the joints before."""
-        model, state = self.case
+        model, state = self.case.model, self.case.state
         right = np.array([self.right.get(name, np.zeros(self._near.shape)) for name in WRENCHES])
         parts = list[Part]()
         for what, every, is_whole in (
@@ -444,7 +445,7 @@ class Outputs:
         A part has the pose of its body and a share of mass and inertia; on it act the closing joint, gravity
         and the weld.
         """
-        model, state = self.case
+        model, state = self.case.model, self.case.state
         if not model.has_loops or not self.right.keys() >= {"acceleration", *WRENCHES}:
             return []
         cut, each = cut_open(model), list[tuple[str, Array]]()
@@ -468,7 +469,7 @@ class Outputs:
     @cached_property
     def _levers(self) -> list[Part]:
         """Moments that joints' forces have about other points, of all joints or of those of one kind."""
-        model, state = self.case
+        model, state = self.case.model, self.case.state
         far = model.body[:, 0]
         hung = np.where((far < 0)[:, None], model.point[:, 0],
                         state.r[:, far] + np.matvec(self._turns[:, far], model.point[:, 0]))  # fmt: skip
@@ -520,9 +521,3 @@ def _each_and_all(every: str, each: Sequence[tuple[str, Array]]) -> list[Part]:
 
 def _thing(quantity: str) -> str:
     return "joint" if quantity in WRENCHES else "body"
-
-
-def _per_entry(bound: Array, values: Array) -> Array:
-    """Positive bounds (S,) or (S, N) that broadcast against values; of a bound of 0 nothing counts."""
-    bound = np.where(bound > 0, bound, np.inf)
-    return bound[..., None] if values.ndim > bound.ndim else bound

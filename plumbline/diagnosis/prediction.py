@@ -6,10 +6,10 @@ state; an engine in maximal coordinates evaluates the bodies where they are, loo
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,7 @@ from plumbline.model.datatypes import (
     Model,
     State,
     StateQuantities,
+    StepRun,
 )
 from plumbline.model.invariants import kinetic_energy, potential_energy
 from plumbline.model.kinematics import (
@@ -77,6 +78,12 @@ def tolerances(
     return np.asarray((found.T + limits).T)
 
 
+def per_entry(bound: Array, values: Array) -> Array:
+    """Return bounds (S,) or (S, N) that broadcast against values; of a bound of 0 nothing counts."""
+    bound = np.where(bound > 0, bound, np.inf)
+    return bound[..., None] if values.ndim > bound.ndim else bound
+
+
 def error_ratio(difference: Array, bound: Array) -> float:
     """Return the largest ‖difference‖/bound, of (S,) scalars or (S, ..., 3) vectors; NaN where any is."""
     size = np.abs(difference) if difference.ndim == 1 else np.linalg.norm(difference, axis=-1)
@@ -94,11 +101,21 @@ def error_ratios(reported: Sequence[StateQuantities], truth: StateTruth, quantit
     return np.where(np.isnan(found), np.inf, found)
 
 
-class Case(NamedTuple):
-    """What an engine evaluates in place of S states: fields of the model may be others at each state."""
+@dataclass(frozen=True)
+class Case:
+    """What an engine evaluates in place of S states: fields of the model may be others at each state.
+
+    Or what it takes steps of, by a formula.
+    """
 
     model: Model
     state: State  # arrays (S, ...)
+    method: Any = None  # a formula of the declared one's class
+    read: Callable[[StepRun], StepRun] | None = None  # samples as an engine may hold them → right ones
+
+    def right_samples(self, run: StepRun) -> StepRun:
+        """Return a run whose samples are what they should be."""
+        return self.read(run) if self.read else run
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,7 @@ Readings have no amount.  Each is listed for one body, joint or spring, and for 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import permutations
 from typing import Any, NamedTuple
@@ -85,7 +84,7 @@ def change_key(seen: Case, right: Case) -> tuple[tuple[str, bytes], ...]:
     Quaternions ±q are the same, and of rigid joints only the relative turn counts.
     """
     found = list[tuple[str, bytes]]()
-    for changed, base in zip(seen, right, strict=True):
+    for changed, base in ((seen.model, right.model), (seen.state, right.state)):
         for name, value in vars(base).items():
             x = getattr(changed, name)
             if x is value:
@@ -118,7 +117,7 @@ def _every_reading(case: Case) -> Iterator[tuple[str, str, str, Change]]:
         ("spring", len(model.spring_body), _spring_readings),
     ):
         for k in range(count):
-            for term, words, change, where in (Reading(*one) for one in readings(case, k)):
+            for term, words, change, where in readings(case, k):
                 groups.setdefault((thing, term, words, where), []).append(change)
                 if count <= MAX_PLACES:
                     yield term, f"{thing} {k + 1}{where}", words, change
@@ -134,12 +133,8 @@ def _every_reading(case: Case) -> Iterator[tuple[str, str, str, Change]]:
     for i, j in ((0, 1), (0, 2), (1, 2)):
         order = [j if axis == i else i if axis == j else axis for axis in range(3)]
         axes = f"{'xyz'[i]} and {'xyz'[j]}"
-        yield (
-            "components of gravity",
-            "",
-            f"taken with {axes} exchanged",
-            _fields(gravity=model.gravity[order]),
-        )
+        exchanged = _fields(gravity=model.gravity[order])
+        yield "components of gravity", "", f"taken with {axes} exchanged", exchanged
     yield "inputs", "", "rounded to single precision", _rounded_to_single_precision
 
 
@@ -159,7 +154,7 @@ def _one_after_another(changes: Sequence[Change]) -> Change:
 def _merged(right: Case, one: Case, other: Case) -> Case:
     """Both changes; where both change a field, what the second changes of it."""
     fields = {}
-    for base, a, b in zip(right, one, other, strict=True):
+    for base, a, b in zip(*((case.model, case.state) for case in (right, one, other)), strict=True):
         for name, value in vars(base).items():
             x, y = getattr(a, name), getattr(b, name)
             if y is not value:
@@ -171,15 +166,62 @@ def _fields(**values: Any) -> Change:
     return lambda case: with_fields(case, **values)
 
 
-def _row(name: str, k: int, of: Callable[[Case], Array]) -> Change:
+class _Place:
+    """What the fields of a case hold of one body, joint or spring, by their names."""
+
+    def __init__(self, case: Case, k: int) -> None:
+        self.case, self.k = case, k
+
+    def __getattr__(self, name: str) -> Array:
+        return np.asarray(field(self.case, name)[_at(name, self.k)])
+
+    @property
+    def above(self) -> Array:
+        """Attitude of the far body."""
+        far = int(self.case.model.body[self.k, 0])
+        return np.asarray(self.case.state.p[:, far] if far >= 0 else np.eye(4)[:1])
+
+    @property
+    def relative(self) -> Array:
+        """Attitude relative to the far body."""
+        return quaternion_product(quaternion_conjugate(self.above), self.p)
+
+    @property
+    def carried(self) -> Array:
+        """Angular velocity of the far body, in this body's frame."""
+        far = int(self.case.model.body[self.k, 0])
+        omega = self.case.state.omega[:, far] if far >= 0 else 0 * self.omega
+        return self.to_body(rotate_vectors(rotation_matrix(self.above), omega))
+
+    def to_world(self, x: Array) -> Array:
+        return np.asarray(np.matvec(rotation_matrix(self.p), x))
+
+    def to_body(self, x: Array) -> Array:
+        return np.asarray(np.matvec(rotation_matrix(self.p).mT, x))
+
+    def turned_inertia(self, times: int, axes: Array | None = None) -> Array:
+        """Inertia turned so many times by axes, or by the attitude at each state."""
+        A = rotation_matrix(self.p) if axes is None else np.broadcast_to(axes, (len(self.p), 3, 3))
+        A = np.linalg.matrix_power(A, times)
+        J = A @ self.inertia @ A.mT
+        return np.asarray((J + J.mT) / 2)
+
+
+Read = Callable[[_Place], Any]
+
+
+def _at(name: str, k: int) -> tuple[Any, ...]:
+    return (..., k, *(slice(None),) * TRAILING[name])
+
+
+def _row(name: str, k: int, of: Read) -> Change:
     """Replace what a field holds of one place, by one value or one per state."""
 
     def change(case: Case) -> Case:
-        value, values, own = np.asarray(of(case)), field(case, name), TRAILING[name]
+        value, values, own = np.asarray(of(_Place(case, k))), field(case, name), TRAILING[name]
         is_lifted = value.ndim > own and values.ndim == own + 1
         values = np.repeat(values[None], len(value), 0) if is_lifted else values.copy()
-        at: tuple[Any, ...] = (..., k, *(slice(None),) * own)
-        values[at] = value
+        values[_at(name, k)] = value
         return with_fields(case, **{name: values})
 
     return change
@@ -192,122 +234,99 @@ def _constant(name: str, k: int, value: Any) -> Change:
 
 # -- bodies --------------------------------------------------------------------------------------------
 
+# term, field, and what is read in place of it; a reading that changes nothing is left out
+OF_BODIES: tuple[tuple[str, str, dict[str, Read]], ...] = (
+    ("attitude", "p", {
+        **{words: partial(lambda read, b: read(b.p), read) for words, read in list(QUATERNIONS.items())[1:]},
+        "that relative to its parent": lambda b: b.relative,
+        "taken as relative to its parent": lambda b: quaternion_product(b.above, b.p),
+        "multiplied in the reverse order, its parent's after the relative one":
+            lambda b: quaternion_product(b.relative, b.above),
+    }),
+    ("angular velocity", "omega", {
+        "in the world frame": lambda b: b.to_world(b.omega),
+        "turned with Aᵀ instead of A": lambda b: b.to_body(b.omega),
+        "that relative to its parent": lambda b: b.omega - b.carried,
+        "taken as relative to its parent": lambda b: b.omega + b.carried,
+    }),
+    ("velocity", "v", {
+        "given in the body frame": lambda b: b.to_world(b.v),
+        "in the body frame": lambda b: b.to_body(b.v),
+    }),
+    ("inertia", "inertia", {
+        "taken in world axes": lambda b: b.turned_inertia(-1),
+        "turned with Aᵀ instead of A": lambda b: b.turned_inertia(-2),
+    }),
+    ("applied force", "force", {
+        "taken in the body frame": lambda b: b.to_world(b.force),
+        "rotated with Aᵀ": lambda b: b.to_body(b.force),
+    }),
+    ("applied moment", "moment", {
+        "taken in the world frame": lambda b: b.to_body(b.moment),
+        "rotated with A": lambda b: b.to_world(b.moment),
+    }),
+    ("drag moment", "drag_moment", {
+        "that of the drag force's coefficient": lambda b: b.drag_force or b.drag_moment,
+    }),
+    ("drag force", "drag_force", {
+        "that of the drag moment's coefficient": lambda b: b.drag_moment or b.drag_force,
+    }),
+    ("drag force", "force", {
+        "taken with the body-frame velocity": lambda b: b.force + b.drag_force * (b.v - b.to_body(b.v)),
+        "taken with the velocity of its joint's point":
+            lambda b: b.force - b.drag_force * b.to_world(np.cross(b.omega, b.point[1])),
+    }),
+    ("drag moment", "moment", {
+        "taken with the world-frame angular velocity":
+            lambda b: b.moment + b.drag_moment * (b.omega - b.to_world(b.omega)),
+        "taken with the angular velocity relative to its parent":
+            lambda b: b.moment + b.drag_moment * b.carried,
+    }),
+)  # fmt: skip
 
-@dataclass(frozen=True)
-class _Body:
-    """What readings take of body k at the states of a case."""
 
-    k: int
-    far: int
-
-    def p(self, c: Case) -> Array:
-        return c.state.p[:, self.k]
-
-    def omega(self, c: Case) -> Array:
-        return c.state.omega[:, self.k]
-
-    def v(self, c: Case) -> Array:
-        return c.state.v[:, self.k]
-
-    def above(self, c: Case) -> Array:
-        return c.state.p[:, self.far]
-
-    def relative(self, c: Case) -> Array:
-        return quaternion_product(quaternion_conjugate(self.above(c)), self.p(c))
-
-    def to_world(self, c: Case, x: Array) -> Array:
-        return np.asarray(np.matvec(rotation_matrix(self.p(c)), x))
-
-    def to_body(self, c: Case, x: Array) -> Array:
-        return np.asarray(np.matvec(rotation_matrix(self.p(c)).mT, x))
-
-    def carried(self, c: Case) -> Array:
-        """Angular velocity of the far body, in this body's frame."""
-        return self.to_body(c, rotate_vectors(rotation_matrix(self.above(c)), c.state.omega[:, self.far]))
-
-
-def _rows(
-    term: str, name: str, k: int, readings: Mapping[str, Callable[[Case], Array]]
-) -> list[tuple[Any, ...]]:
-    return [(term, words, _row(name, k, of)) for words, of in readings.items()]
-
-
-def _body_readings(case: Case, k: int) -> Iterator[tuple[Any, ...]]:
+def _body_readings(case: Case, k: int) -> Iterator[Reading]:
     model = case.model
-    kind, b = model.kinds[k], _Body(k, int(model.body[k, 0]))
-    if kind.has_attitude:
-        attitudes: dict[str, Callable[[Case], Array]] = {
-            words: partial(lambda read, c: read(b.p(c)), read)
-            for words, read in list(QUATERNIONS.items())[1:]
-        }
-        rates = {
-            "in the world frame": lambda c: b.to_world(c, b.omega(c)),
-            "turned with Aᵀ instead of A": lambda c: b.to_body(c, b.omega(c)),
-        }
-        if b.far >= 0:
-            attitudes |= {
-                "that relative to its parent": b.relative,
-                "taken as relative to its parent": lambda c: quaternion_product(b.above(c), b.p(c)),
-                "multiplied in the reverse order, its parent's after the relative one": lambda c: (
-                    quaternion_product(b.relative(c), b.above(c))
-                ),
-            }
-            rates |= {
-                "that relative to its parent": lambda c: b.omega(c) - b.carried(c),
-                "taken as relative to its parent": lambda c: b.omega(c) + b.carried(c),
-            }
-        yield from _rows("attitude", "p", k, attitudes)
-        yield from _rows("angular velocity", "omega", k, rates)
-    if kind.holds_nothing:
-        velocities = {
-            "given in the body frame": lambda c: b.to_world(c, b.v(c)),
-            "in the body frame": lambda c: b.to_body(c, b.v(c)),
-        }
-        yield from _rows("velocity", "v", k, velocities)
-    yield from _attachment_readings(model, k)
-    yield from _inertia_readings(model, k)
-    yield from _load_readings(model, b)
-
-
-def _attachment_readings(model: Model, k: int) -> Iterator[tuple[Any, ...]]:
-    """All points of joints on a body with the opposite sign, or two of them exchanged."""
+    kind = model.kinds[k]
+    is_read = {"p": kind.has_attitude, "omega": kind.has_attitude, "v": kind.holds_nothing}
+    for term, name, readings in OF_BODIES:
+        for words, of in readings.items() if is_read.get(name, True) else ():
+            yield Reading(term, words, _row(name, k, of))
     on_body = model.body == k
-    if np.sum(on_body) < 2:
-        return
-
-    def reversed_points(c: Case) -> Case:
-        return with_fields(c, point=np.where(on_body[..., None], -c.model.point, c.model.point))
-
-    def exchanged(c: Case) -> Case:
-        points = c.model.point.copy()
-        points[..., on_body, :] = points[..., on_body, :][..., ::-1, :]
-        return with_fields(c, point=points)
-
-    yield "attachment points", "reversed", reversed_points
+    if np.sum(on_body) > 1:
+        changed = np.where(on_body[..., None], -model.point, model.point)
+        yield Reading("attachment points", "reversed", _fields(point=changed))
     if np.sum(on_body) == 2:
-        yield "attachment points", "exchanged", exchanged
-
-
-def _inertia_readings(model: Model, k: int) -> Iterator[tuple[Any, ...]]:
-    J, arm = model.inertia[k], cross_matrix(model.proximal[k])
-
-    def turned(by: Callable[[Array], Array]) -> Callable[[Case], Array]:
-        def of(c: Case) -> Array:
-            A = by(rotation_matrix(c.state.p[:, k]))
-            return np.asarray((A @ J @ A.mT + (A @ J @ A.mT).mT) / 2)
-
-        return of
-
-    readings = {
-        "taken in world axes": turned(lambda A: A.mT),
-        "turned with Aᵀ instead of A": turned(lambda A: A.mT @ A.mT),
+        changed = model.point.copy()
+        changed[on_body] = changed[on_body][::-1]
+        yield Reading("attachment points", "exchanged", _fields(point=changed))
+    yield from _inertia_readings(model, k)
+    points = {} if kind.holds_nothing else {"its joint's": model.proximal[k]}
+    points |= {f"joint {j + 1}'s": model.point[j, 0] for j, far in enumerate(model.body[:, 0]) if far == k}
+    forces: dict[str, Read] = {
+        "applied force": lambda b: b.force,
+        "weight": lambda b: b.mass * b.case.model.gravity,
+        "drag force": lambda b: -b.drag_force * b.v,
     }
+    for which, point in points.items():
+        for term, force in forces.items():
+            moved = partial(lambda x, of, b: b.moment + np.cross(x, b.to_body(of(b))), point, force)
+            yield Reading(term, f"applied at {which} point", _row("moment", k, moved))
+    for names, words in ((("force", "moment"), "applied force and moment"),
+                         (("drag_force", "drag_moment"), "drag force and drag moment")):  # fmt: skip
+        changes = [_constant(name, k, getattr(model, other)[k]) for name, other in (names, names[::-1])]
+        yield Reading(words, "exchanged", partial(lambda one, other, case: other(one(case)), *changes))
+
+
+def _inertia_readings(model: Model, k: int) -> Iterator[Reading]:
+    """Inertias about another point, turned by the joint's axes, or with other products."""
+    J, arm = model.inertia[k], cross_matrix(model.proximal[k])
     if not model.kinds[k].holds_nothing:
-        readings["that about its joint's point"] = lambda c: J - model.mass[k] * (arm @ arm)
+        about_point = _constant("inertia", k, J - model.mass[k] * (arm @ arm))
+        yield Reading("inertia", "that about its joint's point", about_point)
     for times, words in TURNS.items() if not model.kinds[k].has_attitude else ():
-        axes = np.linalg.matrix_power(rotation_matrix(model.turn[k, 1]), times)
-        readings[words] = turned(partial(lambda axes, _: axes, axes))
-    yield from _rows("inertia", "inertia", k, readings)
+        of = partial(lambda n, axes, b: b.turned_inertia(n, axes), times, rotation_matrix(model.turn[k, 1]))
+        yield Reading("inertia", words, _row("inertia", k, of))
     for order in list(permutations(range(3)))[1:]:  # in the right order a factor
         for sign in (-1.0, 1.0):
             other = J.copy()
@@ -315,128 +334,62 @@ def _inertia_readings(model: Model, k: int) -> Iterator[tuple[Any, ...]]:
                 a, b, c, d = (i + 1) % 3, (i + 2) % 3, (j + 1) % 3, (j + 2) % 3
                 other[a, b] = other[b, a] = sign * J[c, d]
             taken = ", ".join("-" * (sign < 0) + PRODUCTS[j] for j in order)
-            yield "products of inertia yz, xz, xy", taken, _constant("inertia", k, other)
-
-
-def _load_readings(model: Model, b: _Body) -> Iterator[tuple[Any, ...]]:
-    """Loads and drag in other axes, at other points, exchanged, or of other velocities."""
-    k = b.k
-    force, moment, c_t, c_r = model.force[k], model.moment[k], model.drag_force[k], model.drag_moment[k]
-
-    def more(name: str, of: Callable[[Case], Array]) -> Change:
-        return _row(name, k, lambda c: field(c, name)[..., k, :] + of(c))
-
-    def at_point(point: Array, of: Callable[[Case], Array]) -> Change:
-        return more("moment", lambda c: np.cross(point, b.to_body(c, of(c))))
-
-    def of_point(c: Case) -> Array:
-        return b.to_world(c, np.cross(b.omega(c), model.proximal[k]))
-
-    forces = {
-        "taken in the body frame": lambda c: b.to_world(c, force),
-        "rotated with Aᵀ": lambda c: b.to_body(c, force),
-    }
-    moments = {
-        "taken in the world frame": lambda c: b.to_body(c, moment),
-        "rotated with A": lambda c: b.to_world(c, moment),
-    }
-    yield from _rows("applied force", "force", k, forces) + _rows("applied moment", "moment", k, moments)
-    points = {} if model.kinds[k].holds_nothing else {"its joint's": model.proximal[k]}
-    points |= {f"joint {j + 1}'s": model.point[j, 0] for j, far in enumerate(model.body[:, 0]) if far == k}
-    for which, point in points.items():
-        where = f"applied at {which} point"
-        yield "applied force", where, at_point(point, lambda c: force)
-        yield "weight", where, at_point(point, lambda c: model.mass[k] * model.gravity)
-        yield "drag force", where, at_point(point, lambda c: -c_t * b.v(c))
-    for names, words in ((("force", "moment"), "applied force and moment"),
-                         (("drag_force", "drag_moment"), "drag force and drag moment")):  # fmt: skip
-        changes = [_constant(name, k, getattr(model, other)[k]) for name, other in (names, names[::-1])]
-        yield words, "exchanged", partial(lambda one, other, case: other(one(case)), *changes)
-    if c_t != c_r:
-        if c_t:
-            yield "drag moment", "that of the drag force's coefficient", _constant("drag_moment", k, c_t)
-        if c_r:
-            yield "drag force", "that of the drag moment's coefficient", _constant("drag_force", k, c_r)
-    drags = {
-        "taken with the body-frame velocity": lambda c: c_t * (b.v(c) - b.to_body(c, b.v(c))),
-        "taken with the velocity of its joint's point": lambda c: -c_t * of_point(c),
-    }
-    rates = {
-        "taken with the world-frame angular velocity": lambda c: (
-            c_r * (b.omega(c) - b.to_world(c, b.omega(c)))
-        )
-    }
-    if b.far >= 0:
-        rates["taken with the angular velocity relative to its parent"] = lambda c: c_r * b.carried(c)
-    yield from (("drag force", words, more("force", of)) for words, of in drags.items())
-    yield from (("drag moment", words, more("moment", of)) for words, of in rates.items())
+            yield Reading("products of inertia yz, xz, xy", taken, _constant("inertia", k, other))
 
 
 # -- joints --------------------------------------------------------------------------------------------
 
 
-def _joint_readings(case: Case, k: int) -> Iterator[tuple[Any, ...]]:
+def _joint_readings(case: Case, k: int) -> Iterator[Reading]:
     model = case.model
     kind = model.kinds[k]
     if k < model.n:
         yield from _coordinate_readings(model, k)
     if len(kind.motions) == 2:
         for name in JOINT_ELEMENTS:
-            pair = getattr(model, name)[k]
-            yield (
-                f"{WORDS.get(name, name)} of the two coordinates", "exchanged",
-                _row(name, k, lambda c, pair=pair: pair[[1, 0, *range(2, len(pair))]]),  # type: ignore[misc]
-            )  # fmt: skip
+            term, pair = f"{WORDS.get(name, name)} of the two coordinates", getattr(model, name)[k]
+            yield Reading(term, "exchanged", _constant(name, k, pair[[1, 0, *range(2, len(pair))]]))
     if kind.has_pitch:
         for words, factor in (("reversed", -1.0), ("taken per turn, not per radian", 0.5 / np.pi)):
-            yield "pitch", words, _row("length", k, lambda c, x=factor: x * c.model.length[..., k])  # type: ignore[misc]
+            yield Reading("pitch", words, _constant("length", k, factor * model.length[k]))
     if not kind.holds_nothing:
         yield from _point_readings(model, k)
     if not kind.has_attitude:
         yield from _axes_readings(model, k)
 
 
-def _coordinate_readings(model: Model, k: int) -> Iterator[tuple[Any, ...]]:
+def _coordinate_readings(model: Model, k: int) -> Iterator[Reading]:
     motions = model.kinds[k].motions
+    of_each: dict[str, Callable[[Array], Array]] = {"reversed": np.negative, "its absolute value": np.abs}
 
     def coordinate(name: str, i: int, change: Callable[[Array], Array]) -> Change:
-        def of(case: Case) -> Array:
-            values = field(case, name)[:, k].copy()
-            values[:, i] = change(values[:, i])
-            return values
+        def of(j: _Place) -> Array:
+            values = getattr(j, name)
+            return np.where(np.arange(values.shape[-1]) == i, change(values), values)
 
         return _row(name, k, of)
 
     for i, (what, _) in enumerate(motions):
         if what == "turn":
             principal = coordinate("x", i, lambda x: np.arctan2(np.sin(x), np.cos(x)))
-            yield f"angle {i + 1}", "its principal value", principal
-        for name, words in (("x", "coordinate"), ("xdot", "rate")):
-            if name == "x" or len(motions) > 1:  # else a factor
-                yield f"{words} {i + 1}", "reversed", coordinate(name, i, lambda x: -x)
-            yield f"{words} {i + 1}", "its absolute value", coordinate(name, i, np.abs)
+            yield Reading(f"angle {i + 1}", "its principal value", principal)
+        for name, term in (("x", "coordinate"), ("xdot", "rate")):
+            for words, change in of_each.items():
+                if name == "x" or len(motions) > 1 or words != "reversed":  # else a factor
+                    yield Reading(f"{term} {i + 1}", words, coordinate(name, i, change))
         if model.stiffness[k, i]:
-            yield f"spring {i + 1}", "without its coordinate", _unmoved_spring(k, i)
+            own = np.arange(model.stiffness.shape[1]) == i
+            pull = _row("effort", k, partial(lambda own, j: j.effort + own * j.stiffness * j.x, own))
+            yield Reading(f"spring {i + 1}", "without its coordinate", pull)
     if len(motions) == 2:
-        for name, words in (("x", "coordinates"), ("xdot", "rates")):
-            yield words, "exchanged", _row(name, k, lambda c, name=name: field(c, name)[:, k, ::-1])  # type: ignore[misc]
+        for name, term in (("x", "coordinates"), ("xdot", "rates")):
+            reverse = partial(lambda name, j: getattr(j, name)[:, ::-1], name)
+            yield Reading(term, "exchanged", _row(name, k, reverse))
 
 
-def _unmoved_spring(k: int, i: int) -> Change:
-    """A joint's spring that pulls with its rest position alone."""
-
-    def change(case: Case) -> Case:
-        effort = np.repeat(case.model.effort[None], len(case.state.x), 0)
-        effort[:, k, i] += case.model.stiffness[k, i] * case.state.x[:, k, i]
-        return with_fields(case, effort=effort)
-
-    return change
-
-
-def _point_readings(model: Model, k: int) -> Iterator[tuple[Any, ...]]:
+def _point_readings(model: Model, k: int) -> Iterator[Reading]:
     """Points of joints negated, exchanged, left out, or in other axes."""
     far, near = points = model.point[k]
-    readings = {("points", "exchanged", " in the two bodies"): (near, far)}
     for side, where in enumerate(("far", "near")):
         turn = rotation_matrix(model.turn[k, side])
         for words, point in (
@@ -446,62 +399,58 @@ def _point_readings(model: Model, k: int) -> Iterator[tuple[Any, ...]]:
             ("given in the axes of the joint", turn @ points[side]),
             ("turned into the axes of the joint", turn.T @ points[side]),
         ):
-            readings[f"{where} point", words, ""] = (point, near) if side == 0 else (far, point)
-    readings["points", "reversed", " in both bodies"] = (-far, -near)
-    for (term, words, where), pair in readings.items():
-        yield term, words, _constant("point", k, pair), where
+            pair = (point, near) if side == 0 else (far, point)
+            yield Reading(f"{where} point", words, _constant("point", k, pair))
+    yield Reading("points", "exchanged", _constant("point", k, (near, far)), " in the two bodies")
+    yield Reading("points", "reversed", _constant("point", k, (-far, -near)), " in both bodies")
 
 
-def _axes_readings(model: Model, k: int) -> Iterator[tuple[Any, ...]]:
+def _axes_readings(model: Model, k: int) -> Iterator[Reading]:
     """Frames of joints left out, turned the other way, exchanged or misread; axes reversed or exchanged."""
     kind = model.kinds[k]
-    motions = [axis for _, axis in kind.motions]
     far, near = frames = model.turn[k]
-    readings: dict[tuple[str, str, str], tuple[Array, Array]] = {}
-    for axis in dict.fromkeys(motions):
-        half = np.roll(np.eye(4)[1], int(axis == 0))  # about y for x, about x for the others
-        pair = (quaternion_product(far, half), quaternion_product(near, half))
-        readings[f"axis {'xyz'[axis]}", "reversed", ""] = pair
-    far_body, near_body, both, two = (
-        f" in {of}" for of in ("the far body", "the near body", "both bodies", "the two bodies")
-    )
+
+    def turned_by(half: Array) -> Change:
+        return _constant("turn", k, quaternion_product(frames, half))
+
+    for axis in dict.fromkeys(axis for _, axis in kind.motions):
+        about = np.roll(np.eye(4)[1], int(axis == 0))  # about y for x, about x for the others
+        yield Reading(f"axis {'xyz'[axis]}", "reversed", turned_by(about))
+    far_body, near_body, both = " in the far body", " in the near body", " in both bodies"
     for sides, where in (((0,), far_body), ((1,), near_body), ((0, 1), both)):
         for words, misread in QUATERNIONS.items():
             read = [misread(q) if side in sides else q for side, q in enumerate(frames)]
-            readings["axes", words, where] = read[0], read[1]
-    readings["axes", "exchanged", two] = near, far
-    readings["axes", "those of the near body", far_body] = near, near
-    readings["axes", "those of the far body", near_body] = far, far
+            yield Reading("axes", words, _constant("turn", k, read), where)
+    yield Reading("axes", "exchanged", _constant("turn", k, (near, far)), " in the two bodies")
+    yield Reading("axes", "those of the near body", _constant("turn", k, (near, near)), far_body)
+    yield Reading("axes", "those of the far body", _constant("turn", k, (far, far)), near_body)
     pairs = ((0, 2), (1, 2)) if kind.is_about_z else ((0, 1), (0, 2), (1, 2))
-    for i, j in pairs if motions else ():
-        half = np.array([0.0, *(np.sqrt(0.5) * (np.eye(3)[i] + np.eye(3)[j]))])
-        pair = (quaternion_product(far, half), quaternion_product(near, half))
-        readings[f"axes {'xyz'[i]} and {'xyz'[j]}", "exchanged", ""] = pair
-    for (term, words, where), pair in readings.items():
-        yield term, words, _constant("turn", k, pair), where
+    for i, j in pairs if kind.motions else ():
+        about = np.array([0.0, *(np.sqrt(0.5) * (np.eye(3)[i] + np.eye(3)[j]))])
+        yield Reading(f"axes {'xyz'[i]} and {'xyz'[j]}", "exchanged", turned_by(about))
 
 
 # -- springs, fields of others, and all ----------------------------------------------------------------
 
 
-def _spring_readings(case: Case, i: int) -> Iterator[tuple[Any, ...]]:
+def _spring_readings(case: Case, i: int) -> Iterator[Reading]:
     """Points of springs negated, left out or exchanged; rates not divided by the length."""
     model = case.model
     points = model.spring_point[i]
-    yield "points", "exchanged", _constant("spring_point", i, points[::-1])
+    yield Reading("points", "exchanged", _constant("spring_point", i, points[::-1]))
     for side, where in enumerate(("first", "second")):
         where = f"{where} point" if model.spring_body[i, side] >= 0 else "world's point"
         for words, point in (("reversed", -points[side]), ("left out", 0 * points[side])):
             pair = (point, points[1]) if side == 0 else (points[0], point)
-            yield where, words, _constant("spring_point", i, pair)
+            yield Reading(where, words, _constant("spring_point", i, pair))
     if model.spring_damping[i]:
 
-        def undivided(c: Case) -> Array:
-            each = single_states(c.state)
+        def undivided(place: _Place) -> Array:
+            each = single_states(place.case.state)
             spans = np.array([np.linalg.norm(spring_vectors(model, s.r, s.p)[i]) for s in each])
             return np.asarray(spans * model.spring_damping[i])
 
-        yield "rate", "dᵀḋ, not over the length", _row("spring_damping", i, undivided)
+        yield Reading("rate", "dᵀḋ, not over the length", _row("spring_damping", i, undivided))
 
 
 def _fields_of_others(model: Model) -> Iterator[tuple[str, str, str, Change]]:

@@ -31,13 +31,13 @@ class Terms:
         """Solve the right mechanism and its responses."""
         self.predictor, self.model = predictor, predictor.case.model
         self.joints = np.arange(len(self.model.kind))  # where joint k is in the tree
-        self.tree, self.state = predictor.case
+        self.tree, self.state = predictor.case.model, predictor.case.state
         self.ends: tuple[tuple[int, int], ...] = ()
         self.scale: Array | None = None
         if self.model.has_loops:
             cut = cut_open(self.model)
             self.joints, self.ends, self.scale = cut.place, cut.ends, cut.row_scale
-            self.tree, self.state = predictor.cut(*predictor.case)
+            self.tree, self.state = predictor.cut(self.tree, self.state)
         self.found = self._solved(self.ends, "accelerations")
         self._responses = self.found.to_joints()  # (S, N, 4, 3, c)
         first = np.cumsum([0, *(held.shape[-1] for held in self.found.held)])

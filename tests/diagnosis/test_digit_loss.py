@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from plumbline.diagnosis.diagnose import diagnose
-from plumbline.diagnosis.digit_loss import MIN_SCATTER, DigitLoss, Problem, find_digit_loss
+from plumbline.diagnosis.digit_loss import MIN_SCATTER, DigitLoss, find_digit_loss, worst_difference
 from plumbline.engines.registry import load_adapter
 from plumbline.model.equivalent import WORLD_VECTORS, bodies_between, rotate_world, unrotate
 from plumbline.model.kinematics import complete_state
@@ -43,7 +43,7 @@ def answering(change):
 def loss_of(change, joints="bb"):
     model, truth = known(joints)
     evaluate = answering(change)
-    return find_digit_loss(Problem.worst(model, evaluate(model, truth.states), truth), evaluate)
+    return find_digit_loss(worst_difference(model, evaluate(model, truth.states), truth), evaluate)
 
 
 def noise(state, shape):
@@ -102,8 +102,8 @@ def test_an_engine_that_keeps_the_call_before_loses_no_digits():
         kept[:] = reported[-1:]
         return reported[:-1]
 
-    problem = Problem.worst(model, evaluate(model, truth.states), truth)
-    assert problem.ratio() > 1e9
+    problem = worst_difference(model, evaluate(model, truth.states), truth)
+    assert np.max(np.abs(problem.values)) > 1e9
     assert find_digit_loss(problem, evaluate) is None
 
 
@@ -134,7 +134,7 @@ def test_an_engine_that_fails_on_turned_problems_is_not_accused_of_losing_digits
     def evaluate(requested, states):
         raise RuntimeError("no")
 
-    assert find_digit_loss(Problem.worst(model, reported, truth), evaluate) is None
+    assert find_digit_loss(worst_difference(model, reported, truth), evaluate) is None
 
 
 @pytest.mark.parametrize("name", ["chain-30-balls", "chain-50-balls"])
