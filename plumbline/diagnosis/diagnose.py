@@ -8,7 +8,7 @@ scatters where little more than the last bits of the problem change has no such 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -29,6 +29,7 @@ from plumbline.diagnosis.fit import (
     Explanation,
     Mask,
     Search,
+    changed,
 )
 from plumbline.diagnosis.needs import find_needs
 from plumbline.diagnosis.outputs import Outputs
@@ -48,7 +49,7 @@ from plumbline.diagnosis.prediction import (
 from plumbline.diagnosis.readings import other_branches
 from plumbline.diagnosis.terms import Terms, force_places, is_spanned
 from plumbline.engines.registry import load_adapter
-from plumbline.model.datatypes import Array, Model, State, StateQuantities
+from plumbline.model.datatypes import Array, Model, StateQuantities
 from plumbline.model.kinematics import complete_state, stack_states
 from plumbline.truth.ground_truth import StateTruth
 
@@ -146,9 +147,7 @@ class _Diagnosing:
             words = "wrong; all other quantities are right"
             return (Cause("output", "mass matrix", "", words, quantities=("mass_matrix",)),)
         if self.largest <= MIN_DIAGNOSABLE_RATIO or not np.isfinite(self.largest):
-            return (
-                self._close(self.wrong()) if np.isfinite(self.largest) else self._unexplained(self.wrong()),
-            )
+            return (self._unexplained(self.wrong(), "close" if np.isfinite(self.largest) else ""),)
         wrong = self.wrong(MIN_DIAGNOSABLE_RATIO)
         self.loss = self._digit_loss(wrong)
         found = self._in_words(wrong) or self._single(View()) or self._outputs_alone(wrong)
@@ -182,11 +181,8 @@ class _Diagnosing:
         is_simple = len(beside) <= 2 and not any(one.kind == "output" and one.amount for one in beside)
         return (beside if is_simple else ()) or self._pairs() or beside
 
-    def _close(self, quantities: Sequence[str]) -> Cause:
-        return Cause("unexplained", quantity_words(quantities), "", "close", quantities=tuple(quantities))
-
-    def _unexplained(self, quantities: Sequence[str]) -> Cause:
-        return Cause("unexplained", quantity_words(quantities), quantities=tuple(quantities))
+    def _unexplained(self, quantities: Sequence[str], change: str = "") -> Cause:
+        return Cause("unexplained", quantity_words(quantities), "", change, quantities=tuple(quantities))
 
     def _digit_loss(self, quantities: Sequence[str]) -> Cause | None:
         if not self.evaluate or self.model.has_loops:
@@ -197,20 +193,18 @@ class _Diagnosing:
 
     # -- causes in what is evaluated -----------------------------------------------------------------
 
-    def _of_sums(self, difference: Difference) -> Mask | None:
-        """The mask of energies and momentum, where they are right: they may be found from other numbers."""
+    def _mask(self, difference: Difference, are_sums_apart: bool) -> Mask:
+        """All quantities; or the vectors, where energies and momentum are right."""
+        if not are_sums_apart:
+            return difference.everything
         sums = difference.of(SUMS)
-        return sums if np.all(np.abs(difference.values[sums]) <= ACCEPTED_RATIO) else None
+        return ~sums & np.all(np.abs(difference.values[sums]) <= ACCEPTED_RATIO)
 
     def _single(self, view: View, are_sums_apart: bool = False) -> tuple[Cause, ...]:
         """Every single cause of all quantities; or of the vectors alone, where the sums are right."""
         search = self.search(view)
-        difference, mask = search.difference, search.difference.everything
-        if are_sums_apart:
-            sums = self._of_sums(difference)
-            if sums is None:
-                return ()
-            mask = ~sums
+        difference = search.difference
+        mask = self._mask(difference, are_sums_apart)
         if np.max(np.abs(difference.values[mask]), initial=0.0) <= ACCEPTED_RATIO:
             return ()
         found = search.explain(mask)
@@ -221,8 +215,7 @@ class _Diagnosing:
             if branch:
                 return branch
             found = search.explain_by_vectors(mask)
-        found = self._proved(view, found, mask)
-        return self._named(found) if found else ()
+        return self._named(self._proved(view, found, mask))
 
     def _single_of_another_kind(self, view: View, wrong: Sequence[str]) -> tuple[Cause, ...]:
         """The same of engines in maximal coordinates, or that take a state with loops in another way."""
@@ -232,6 +225,8 @@ class _Diagnosing:
 
     def _named(self, found: Sequence[Explanation]) -> tuple[Cause, ...]:
         """The causes of the first explanation, with those from which the data cannot distinguish them."""
+        if not found:
+            return ()
         first, *others = found
         causes = dict(zip(first.combination, first.causes(len(self.places)), strict=True))
         equal: dict[Edit, dict[Edit, Cause]] = {one: {} for one in causes}
@@ -250,30 +245,21 @@ class _Diagnosing:
         there, here = Difference(self.model, self.reported, self.truth, view, others), self.difference(view)
         kept = there.of(set(here.quantity[mask]))
         accepted = max(here.accepted(mask), there.accepted(kept))
-        with_changes = [one for one in found if all(c.change is not None for c in one.combination)]
-        effects = there.evaluate([(one.combination, one.amounts) for one in with_changes])
-        left = np.abs(there.values - effects)[:, kept] if len(effects) else np.zeros((0, 1))
-        refuted = [
-            one for one, x in zip(with_changes, left, strict=True) if not np.max(x, initial=0.0) <= accepted
-        ]
-        return [one for one in found if one not in refuted]
+        provable = [one for one in found if all(c.change is not None for c in one.combination)]
+        effects = there.evaluate([(one.combination, one.amounts) for one in provable])
+        left = np.max(np.abs(there.values - effects)[:, kept], axis=1, initial=0.0)
+        refuted = {id(one) for one, x in zip(provable, left, strict=True) if not x <= accepted}
+        return [one for one in found if id(one) not in refuted]
 
     def _branch(self, difference: Difference) -> tuple[Cause, ...]:
         """Loops that are closed on another branch at some states."""
-        predictor = difference.predictor
-        wanted, accepted = difference.values, difference.accepted(difference.everything)
-
-        def is_explained(s: int, poses: Sequence[Callable[[State], State]]) -> bool:
-            here = difference.state == s
-            if np.max(np.abs(wanted[here])) <= accepted:
-                return True
-            with np.errstate(all="ignore"):
-                left = (np.abs(wanted - difference.effect_elsewhere(pose, s))[here] for pose in poses)
-                return any(bool(np.max(one) <= accepted) for one in left)
-
+        accepted = difference.accepted(difference.everything)
         for cause, poses in other_branches(self.model):
-            if all(is_explained(s, poses) for s in range(predictor.count)):
-                return (replace(cause, states=predictor.count),)
+            effects = difference.evaluate([((), np.zeros(0)), *(((one,), np.zeros(0)) for one in poses)])
+            off = np.nan_to_num(np.abs(difference.values - effects), nan=np.inf)
+            at_states = (off[:, difference.state == s] for s in range(difference.predictor.count))
+            if all(np.min(np.max(one, axis=1)) <= accepted for one in at_states):
+                return (replace(cause, states=difference.predictor.count),)
         return ()
 
     # -- causes in outputs ---------------------------------------------------------------------------
@@ -337,33 +323,22 @@ class _Diagnosing:
         off = self._at(quantity, self.reported) - right
         return error_ratio(off, self._bounds(quantity)) <= ACCEPTED_RATIO
 
-    def _altered(self, search: Search, found: Explanation) -> tuple[Case | None, Answers]:
+    def _altered(self, search: Search, found: Explanation) -> tuple[Case, Answers]:
         """The mechanism with a cause, and the quantities that follow."""
         difference = search.difference
         effect = difference.evaluate([(found.combination, found.amounts)])[0] * difference.weight
-        right = {}
-        for q in difference.names:
-            values = self._at(q, self.truth.quantities)
-            right[q] = values + effect[difference.quantity == q].reshape(values.shape)
-        (candidate,) = found.combination
-        if candidate.change is None:
-            return None, right
-        case = candidate.change(difference.predictor.case, found.amounts)
-        model, state = case.model, case.state
-        if any(
-            np.ndim(x) > np.ndim(getattr(self.model, name))
-            for name, x in vars(model).items()
-            if name != "kind"
-        ):
-            return None, right
-        return Case(model, complete_state(model, state)), right
+        right = {q: x + effect[difference.quantity == q].reshape(x.shape) for q, x in difference.true.items()}
+        case = changed(difference.predictor.case, found.combination, found.amounts)
+        fields = vars(self.model).items()
+        if any(np.ndim(getattr(case.model, name)) > np.ndim(x) for name, x in fields if name != "kind"):
+            return difference.predictor.case, right  # another number at each state
+        return Case(case.model, complete_state(case.model, case.state)), right
 
     def _pairs(self) -> tuple[Cause, ...]:
         """Two causes in what is evaluated, together."""
         search = self.search(View())
-        sums = self._of_sums(search.difference)
-        masks = [search.difference.everything, *([] if sums is None else [~sums])]
-        for mask in masks:
+        for are_sums_apart in (False, True):
+            mask = self._mask(search.difference, are_sums_apart)
             found = self._proved(View(), search.explain_by_pairs(mask), mask)
             if found:
                 return self._named(found)
@@ -372,11 +347,10 @@ class _Diagnosing:
     def _forces(self) -> tuple[Cause, ...]:
         """The only place of unknown forces of a tree; where sums are right and accelerations are not."""
         difference = self.difference(View())
-        if self.model.has_loops or np.any(np.abs(difference.values[difference.of(SUMS)]) > ACCEPTED_RATIO):
+        mask = self._mask(difference, are_sums_apart=True)
+        of_motion = difference.values[mask & difference.of(VECTORS[:2])]
+        if self.model.has_loops or np.max(np.abs(of_motion), initial=0.0) <= ACCEPTED_RATIO:
             return ()
-        if np.max(np.abs(difference.values[difference.of(VECTORS[:2])])) <= ACCEPTED_RATIO:
-            return ()
-        mask = difference.of(VECTORS)
         wanted, states, accepted = difference.values[mask], difference.state[mask], difference.accepted(mask)
         for places in force_places(self.model):
             edits = [edit for _, some in places for edit in some]
@@ -411,7 +385,7 @@ class _Diagnosing:
         return (
             *named,
             *([self._unexplained(rest)] if rest else []),
-            *([self._close(close)] if close else []),
+            *([self._unexplained(close, "close")] if close else []),
         )
 
     # -- what an unexplained difference needs --------------------------------------------------------

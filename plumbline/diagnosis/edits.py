@@ -56,7 +56,8 @@ def with_fields(case: Case, **fields: Any) -> Case:
     """Replace fields of the model or of the state."""
     of_state = {name: fields.pop(name) for name in list(fields) if hasattr(case.state, name)}
     model = replace(case.model, **fields) if fields else case.model
-    return replace(case, model=model, state=replace(case.state, **of_state) if of_state else case.state)
+    state = replace(case.state, **of_state) if of_state else case.state
+    return Case(model, state, case.method, case.read)
 
 
 def field(case: Case, name: str) -> Array:

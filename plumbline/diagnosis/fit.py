@@ -7,10 +7,10 @@ in units of the rounding bounds.  What is left is evaluated at every state of th
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from plumbline.diagnosis.cause import FACTORS, Cause
 from plumbline.diagnosis.edits import LENGTHS, Edit, number_edits
 from plumbline.diagnosis.prediction import (
-    VECTORS,
     Answers,
     Case,
     Predictor,
@@ -29,8 +28,8 @@ from plumbline.diagnosis.prediction import (
     values_of,
 )
 from plumbline.diagnosis.readings import change_key, reading_edits
-from plumbline.diagnosis.terms import Terms
-from plumbline.model.datatypes import Array, Model, State, StateQuantities
+from plumbline.diagnosis.terms import Terms, missing_gammas
+from plumbline.model.datatypes import Array, Model, StateQuantities
 from plumbline.truth.ground_truth import StateTruth
 
 MIN_DIAGNOSABLE_RATIO = 8.0  # in bounds: of hundreds of fitted causes, some explain less by chance
@@ -50,7 +49,7 @@ RANK_TOLERANCE = 1e-9  # of slopes: a direction that changes nothing
 MIN_RATIO_OF_VECTORS = 100.0  # in bounds: three numbers explain a smaller difference by chance
 QUARTER_TURNS = [  # rotation vectors of the turns of a cube, half turns twice
     angle * np.array(axis) / np.linalg.norm(axis)
-    for axis in product((-1, 0, 1), repeat=3)
+    for axis in itertools.product((-1, 0, 1), repeat=3)
     for angle in ((), (np.pi / 2, np.pi), (np.pi,), (2 * np.pi / 3,))[np.count_nonzero(axis)]
 ]
 Mask = NDArray[np.bool_]
@@ -108,32 +107,20 @@ class Difference:
         each = [answers[q].reshape(*answers[q].shape[:lead], -1) for q in self.names]
         return np.concatenate(each, axis=-1)
 
-    @cached_property
-    def _right(self) -> Array:
-        return self._flat(self.predictor.right)
-
     def flat_vectors(self, answers: Answers) -> Array:
         """Return changes of vectors (S, …) as an effect (m,); the sums do not change."""
         zeros = {name: 0 * x for name, x in self.predictor.right.items()}
         return np.asarray(self._flat(zeros | answers) / self.weight)
 
-    def effects(self, cases: Sequence[Case]) -> Array:
-        """Return what engines that evaluate other cases return besides the truth, (cases, m)."""
-        if not cases:
-            return np.zeros((0, len(self.values)))
-        return np.asarray((self._flat(self.predictor.predict(cases), 1) - self._right) / self.weight)
-
-    def effect_elsewhere(self, pose: Callable[[State], State], s: int) -> Array:
-        """Return the effect (m,) of another pose of loops at one state; not numbers where there is none."""
-        predictor = self.predictor
-        found = {name: np.full(x.shape, np.nan) for name, x in predictor.right.items()}
-        try:
-            answers = Predictor(self.model, [pose(predictor.states[s])], self.view).right
-        except (ValueError, np.linalg.LinAlgError):
-            return np.full(len(self.values), np.nan)
-        for name, x in answers.items():
-            found[name][s] = x[0]
-        return np.asarray((self._flat(found) - self._right) / self.weight)
+    @cached_property
+    def terms(self) -> list[Edit]:
+        """Edits of terms of the equations."""
+        changes = list[tuple[Cause, Answers]]()
+        if self.view == View():
+            changes += Terms(self.predictor).changes()
+        elif self.view.are_bodies_kept:
+            changes += missing_gammas(self.predictor)
+        return [Edit(cause, effect=self.flat_vectors(change)) for cause, change in changes]
 
     def evaluate(self, lanes: Sequence[Lane]) -> Array:
         """Return the effects of combinations of candidates with their amounts, (lanes, m)."""
@@ -146,7 +133,8 @@ class Difference:
                     linear[i] += one.effect * (own[0] - one.nominal[0] if len(own) else 1.0)
         others = [i for i, case in enumerate(cases) if case is not self.predictor.case]
         if others:
-            linear[others] += self.effects([cases[i] for i in others])
+            answers = self.predictor.predict([cases[i] for i in others])
+            linear[others] += (self._flat(answers, 1) - self._flat(self.predictor.right)) / self.weight
         return linear
 
 
@@ -218,63 +206,37 @@ def fit_amounts(
     return [found for one in fits if (found := one.result(accepted)) is not None]
 
 
+def _edits(difference: Difference) -> Iterator[Edit]:
+    """The table of numbers and readings of a view."""
+    model, case = difference.model, difference.predictor.case
+    if difference.view == View():
+        yield from number_edits(case)
+        yield from reading_edits(case)
+    else:  # other numbers act as in joint coordinates, and without loops all do
+        lengths = (one for one in number_edits(case) if one.cause.unit in LENGTHS)
+        yield from (one for one in lengths if model.has_loops or len(one.nominal) > 1)
+
+
 class Search:
     """All candidates of a view, screened against a difference."""
 
     def __init__(self, difference: Difference, *, of_terms_alone: bool = False) -> None:
         """List the candidates, or terms alone, and evaluate their slopes and whole effects."""
         self.difference = difference
-        view, model = difference.view, difference.model
-        case = difference.predictor.case
-        # other numbers act as in joint coordinates, and without loops all do
-        is_of_lengths = view.are_bodies_kept or view.end_rows == "twists"
-        every = (
-            []
-            if of_terms_alone
-            else [one for one in number_edits(case) if not is_of_lengths or one.cause.unit in LENGTHS]
+        every = [*(() if of_terms_alone else _edits(difference)), *difference.terms]
+        self.fixed, self.numbers, self.vectors = (
+            [one for one in every if len(one.nominal) == count] for count in (0, 1, 3)
         )
-        self.vectors = [one for one in every if len(one.nominal) > 1]
-        is_of_numbers = model.has_loops or not is_of_lengths
-        self.numbers = [one for one in every if len(one.nominal) == 1 and is_of_numbers]
-        self.fixed = list[Edit]()
-        if not is_of_lengths:
-            self.fixed = [] if of_terms_alone else list(reading_edits(case))
-            terms = Terms(difference.predictor)
-            flat = difference.flat_vectors
-            self.numbers += [Edit(cause, effect=flat(effect)) for cause, effect in terms.linear()]
-            self.fixed += [Edit(cause, effect=flat(effect)) for cause, effect in terms.fixed()]
-        elif view.are_bodies_kept:
-            self.fixed += self._missing_gammas(model)
         steps = [one.nominal + STEP * one.scale for one in self.numbers]
         slopes = difference.evaluate([((one,), x) for one, x in zip(self.numbers, steps, strict=True)])
         scales = np.array([STEP * one.scale for one in self.numbers]).reshape(-1, 1)
         self.slopes = np.where(np.isfinite(slopes), slopes, 0.0) / scales
-        self.whole = ([] if is_of_lengths else self._whole_numbers()) + [
-            ((one,), np.zeros(0)) for one in self.fixed
-        ]
+        # of numbers that may vanish the amounts of words
+        words = [factor for factor in FACTORS if factor != 0.5 and difference.view == View()]
+        can_vanish = [one for one in self.numbers if one.can_vanish and one.nominal[0]]
+        self.whole = [((one,), factor * one.nominal) for one in can_vanish for factor in words]
+        self.whole += [((one,), one.nominal) for one in self.fixed]
         self.effects = difference.evaluate(self.whole)
-
-    def _missing_gammas(self, model: Model) -> Iterator[Edit]:
-        """γ of rows of joints that an engine in maximal coordinates leaves out."""
-        predictor = self.difference.predictor
-        at = list(predictor.each_state(predictor.case))
-        joints = [k for k in range(len(model.kind)) if not model.free[k]]
-        places = {f"joint {k + 1}": [k] for k in joints} | ({"all joints": joints} if joints[1:] else {})
-        for place, some in places.items():
-            answers = predictor.of_bodies(at, some)
-            change = {name: answers[name] - predictor.right[name] for name in VECTORS}
-            cause = Cause("term", "γ of the rows", place, "missing")
-            yield Edit(cause, effect=self.difference.flat_vectors(change))
-
-    def _whole_numbers(self) -> list[Lane]:
-        """The amounts of words of numbers that may vanish."""
-        return [
-            ((one,), factor * one.nominal)
-            for one in self.numbers
-            if one.can_vanish and one.nominal[0]
-            for factor in FACTORS
-            if factor != 0.5
-        ]
 
     def explain(self, mask: Mask) -> list[Explanation]:
         """Return every single cause that explains the difference of some quantities."""

@@ -12,6 +12,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -314,91 +315,82 @@ def _wrong_numbers(steps: _Steps) -> list[Edit]:
 
 # -- joint coordinates -------------------------------------------------------------------------------
 
-CLASSICAL = classical_runge_kutta("joint rotations")
-
 
 def _joint_space_edits(declared: JointSpaceMethod, model: Model) -> Iterator[Edit]:
     """Other formulas in the same coordinates, then the declared one with another parameter."""
     yield from _formulas([declared], _other_formulas(declared, model))
-    yield _parameter(declared, "step_factor", "it took a step {} times as long as asked")
-    if model.rods.any() and declared.coordinates == "joint rotations":
-        words = "the axial inertia of rods were {} of the trace of the inertia that they carry"
-        yield _parameter(declared, "rod_axial_inertia", words)
-    if declared.implicit_forces != "none":
-        words = "the derivatives of forces in the matrix were {} times as large"
-        yield _parameter(declared, "damping_factor", words)
-    if declared.formula == "semi-implicit Euler":
-        words = "it moved positions by {} of the new velocity and the rest of the old one"
-        yield _parameter(declared, "new_velocity_share", words)
+    has_rods = bool(model.rods.any()) and declared.coordinates == "joint rotations"
+    for applies, name, words in (
+        (True, "step_factor", "it took a step {} times as long as asked"),
+        (has_rods, "rod_axial_inertia",
+         "the axial inertia of rods were {} of the trace of the inertia that they carry"),
+        (declared.implicit_forces != "none", "damping_factor",
+         "the derivatives of forces in the matrix were {} times as large"),
+        (declared.formula == "semi-implicit Euler", "new_velocity_share",
+         "it moved positions by {} of the new velocity and the rest of the old one"),
+    ):  # fmt: skip
+        if applies:
+            yield _parameter(declared, name, words)
     for i, j in itertools.permutations(range(len(declared.weights)), 2):
         words = f"the weight of stage {i + 1} were larger by {{}} and that of stage {j + 1} smaller"
-        moved = np.eye(len(declared.weights))[i] - np.eye(len(declared.weights))[j]
-        yield _family(
-            words, 0.0,
-            lambda x, moved=moved: replace(declared, weights=tuple(declared.weights + x * moved)),  # type: ignore[misc]
-            can_vanish=False,
-        )  # fmt: skip
+        yield _family(words, 0.0, partial(_with_weights, declared, i, j), can_vanish=False)
+
+
+def _with_weights(declared: JointSpaceMethod, i: int, j: int, x: float) -> JointSpaceMethod:
+    """Weight i by x more, weight j by x less."""
+    weights = list(declared.weights)
+    weights[i] += x
+    weights[j] -= x
+    return replace(declared, weights=tuple(weights))
 
 
 def _other_formulas(declared: JointSpaceMethod, model: Model) -> Iterator[tuple[str, JointSpaceMethod]]:
-    if model.has_loops and declared.gap_correction:
-        yield "it did not correct the gaps of loops", replace(declared, gap_correction=0.0)
     euler = JointSpaceMethod(
         "semi-implicit Euler", declared.coordinates, declared.rod_axial_inertia,
         free_coordinates=declared.free_coordinates, gap_correction=declared.gap_correction,
     )  # fmt: skip
-    is_euler = declared.formula == "semi-implicit Euler"
-    verlet = replace(euler, formula="velocity Verlet")
-    reused = "step, with the last acceleration of the step before in place of its first"
-    yield from {
-        "it took explicit Euler's step: positions by the old velocity": replace(
-            euler, new_velocity_share=0.0
-        ),
-        "it took semi-implicit Euler's step, with all forces explicit": euler,
-        "it exchanged the halves of semi-implicit Euler: positions first": replace(
-            euler, formula="positions first"
-        ),
-        "it took velocity Verlet's step": verlet,
-        f"it took velocity Verlet's {reused}": replace(verlet, reuses_acceleration=True),
-        f"it took its declared {reused}": replace(declared, reuses_acceleration=True),
-        "it moved positions by the mean of the old and the new velocity": replace(
-            declared if is_euler else euler, new_velocity_share=0.5
-        ),
-    }.items()
-    if declared.coordinates == "joint rotations":
-        if model.has_drag:
-            words = "it took semi-implicit Euler's step, with the drag implicit and velocity terms explicit"
-            yield words, replace(euler, implicit_forces="applied")
-        words = "it took semi-implicit Euler's step, with all forces implicit"
-        yield words, replace(euler, implicit_forces="all")
-        words = "it moved quaternions by p + h ṗ and normalised them"
-        yield words, replace(declared, is_rotation_exact=False)
-    if declared.implicit_forces != "none":
-        words = "it symmetrised the derivatives of forces in the matrix"
-        yield words, replace(declared, is_damping_symmetric=True)
-        yield "it moved positions by the old velocity", replace(declared, new_velocity_share=0.0)
-    for count in (2, 3, 4):
-        yield f"it took {count} steps of 1/{count} of the size", replace(declared, substeps=count)
-    if is_euler:
-        names = [(f"rod {k + 1}",) * int(model.rods[k]) + (f"body {k + 1}",) for k in range(model.n)]
-        for j, name in enumerate(itertools.chain.from_iterable(names)):
-            words = f"it moved the joint of {name} by the old velocity (stale)"
-            yield words, replace(declared, stale_joint=j)
-    yield from _runge_kutta_formulas(declared)
-
-
-def _runge_kutta_formulas(declared: JointSpaceMethod) -> Iterator[tuple[str, JointSpaceMethod]]:
-    base = classical_runge_kutta(
+    is_euler, turns = declared.formula == "semi-implicit Euler", declared.coordinates == "joint rotations"
+    is_implicit, verlet = declared.implicit_forces != "none", replace(euler, formula="velocity Verlet")
+    classical = classical_runge_kutta(
         declared.coordinates, declared.rod_axial_inertia, declared.free_coordinates, declared.gap_correction
     )
-    for name, (stages, weights) in TABLEAUS.items():
-        yield f"it took the step of {name}", replace(base, stages=stages, weights=weights)
-    if declared.coordinates == "joint rotations":
-        for count, words in enumerate(
-            ("left dexp⁻¹ out of Runge–Kutta's stages (θ̇ = v: order 2)", "cut dexp⁻¹ after θ×v/2",
-             "cut dexp⁻¹ after θ×(θ×v)/12")
-        ):  # fmt: skip
-            yield f"it {words}", replace(base, correction_terms=count)
+    reused = "step, with the last acceleration of the step before in place of its first"
+    names = [(f"rod {k + 1}",) * int(model.rods[k]) + (f"body {k + 1}",) for k in range(model.n)]
+    moved = enumerate(itertools.chain.from_iterable(names) if is_euler else ())
+    for applies, words, base, changes in (
+        (model.has_loops, "it did not correct the gaps of loops", declared, {"gap_correction": 0.0}),
+        (True, "it took explicit Euler's step: positions by the old velocity", euler,
+         {"new_velocity_share": 0.0}),
+        (True, "it took semi-implicit Euler's step, with all forces explicit", euler, {}),
+        (True, "it exchanged the halves of semi-implicit Euler: positions first", euler,
+         {"formula": "positions first"}),
+        (True, "it took velocity Verlet's step", verlet, {}),
+        (True, f"it took velocity Verlet's {reused}", verlet, {"reuses_acceleration": True}),
+        (True, f"it took its declared {reused}", declared, {"reuses_acceleration": True}),
+        (True, "it moved positions by the mean of the old and the new velocity",
+         declared if is_euler else euler, {"new_velocity_share": 0.5}),
+        (turns and model.has_drag,
+         "it took semi-implicit Euler's step, with the drag implicit and velocity terms explicit", euler,
+         {"implicit_forces": "applied"}),
+        (turns, "it took semi-implicit Euler's step, with all forces implicit", euler,
+         {"implicit_forces": "all"}),
+        (turns, "it moved quaternions by p + h ṗ and normalised them", declared,
+         {"is_rotation_exact": False}),
+        (is_implicit, "it symmetrised the derivatives of forces in the matrix", declared,
+         {"is_damping_symmetric": True}),
+        (is_implicit, "it moved positions by the old velocity", declared, {"new_velocity_share": 0.0}),
+        *((True, f"it took {count} steps of 1/{count} of the size", declared, {"substeps": count})
+          for count in (2, 3, 4)),
+        *((True, f"it moved the joint of {name} by the old velocity (stale)", declared, {"stale_joint": j})
+          for j, name in moved),
+        *((True, f"it took the step of {name}", classical, {"stages": stages, "weights": weights})
+          for name, (stages, weights) in TABLEAUS.items()),
+        *((turns, f"it {words}", classical, {"correction_terms": count})
+          for count, words in enumerate(("left dexp⁻¹ out of Runge–Kutta's stages (θ̇ = v: order 2)",
+                                         "cut dexp⁻¹ after θ×v/2", "cut dexp⁻¹ after θ×(θ×v)/12"))),
+    ):  # fmt: skip
+        if applies:
+            yield words, replace(base, **changes)  # type: ignore[arg-type]
 
 
 def _formulas(known: list[Any], others: Iterator[tuple[str, Any]]) -> Iterator[Edit]:

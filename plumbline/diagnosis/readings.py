@@ -6,6 +6,7 @@ Readings have no amount.  Each is listed for one body, joint or spring, and for 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import permutations
 from typing import Any, NamedTuple
@@ -26,6 +27,7 @@ from plumbline.model.kinematics import (
     rotate_vectors,
     rotation_matrix,
     spring_vectors,
+    stack_states,
 )
 from plumbline.model.loops import assembled, loop_gaps
 
@@ -510,47 +512,40 @@ def _rounded_to_single_precision(case: Case) -> Case:
 # -- loops ---------------------------------------------------------------------------------------------
 
 
-def other_branches(model: Model) -> Iterator[tuple[Cause, list[Callable[[State], State]]]]:
+def other_branches(model: Model) -> Iterator[tuple[Cause, list[Edit]]]:
     """List joints on the world at whose coordinates an engine may close the loops in other poses.
 
     Yields:
-        The cause, and the poses that guesses lead to.
+        The cause, and the poses that guesses lead to; the right one where loops do not close from there.
 
     """
     turns = [
         (k, i) for k in range(model.n) for i, (what, _) in enumerate(model.kinds[k].motions) if what == "turn"
     ]
-    guesses: list[Callable[[Array], Array]] = [lambda x: -x, *map(_turned_over, turns)]
     for given in map(int, np.flatnonzero(model.body[: model.n, 0] < 0)):
         if len(model.kinds[given].motions) == 1:
             words = "closed on another branch at the same coordinate"
             cause = Cause("frame", "loops", "", f"{words} of joint {given + 1}")
-            yield cause, [_branch(model, given, guess) for guess in guesses]
+            yield cause, [Edit(cause, _always(_branch(given, turn))) for turn in (None, *turns)]
 
 
-def _turned_over(turn: tuple[int, int]) -> Callable[[Array], Array]:
-    """A guess: one angle is half a turn more."""
+def _branch(given: int, turn: tuple[int, int] | None) -> Change:
+    """The pose to which loops close, joint ``given`` held, from half a turn more of one angle, or from −x."""
 
-    def guess(x: Array) -> Array:
-        y = x.copy()
-        y[turn] += np.pi
-        return y
-
-    return guess
-
-
-def _branch(model: Model, given: int, guess: Callable[[Array], Array]) -> Callable[[State], State]:
-    """The pose to which loops close from a guess of the coordinates (N, 2), joint ``given`` held."""
-
-    def pose(state: State) -> State:
-        x = guess(state.x)
+    def pose(model: Model, state: State) -> State:
+        x = -state.x if turn is None else state.x.copy()
+        if turn is not None:
+            x[turn] += np.pi
         x[given] = state.x[given]
         movable = np.ones(rate_count(model.tree), bool)
         movable[own_rates(model)[given]] = False
-        start = complete_state(model, State(**(vars(state) | {"x": x})))
-        other = assembled(model, start, movable, is_pose_kept=True)
-        if max(map(np.max, loop_gaps(model, other))) > CLOSED:
-            raise ValueError("the loops do not close from this guess")
-        return other
+        try:
+            start = complete_state(model, replace(state, x=x))
+            other = assembled(model, start, movable, is_pose_kept=True)
+        except (ValueError, np.linalg.LinAlgError):
+            return state
+        return other if max(map(np.max, loop_gaps(model, other))) <= CLOSED else state
 
-    return pose
+    return lambda case: with_fields(
+        case, **vars(stack_states([pose(case.model, one) for one in single_states(case.state)]))
+    )

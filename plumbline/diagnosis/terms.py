@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from plumbline.diagnosis.cause import Cause
 from plumbline.diagnosis.edits import Edit, at_place, coordinate_place, with_fields
-from plumbline.diagnosis.prediction import Answers, Case, Predictor
+from plumbline.diagnosis.prediction import VECTORS, Answers, Case, Predictor
 from plumbline.equations.responses import Responses
 from plumbline.model.datatypes import Array, Model
 from plumbline.model.kinematics import cross, quaternion_exponential, quaternion_product, rotation_matrix
@@ -50,6 +50,11 @@ class Terms:
     def answers(self, change: Array) -> Answers:
         """Turn changes (S, N, 4, 3) of the solution into those of the mechanism's vectors."""
         return self.predictor.vectors(change, self.found.tree, self.joints, self.predictor.projectors)
+
+    def changes(self) -> Iterator[tuple[Cause, Answers]]:
+        """List terms that may be multiplied, then those that may be left out, with their effects."""
+        yield from self.linear()
+        yield from self.fixed()
 
     def linear(self) -> Iterator[tuple[Cause, Answers]]:
         """List velocity terms, with the effect of one more of each."""
@@ -158,6 +163,17 @@ class Terms:
         return [self.answers(self._responses[..., i]) for i in range(at.start, at.stop)]
 
 
+def missing_gammas(predictor: Predictor) -> Iterator[tuple[Cause, Answers]]:
+    """List γ of rows of joints that an engine in maximal coordinates may leave out, with the effect."""
+    at = list(predictor.each_state(predictor.case))
+    joints = [k for k, is_free in enumerate(predictor.case.model.free) if not is_free]
+    places = {f"joint {k + 1}": [k] for k in joints} | ({"all joints": joints} if joints[1:] else {})
+    for place, some in places.items():
+        answers = predictor.of_bodies(at, some)
+        change = {name: answers[name] - predictor.right[name] for name in VECTORS}
+        yield Cause("term", "γ of the rows", place, "missing"), change
+
+
 # -- unknown forces ------------------------------------------------------------------------------------
 
 
@@ -180,11 +196,7 @@ def force_places(model: Model) -> Iterator[list[tuple[Cause, list[Edit]]]]:
     def another(term: str, place: str) -> Cause:
         return Cause("term", term, place, "another at each state")
 
-    single, joints, balls = (
-        list[tuple[Cause, list[Edit]]](),
-        list[tuple[Cause, list[Edit]]](),
-        list[tuple[Cause, list[Edit]]](),
-    )
+    single, joints, balls = (list[tuple[Cause, list[Edit]]]() for _ in range(3))
     for k, kind in enumerate(model.kinds):
         for i, (what, _) in enumerate(kind.motions):
             term = "force" if what == "slide" else "torque"
