@@ -8,7 +8,7 @@ scatters where little more than the last bits of the problem change has no such 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -352,26 +352,28 @@ class _Diagnosing:
         if self.model.has_loops or np.max(np.abs(of_motion), initial=0.0) <= ACCEPTED_RATIO:
             return ()
         wanted, states, accepted = difference.values[mask], difference.state[mask], difference.accepted(mask)
-        for places in force_places(self.model):
+        for places in self._places_of_unknowns(difference):
             edits = [edit for _, some in places for edit in some]
-            effects = iter(difference.evaluate([((e,), e.nominal) for e in edits]))
+            effects = iter(difference.evaluate([((e,), e.nominal) for e in edits])[:, mask])
             found = []
             for cause, some in places:
-                basis = np.stack([next(effects)[mask] for _ in some], axis=1)
+                basis = np.stack([next(effects) for _ in some], axis=1)
                 if is_spanned(basis, wanted, states, accepted):
                     found.append(cause)
             if found:
                 return (found[0],) if len(found) == 1 else ()
-        return self._other_velocity_term(difference, mask)
+        return ()
 
-    def _other_velocity_term(self, difference: Difference, mask: Mask) -> tuple[Cause, ...]:
-        terms, found = Terms(difference.predictor), []
+    def _places_of_unknowns(self, difference: Difference) -> Iterator[list[tuple[Cause, list[Edit]]]]:
+        """Forces, then velocity terms of joints, that may be others at each state."""
+        yield from force_places(self.model)
+        terms, places = Terms(difference.predictor), list[tuple[Cause, list[Edit]]]()
         for k in np.flatnonzero(~self.model.free).tolist():
-            effects = [difference.flat_vectors(one)[mask] for one in terms.unit_velocity_terms(k)]
-            states, accepted = difference.state[mask], difference.accepted(mask)
-            if effects and is_spanned(np.stack(effects, axis=1), difference.values[mask], states, accepted):
-                found.append(Cause("term", "velocity term", f"joint {k + 1}", "another at each state"))
-        return (found[0],) if len(found) == 1 else ()
+            cause = Cause("term", "velocity term", f"joint {k + 1}", "another at each state")
+            effects = [difference.flat_vectors(one) for one in terms.unit_velocity_terms(k)]
+            if effects:
+                places.append((cause, [Edit(cause, effect=effect) for effect in effects]))
+        yield places
 
     def _partly(self, wrong: Sequence[str]) -> tuple[Cause, ...]:
         """The quantities that have a name, and the rest without one."""

@@ -20,6 +20,7 @@ from plumbline.model.kinematics import quaternion_exponential, quaternion_produc
 AXES: tuple[tuple[Any, str], ...] = ((0, " x"), (1, " y"), (2, " z"), (slice(None), ""))  # and all three
 ASKEW = 1e-6  # of a direction: it lies along an axis but for rounding
 NumberChange = Callable[[Case, Array], Case]
+PLURALS = {"body": "bodies", "joint": "joints", "spring": "springs"}
 LENGTHS = (" m", " rad")  # units of a mechanism's geometry, by which loops may open
 WORDS = {"rest": "rest position", "force": "applied force", "moment": "applied moment",
          "drag_force": "drag force", "drag_moment": "drag moment", "omega": "angular velocity ω′",
@@ -267,7 +268,7 @@ class _Factor:
 
     term: str
     names: tuple[str, ...]
-    things: str
+    thing: str
     part: Any = 1.0  # of a field's entries, 1 where they are multiplied
     is_of_each: bool = False
     is_from_one_on: bool = True
@@ -276,25 +277,24 @@ class _Factor:
 
 
 FACTORS = (
-    _Factor("mass and inertia", ("mass", "inertia"), "bodies", is_of_each=True, can_vanish=False),
-    _Factor("mass", ("mass",), "bodies", can_vanish=False),
-    _Factor("inertia", ("inertia",), "bodies", is_of_each=True, can_vanish=False),
-    _Factor("products of inertia", ("inertia",), "bodies", 1 - np.eye(3), is_of_each=True),
-    _Factor("applied force", ("force",), "bodies", is_of_each=True),
-    _Factor("applied moment", ("moment",), "bodies", is_of_each=True),
-    _Factor("applied loads", ("force", "moment"), "bodies", is_of_each=True),
-    _Factor("drag force", ("drag_force",), "bodies", is_of_each=True),
-    _Factor("drag moment", ("drag_moment",), "bodies", is_of_each=True),
-    _Factor("drag", ("drag_force", "drag_moment"), "bodies", is_of_each=True),
-    _Factor("angular velocity ω′", ("omega",), "bodies", is_of_each=True),
-    _Factor("rod rate u̇", ("udot",), "joints", is_of_each=True, is_from_one_on=False),
-    _Factor("rates", ("xdot",), "joints", is_of_each=True, is_from_one_on=False),
-    *(_Factor(WORDS.get(name, name), (name,), "joints") for name in JOINT_ELEMENTS),
-    _Factor("far point", ("point",), "joints", np.eye(2)[0][:, None]),
-    _Factor("near point", ("point",), "joints", np.eye(2)[1][:, None]),
-    *(_Factor(WORDS[name], (name,), "springs", general=OF_SPRINGS[name]) for name in SPRING_FIELDS[2:]),
+    _Factor("mass and inertia", ("mass", "inertia"), "body", is_of_each=True, can_vanish=False),
+    _Factor("mass", ("mass",), "body", can_vanish=False),
+    _Factor("inertia", ("inertia",), "body", is_of_each=True, can_vanish=False),
+    _Factor("products of inertia", ("inertia",), "body", 1 - np.eye(3), is_of_each=True),
+    _Factor("applied force", ("force",), "body", is_of_each=True),
+    _Factor("applied moment", ("moment",), "body", is_of_each=True),
+    _Factor("applied loads", ("force", "moment"), "body", is_of_each=True),
+    _Factor("drag force", ("drag_force",), "body", is_of_each=True),
+    _Factor("drag moment", ("drag_moment",), "body", is_of_each=True),
+    _Factor("drag", ("drag_force", "drag_moment"), "body", is_of_each=True),
+    _Factor("angular velocity ω′", ("omega",), "body", is_of_each=True),
+    _Factor("rod rate u̇", ("udot",), "joint", is_of_each=True, is_from_one_on=False),
+    _Factor("rates", ("xdot",), "joint", is_of_each=True, is_from_one_on=False),
+    *(_Factor(WORDS.get(name, name), (name,), "joint") for name in JOINT_ELEMENTS),
+    _Factor("far point", ("point",), "joint", np.eye(2)[0][:, None]),
+    _Factor("near point", ("point",), "joint", np.eye(2)[1][:, None]),
+    *(_Factor(WORDS[name], (name,), "spring", general=OF_SPRINGS[name]) for name in SPRING_FIELDS[2:]),
 )
-SINGULAR = {"bodies": "body", "joints": "joint", "springs": "spring"}
 
 
 def _factors(case: Case) -> Iterator[Edit]:
@@ -308,14 +308,18 @@ def _factors(case: Case) -> Iterator[Edit]:
         number, places = np.arange(len(has)), np.flatnonzero(has).tolist()
         # of a vector or products with one entry it is a number's
         is_several = np.sum(counts, axis=0) > (2 if np.ndim(one.part) == 2 else 1)
-        is_number = one.things == "bodies" and TRAILING[one.names[0]] and one.names[0] != "omega"
+        is_number = one.thing == "body" and TRAILING[one.names[0]] and one.names[0] != "omega"
         chosen = [
-            (f"{SINGULAR[one.things]} {k + 1}", number == k)
+            (f"{one.thing} {k + 1}", number == k)
             for k in (places if one.is_of_each else [])
             if is_several[k] or not is_number
         ]
         for first in places[: len(places) - 1 if one.is_from_one_on else min(len(places) - 1, 1)]:
-            which = f"all {one.things}" if first == places[0] else f"{one.things} {first + 1} to {len(has)}"
+            which = (
+                f"all {PLURALS[one.thing]}"
+                if first == places[0]
+                else f"{PLURALS[one.thing]} {first + 1} to {len(has)}"
+            )
             chosen.append((which, has & (number >= first)))
         for place, where in chosen:
             masks = {name: where.reshape(-1, *(1,) * TRAILING[name]) * one.part for name in one.names}

@@ -14,14 +14,12 @@ from itertools import combinations, islice
 import numpy as np
 
 from plumbline.diagnosis.digit_loss import REFUSALS, Evaluate, ask
-from plumbline.diagnosis.prediction import Predictor, View, error_ratio, tolerances, values_of
+from plumbline.diagnosis.prediction import Predictor, View, error_ratio, is_closed, tolerances, values_of
 from plumbline.model.datatypes import BODY_FIELDS, JOINT_ELEMENTS, JOINT_FIELDS, KINDS, Flags, Model, State
 from plumbline.model.kinematics import complete_state
-from plumbline.model.loops import cut_open
 from plumbline.truth.rounding_bound import rounding_bounds
 
 VANISHED = 2.0  # in bounds: the engine's rounding and that of the expected number
-CLOSED = 1e-9  # m, rad: a larger gap is an open loop, which no engine can be asked about
 MAX_CHOICES, MAX_TRIALS = 100, 3  # of as many bodies, from either end: looked at, and tried
 MAX_COUNT = 6  # of bodies that are distinguished from more
 SAME_CALL = "other states in the same call"
@@ -111,7 +109,7 @@ def _without_one(model: Model, states: list[State]) -> Iterator[tuple[str, Itera
     if np.any(model.inertia * (1 - np.eye(3))):
         yield "products of inertia", [(replace(model, inertia=model.inertia * np.eye(3)), states)]
     for kind in dict.fromkeys(model.kind):
-        yield _joint(kind), _with_other_joints(model, states, kind)
+        yield f"a {kind} joint", _with_other_joints(model, states, kind)
     if np.any(_turns(model)):
         turn = np.broadcast_to(IDENTITY, model.turn.shape)
         yield "turned axes of joints", _possible(replace(model, turn=turn), states)
@@ -119,10 +117,6 @@ def _without_one(model: Model, states: list[State]) -> Iterator[tuple[str, Itera
     if len(set(far.tolist())) < model.n and not model.has_loops:
         body = np.where(model.free[:, None], model.body, model.body[:, 1:] - [1, 0])
         yield "a branch", _possible(replace(model, body=body), states)
-
-
-def _joint(kind: str) -> str:
-    return f"a {kind} joint"
 
 
 def _turns(model: Model) -> Flags:
@@ -143,18 +137,8 @@ def _at_rest(s: State) -> State:
 def _possible(model: Model, states: list[State]) -> Iterator[Problem]:
     """The problem at the same coordinates; none where they open loops."""
     at = [complete_state(model, s) for s in states]
-    if not model.has_loops or all(_is_closed(model, s) for s in at):
+    if not model.has_loops or all(is_closed(model, s) for s in at):
         yield model, at
-
-
-def _is_closed(model: Model, state: State) -> bool:
-    cut = cut_open(model)
-    with np.errstate(all="ignore"):  # where points of rods coincide
-        tree = cut.state(state)
-    ends = np.array(cut.ends)
-    apart = [np.max(np.abs(x[ends[:, 0]] - x[ends[:, 1]])) for x in (tree.v, tree.omega)]
-    gap = float(max(np.max(np.abs(cut.gap(tree))), *apart))
-    return gap <= CLOSED * max(1.0, float(np.max(np.abs(tree.v))))
 
 
 def _with_other_joints(model: Model, states: list[State], kind: str) -> Iterator[Problem]:
@@ -196,8 +180,9 @@ def _reduced(model: Model, states: list[State], kept: list[int]) -> Problem:
         while above >= 0 and above not in place:
             above = int(model.body[above, 0])
         far.append(place.get(above, -1))
-    fields = {name: getattr(model, name)[kept] for name in ("mass", "inertia", *BODY_FIELDS)}
-    fields |= {name: getattr(model, name)[kept] for name in JOINT_FIELDS if name not in ("kind", "body")}
+    fields = {
+        name: getattr(model, name)[kept] for name in ("mass", "inertia", *BODY_FIELDS, *JOINT_FIELDS[2:])
+    }
     lacking = np.arange(model.columns) >= np.array([[model.kinds[k].element_count] for k in kept])
     for name in (*BODY_FIELDS, *JOINT_ELEMENTS):
         every = getattr(model, name)
@@ -230,12 +215,9 @@ def _wrong(model: Model, states: list[State], quantities: Collection[str], evalu
     """Those of the quantities that differ from what is right at one of the states."""
     answers, right = ask(evaluate, model, states), Predictor(model, states, View()).right
     bounds = rounding_bounds(model, states)
-    wrong = set()
-    for q in quantities:
-        is_given = all(getattr(answer, q) is not None for answer in answers)  # else it shows nothing
-        if (
-            not is_given
-            or not error_ratio(values_of(answers, q) - right[q], tolerances(bounds, q)) <= VANISHED
-        ):
-            wrong.add(q)
-    return wrong
+    is_right = {  # what is not given shows nothing
+        q: all(getattr(answer, q) is not None for answer in answers)
+        and error_ratio(values_of(answers, q) - right[q], tolerances(bounds, q)) <= VANISHED
+        for q in quantities
+    }
+    return {q for q, one in is_right.items() if not one}

@@ -15,6 +15,7 @@ import numpy as np
 from plumbline.diagnosis.cause import Cause, quantity_words, significant
 from plumbline.diagnosis.edits import WORDS, gyroscopic_moment
 from plumbline.diagnosis.prediction import (
+    SUMS,
     TINY,
     WRENCHES,
     Answers,
@@ -93,14 +94,8 @@ class Outputs:
         of = " and ".join(f"{thing} {k + 1}" for k in wrong)
         as_that = " and ".join(f"{thing} {source[k] + 1}" for k in wrong)
         is_swap = len(wrong) == 2 and source == {wrong[0]: wrong[1], wrong[1]: wrong[0]}
-        change = "exchanged" if is_swap else f"as that of {of}"
-        return Cause(
-            "output",
-            quantity_words([quantity]),
-            of if is_swap else as_that,
-            change,
-            general=f"of another {thing}",
-        )
+        place, change = (of, "exchanged") if is_swap else (as_that, f"as that of {of}")
+        return Cause("output", quantity_words([quantity]), place, change, general=f"of another {thing}")
 
     def _is_that_of(self, quantity: str, reported: Array, k: int, j: int) -> bool:
         """Whether row k is what row j should be."""
@@ -254,11 +249,7 @@ class Outputs:
         if quantity in WRENCHES:
             own = [replace(part, value=part.value[WRENCHES.index(quantity)]) for part in self._wrench_parts]
             return own + (self._levers if quantity == "joint_moment" else [])
-        names = {
-            "kinetic_energy": "_kinetic",
-            "potential_energy": "_potential",
-            "angular_momentum": "_momentum",
-        }
+        names = dict(zip(SUMS, ("_kinetic", "_potential", "_momentum"), strict=True))
         return getattr(self, names[quantity]) if quantity in names else []
 
     @cached_property
@@ -274,12 +265,9 @@ class Outputs:
         model, state = self.case.model, self.case.state
         weight = -model.mass * np.sum(state.r * model.gravity[..., None, :], -1)
         between = self._energies(1, "", "spring_stiffness")
-        parts = _of_bodies({"the weight of {}": weight}) + self._energies(1, "spring", "stiffness") + between
-        return (
-            [*parts, Part("all springs", self._energy(1, "stiffness", "spring_stiffness"))]
-            if between
-            else parts
-        )
+        if between:
+            between.append(Part("all springs", self._energy(1, "stiffness", "spring_stiffness")))
+        return _of_bodies({"the weight of {}": weight}) + self._energies(1, "spring", "stiffness") + between
 
     @cached_property
     def _momentum(self) -> list[Part]:
@@ -326,10 +314,10 @@ class Outputs:
         both = determinate(self.case.model, dict(zip(WRENCHES, wrenches, strict=True)), self._projectors)
         return np.array([both[name] for name in WRENCHES])
 
-    def _carried(self, loads: Array) -> Array:
+    def _carried(self, loads: Array, own: Array | float = 0.0) -> Array:
         """What joints carry (2, S, J, 3) of forces and moments (2, S, N, 3) at the centres of mass."""
         model, state = self.case.model, self.case.state
-        carried = np.zeros((2, *self._near.shape))
+        carried = np.zeros((2, *self._near.shape)) + own
         for body in range(model.n):
             force, moment = loads[:, :, body]
             k = body
@@ -367,12 +355,13 @@ class Outputs:
         model, parts = self.case.model, list[Part]()
         fields = {name: getattr(model, name) for name in ("spring_damping", "spring_stiffness")}
         both = np.all([np.any(x) for x in fields.values()])
-        for words, names in (("{}", fields), ("the damping of {}", ["spring_damping"] if both else [])):
-            each = list[tuple[str, Array]]()
-            for i in range(len(model.spring_body) if names else 0):
-                only = np.arange(len(model.spring_body)) == i
-                alone = self._carried(self._loads(**{name: fields[name] * only for name in names}))
-                each.append((words.format(f"spring {i + 1}"), alone))
+        numbers = np.arange(len(model.spring_body))
+        for words, names in (
+            ("{}", list(fields)),
+            *([("the damping of {}", ["spring_damping"])] if both else []),
+        ):
+            loads = [self._loads(**{name: fields[name] * (numbers == i) for name in names}) for i in numbers]
+            each = [(words.format(f"spring {i + 1}"), self._carried(loads[i])) for i in numbers]
             parts += _each_and_all(words.format(SPRINGS), each)
         return parts
 
@@ -397,10 +386,9 @@ class Outputs:
                     values["rotors"][row, s, k] += (held - total) * axis
         parts, joints = list[Part](), np.arange(self._near.shape[1])[:, None]
         for name, value in values.items():
-            places = np.flatnonzero(np.any(value, axis=(0, 1, 3)))
             each = [
                 (f"that of the {name} of joint {k + 1}", self._determinate(value * (joints == k)))
-                for k in places
+                for k in np.flatnonzero(np.any(value, axis=(0, 1, 3)))
             ]
             parts += _each_and_all(f"those of the {name} of joints", each)
         everything = np.sum([values[name] for name in efforts], axis=0)
@@ -408,33 +396,40 @@ class Outputs:
             parts.append(Part("those of their springs, dampers and efforts", self._determinate(everything)))
         return parts
 
+    def _applied(self, k: int, force: Array, moment: Array) -> Array:
+        """What joint k applies to its bodies (2, S, N, 3) by a force and a moment about its near point."""
+        r, near = self.case.state.r, self._near[:, k]
+        loads = np.zeros((2, *r.shape))
+        for body, sign in zip(self.case.model.body[k], (-1.0, 1.0), strict=True):
+            if body >= 0:
+                loads[0, :, body] += sign * force
+                loads[1, :, body] += sign * (moment + cross(near - r[:, body], force))
+        return loads
+
     def _joint_parts(self) -> list[Part]:
         """What closing joints and children have in the wrenches of the joints before."""
-        model, state = self.case.model, self.case.state
-        right = np.array([self.right.get(name, np.zeros(self._near.shape)) for name in WRENCHES])
-        parts = list[Part]()
+        model, closing, parts = (
+            self.case.model,
+            range(self.case.model.n, len(self.case.model.kind)),
+            list[Part](),
+        )
+        force, moment = (self.right.get(name, np.zeros(self._near.shape)) for name in WRENCHES)
         for what, every, is_whole in (
             ("that of", CLOSING_JOINTS, True),
             ("the moment of", "the moments of the closing joints", False),
         ):
-            each = list[tuple[str, Array]]()
-            for k in range(model.n, len(model.kind)):
-                applied = np.zeros((2, *state.v.shape))
-                force, moment = is_whole * right[0, :, k], right[1, :, k]
-                for body, sign in zip(model.body[k], (-1.0, 1.0), strict=True):
-                    if body >= 0:
-                        applied[0, :, body] += sign * force
-                        lever = self._near[:, k] - state.r[:, body]
-                        applied[1, :, body] += sign * (moment + cross(lever, force))
-                each.append((f"{what} the closing joint {k + 1}", self._carried(applied)))
+            loads = [self._applied(k, is_whole * force[:, k], moment[:, k]) for k in closing]
+            each = [
+                (f"{what} the closing joint {k + 1}", self._carried(x))
+                for k, x in zip(closing, loads, strict=True)
+            ]
             parts += _each_and_all(every, each)
         parts += self._welds_of_cuts()
         carried = np.zeros((2, *self._near.shape))
         for k in np.flatnonzero(model.body[: model.n, 0] >= 0).tolist():
             far = int(model.body[k, 0])
-            lever = self._near[:, k] - self._near[:, far]
-            carried[0, :, far] += right[0][:, k]
-            carried[1, :, far] += right[1][:, k] + cross(lever, right[0][:, k])
+            carried[0, :, far] += force[:, k]
+            carried[1, :, far] += moment[:, k] + cross(self._near[:, k] - self._near[:, far], force[:, k])
         if np.any(carried):
             parts.append(Part("what the bodies beyond apply", self._determinate(carried)))
         return parts
@@ -448,22 +443,17 @@ class Outputs:
         model, state = self.case.model, self.case.state
         if not model.has_loops or not self.right.keys() >= {"acceleration", *WRENCHES}:
             return []
-        cut, each = cut_open(model), list[tuple[str, Array]]()
+        cut, each, number = cut_open(model), list[tuple[str, Array]](), np.arange(len(model.kind))[:, None]
         inertial = np.matvec(model.inertia, self.right["angular_acceleration"]) + gyroscopic_moment(self.case)
         inertial = np.matvec(self._turns, inertial)
         for k in range(model.n, len(model.kind)):
             body = int(model.body[k, 1])
             share = float(cut.model.mass[cut.place[k]] / model.mass[body])
-            lever = self._near[:, k] - state.r[:, body]
             force, moment = (self.right[name][:, k] for name in WRENCHES)
-            weld = share * inertial[:, body] - moment - cross(lever, force)
-            value = np.zeros((2, *self._near.shape))
-            value[1, :, k] += weld
-            for at, sign in ((int(model.body[k, 0]), 1.0), (body, -1.0)):
-                while at >= 0:
-                    value[1, :, at] += sign * weld
-                    at = int(model.body[at, 0])
-            each.append((f"the moment of the weld in body {body + 1}", self._determinate(value)))
+            weld = share * inertial[:, body] - moment - cross(self._near[:, k] - state.r[:, body], force)
+            own = np.array([0.0, 1.0])[:, None, None, None] * weld[:, None] * (number == k)
+            carried = self._carried(self._applied(k, 0 * weld, weld), own)
+            each.append((f"the moment of the weld in body {body + 1}", carried))
         return _each_and_all("the moments of the welds in cut bodies", each)
 
     @cached_property

@@ -41,7 +41,7 @@ from plumbline.model.kinematics import (
     rotation_matrix,
     stack_states,
 )
-from plumbline.model.loops import cut_open, determinate_projectors, wrench_length
+from plumbline.model.loops import cut_open, determinate_projectors, loop_gaps, wrench_length
 from plumbline.truth.ground_truth import StateTruth
 from plumbline.truth.rounding_bound import RoundingBound
 from reference_impl.direct import DirectSystem
@@ -60,6 +60,7 @@ TRAILING = (
 )
 CONSTANT_FIELDS = ("kind", "body", "spring_body")
 TINY = float(np.finfo(float).tiny)
+CLOSED = 1e-9  # m, rad and their rates: a larger gap is an open loop
 MAX_BATCH_BODIES = 12_000  # of one batch
 Answers = dict[str, Array]  # by quantity (S, N, 3), (S, 3) or (S,), or with an axis of lanes before
 
@@ -267,6 +268,13 @@ class Predictor:
         answers = {name: np.stack([one[name] for one in each]) for name in QUANTITIES}
         projectors = [self.projectors[i % self.count] for i in range(len(each))]
         return determinate(self.case.model, answers, projectors)
+
+
+def is_closed(model: Model, state: State) -> bool:
+    """Whether loops are closed at a state, rates included."""
+    with np.errstate(all="ignore"):  # where points of rods coincide
+        gap = max(map(np.max, loop_gaps(model, state)))
+    return bool(gap <= CLOSED * max(1.0, float(np.max(np.abs(state.v)))))
 
 
 def single_states(state: State) -> list[State]:

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from plumbline.diagnosis.cause import Cause
-from plumbline.diagnosis.edits import WORDS, Edit, field, with_fields
-from plumbline.diagnosis.prediction import TRAILING, Case, single_states
+from plumbline.diagnosis.edits import PLURALS, WORDS, Edit, field, with_fields
+from plumbline.diagnosis.prediction import TRAILING, Case, is_closed, single_states
 from plumbline.model.datatypes import JOINT_ELEMENTS, SPRING_FIELDS, Array, Model, State
 from plumbline.model.kinematics import (
     complete_state,
@@ -29,9 +29,8 @@ from plumbline.model.kinematics import (
     spring_vectors,
     stack_states,
 )
-from plumbline.model.loops import assembled, loop_gaps
+from plumbline.model.loops import assembled
 
-CLOSED = 1e-9  # m, rad: a larger gap is an open loop
 EQUAL, DIGITS = 1e-12, 10  # of two readings
 MAX_PLACES = 12  # bodies in which a field may be another's from each of them on; and readings of one body
 Change = Callable[[Case], Case]
@@ -46,7 +45,6 @@ class Reading(NamedTuple):
     where: str = ""
 
 
-PLURALS = {"body": "bodies", "joint": "joints", "spring": "springs"}
 MISSING = {
     "springs and dampers": ("damping", "stiffness"),
     "springs and efforts": ("stiffness", "effort"),
@@ -544,7 +542,7 @@ def _branch(given: int, turn: tuple[int, int] | None) -> Change:
             other = assembled(model, start, movable, is_pose_kept=True)
         except (ValueError, np.linalg.LinAlgError):
             return state
-        return other if max(map(np.max, loop_gaps(model, other))) <= CLOSED else state
+        return other if is_closed(model, other) else state
 
     return lambda case: with_fields(
         case, **vars(stack_states([pose(case.model, one) for one in single_states(case.state)]))
