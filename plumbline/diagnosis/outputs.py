@@ -443,18 +443,25 @@ class Outputs:
         model, state = self.case.model, self.case.state
         if not model.has_loops or not self.right.keys() >= {"acceleration", *WRENCHES}:
             return []
-        cut, each, number = cut_open(model), list[tuple[str, Array]](), np.arange(len(model.kind))[:, None]
+        cut, number = cut_open(model), np.arange(len(model.kind))[:, None]
         inertial = np.matvec(model.inertia, self.right["angular_acceleration"]) + gyroscopic_moment(self.case)
-        inertial = np.matvec(self._turns, inertial)
+        inertial, each, total = np.matvec(self._turns, inertial), list[tuple[str, Array]](), 0.0 * self._near
+
+        def carried(k: int, weld: Array) -> Array:
+            own = np.array([0.0, 1.0])[:, None, None, None] * weld[:, None] * (number == k)
+            return -self._carried(self._applied(k, 0 * weld, weld), own)
+
         for k in range(model.n, len(model.kind)):
             body = int(model.body[k, 1])
             share = float(cut.model.mass[cut.place[k]] / model.mass[body])
             force, moment = (self.right[name][:, k] for name in WRENCHES)
             weld = share * inertial[:, body] - moment - cross(self._near[:, k] - state.r[:, body], force)
-            own = np.array([0.0, 1.0])[:, None, None, None] * weld[:, None] * (number == k)
-            carried = self._carried(self._applied(k, 0 * weld, weld), own)
-            each.append((f"the moment of the weld in body {body + 1}", carried))
-        return _each_and_all("the moments of the welds in cut bodies", each)
+            each.append((f"the moment of the weld in body {body + 1}", carried(k, weld)))
+            # a quaternion's rows have the multipliers 2 Aᵀ N
+            total = total + carried(k, 2 * np.matvec(self._turns[:, body].mT, weld) - weld)
+        what = "the moments of the welds in cut bodies"
+        multipliers = Part(f"the multipliers of {what}", total, f"with {what} doubled and in body axes")
+        return [multipliers, *_each_and_all(what, each)]
 
     @cached_property
     def _levers(self) -> list[Part]:

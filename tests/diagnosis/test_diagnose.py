@@ -187,6 +187,30 @@ def test_a_joint_force_that_counts_a_part_otherwise_is_named(name, change, parts
     assert cause.amount == ((1.25,) if "multiplied" in change else ())
 
 
+def test_multipliers_of_welds_that_are_taken_for_their_moments_are_named():
+    """As MuJoCo 3.13.0 does where a body is cut and welded: twice the moment, in the body's axes."""
+    model, truth = known(LOOP, 5)
+    reported = []
+    for state, a in zip(truth.states, truth.quantities, strict=True):
+        moment = a.joint_moment.copy()
+        for k in range(model.n, len(model.kind)):
+            far, body = model.body[k]
+            A, J, omega = rotation_matrix(state.p[body]), model.inertia[body], state.omega[body]
+            spin = A @ (J @ a.angular_acceleration[body] + np.cross(omega, J @ omega))
+            arm = A @ model.point[k, 1]
+            weld = spin / 2 - a.joint_moment[k] - np.cross(arm, a.joint_reaction[k])
+            off = 2 * A.T @ weld - weld
+            moment[k] -= off
+            for at, sign in ((far, -1), (body, 1)):
+                while at >= 0:
+                    moment[at] += sign * off
+                    at = model.body[at, 0]
+        reported.append(determinate(model, state, replace(a, joint_moment=moment)))
+    (cause,) = diagnose(model, reported, truth).causes
+    assert cause.change == "with the moments of the welds in cut bodies doubled and in body axes", cause
+    assert not cause.equal and cause.term == "joint moment"
+
+
 def determinate(model, state, answer):
     return replace(determinate_part(model, state, answer), mass_matrix=None) if model.has_loops else answer
 
