@@ -21,7 +21,6 @@ body on its last, and outputs of the body are read at the point on its first hal
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from copy import copy
 from typing import Any, ClassVar
 
 import exudyn
@@ -371,7 +370,6 @@ class Exudyn(ExudynAdapter):
     builds_trees = builds_elements = moves_loops = True
     unwritten_ways = ("two welded halves",)
     welding_unsupported_reason = ""
-    is_single_step: bool = False  # full Newton iterations to `STEP_SETTINGS`; multipliers are sampled too
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
         with silence_engine():
@@ -420,14 +418,12 @@ class Exudyn(ExudynAdapter):
         return _trajectory(model, state, times, samples, resolution)
 
     def _step(self, model: Model, state: State, times: Array, integrator: Integrator, step: float) -> StepRun:
-        other = copy(self)
-        other.is_single_step, other._samples = True, []
-        run = other._simulate(model, state, times, integrator, step)
+        with silence_engine():
+            chain = _chain_that_moves(model, state)
+            samples = self._run_samples(chain, times, integrator, step, is_exact=True)
         shape = len(times), model.n, -1
-        acceleration, multipliers = (
-            np.array([sample[i] for sample in other._samples]).reshape(shape) for i in (2, 3)
-        )
-        return StepRun(run, acceleration, multipliers)
+        acceleration, multipliers = (np.array([x[i] for x in samples]).reshape(shape) for i in (2, 3))
+        return StepRun(_trajectory(model, state, times, samples, step), acceleration, multipliers)
 
     def _simulate_round_trip(
         self, model: Model, state: State, end: float, integrator: Integrator, resolution: float
@@ -437,7 +433,7 @@ class Exudyn(ExudynAdapter):
             chain = _chain_that_moves(model, state)
             data = chain.mbs.systemData
             there = self._run_samples(chain, leg, integrator, resolution)
-            q, qdot, qddot = there[-1]
+            q, qdot, qddot, _ = there[-1]
             data.SetODE2Coordinates(q, initial)
             data.SetODE2Coordinates_t(-qdot, initial)
             data.SetODE2Coordinates_tt(qddot, initial)  # carried from step to step: a part of its state
@@ -452,8 +448,14 @@ class Exudyn(ExudynAdapter):
         integrator: Integrator,
         step: float,
         compute_initial_accelerations: bool = True,
-    ) -> list[tuple[Array, Array, Array]]:
-        """Return displacements, rates and accelerations (7N,) at ``times``."""
+        is_exact: bool = False,
+    ) -> list[tuple[Array, ...]]:
+        """Return displacements, rates and accelerations (7N,) and multipliers at ``times``.
+
+        Args:
+            is_exact: whether Newton's iterations are full ones to `STEP_SETTINGS`.
+
+        """
         settings, data = make_settings(), chain.mbs.systemData
         set_linear_solver(settings, self.option or self.usual_linear_solver)
         alpha = settings.timeIntegration.generalizedAlpha
@@ -462,21 +464,16 @@ class Exudyn(ExudynAdapter):
             alpha.useNewmark = alpha.useIndex2Constraints = True
         else:
             alpha.spectralRadius = SPECTRAL_RADIUS
+        if is_exact:
+            newton = settings.timeIntegration.newton
+            newton.useModifiedNewton = False
+            newton.absoluteTolerance = STEP_SETTINGS["solver_atol"]
+            newton.relativeTolerance = STEP_SETTINGS["solver_rtol"]
         parts = data.GetODE2Coordinates, data.GetODE2Coordinates_t, data.GetODE2Coordinates_tt
-        solver = exudyn.MainSolverImplicitSecondOrder()
-        if not self.is_single_step:
-            return run_solver(
-                solver, chain.mbs, settings, times, step, lambda: tuple(part() for part in parts)
-            )
-        newton = settings.timeIntegration.newton
-        newton.useModifiedNewton = False
-        newton.absoluteTolerance = STEP_SETTINGS["solver_atol"]
-        newton.relativeTolerance = STEP_SETTINGS["solver_rtol"]
-        self._samples = run_solver(
-            solver, chain.mbs, settings, times, step,
+        return run_solver(
+            exudyn.MainSolverImplicitSecondOrder(), chain.mbs, settings, times, step,
             lambda: (*(part() for part in parts), chain.multipliers()),
         )  # fmt: skip
-        return [sample[:3] for sample in self._samples]
 
 
 def _chain_that_moves(model: Model, state: State) -> ExudynChain:
@@ -508,7 +505,7 @@ def _chain_that_moves(model: Model, state: State) -> ExudynChain:
 
 
 def _trajectory(
-    model: Model, state: State, times: Array, samples: list[tuple[Array, Array, Array]], step: float
+    model: Model, state: State, times: Array, samples: list[tuple[Array, ...]], step: float
 ) -> Trajectory:
     """Add the displacements of a run to its initial state."""
     start = np.concatenate([state.r, state.p], axis=1)

@@ -58,7 +58,14 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from adapters.mujoco_common import compiler_of, full_mass_matrix, member, set_attributes, warnings_to
+from adapters.mujoco_common import (
+    add_actuator,
+    compiler_of,
+    full_mass_matrix,
+    member,
+    set_attributes,
+    warnings_to,
+)
 from adapters.mujoco_probes import Probed
 from adapters.mujoco_surface import POSE_FUNCTIONS, add_probes, add_surface, pose_function
 from adapters.mujoco_variants import (
@@ -757,15 +764,9 @@ def _add_load_actuators(spec: Any, body: Any, k: int, model: Model) -> None:
     rates = -np.repeat([model.drag_force[k], model.drag_moment[k]], 3)
     for gear, bias, rate in zip(np.eye(6), biases, rates, strict=True):
         if bias or rate:
-            set_attributes(
-                spec.add_actuator(),
-                trntype=mujoco.mjtTrn.mjTRN_SITE,
-                target=f"com{k}",
-                gear=gear,
-                gainprm=np.zeros(10),
-                biastype=mujoco.mjtBias.mjBIAS_AFFINE,
-                biasprm=[bias, 0, rate, 0, 0, 0, 0, 0, 0, 0],
-            )
+            numbers = {"gainprm": np.zeros(10), "biasprm": [bias, 0, rate, 0, 0, 0, 0, 0, 0, 0]}
+            affine = mujoco.mjtBias.mjBIAS_AFFINE
+            add_actuator(spec, "", "SITE", f"com{k}", gear, biastype=affine, **numbers)
 
 
 def _add_tendon(spec: Any, links: list[Any], name: str, bodies: NDArray[np.intp], points: Array) -> None:
