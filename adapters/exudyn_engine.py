@@ -47,7 +47,7 @@ from adapters.exudyn_common import (
     whole_column,
     written_items,
 )
-from adapters.exudyn_surface import POSE_FUNCTIONS, Probes, pose_function
+from adapters.exudyn_surface import Probes, pose_function
 from adapters.exudyn_variants import VARIANTS, Change, Joint, Piece
 from adapters.pose_functions import add_pose_answers
 from plumbline.model.datatypes import (
@@ -406,7 +406,7 @@ class Exudyn(ExudynAdapter):
                 assert chain.probes is not None
                 chain.probes.add_all()
                 found.append(chain.probes.found)
-            add_pose_answers(found, states, POSE_FUNCTIONS, pose_function)
+            add_pose_answers(found, states, "exudyn", pose_function)
         return found
 
     def _simulate(

@@ -67,7 +67,7 @@ from adapters.mujoco_common import (
     warnings_to,
 )
 from adapters.mujoco_probes import Probed
-from adapters.mujoco_surface import POSE_FUNCTIONS, add_probes, add_surface, pose_function
+from adapters.mujoco_surface import add_probes, add_surface, pose_function
 from adapters.mujoco_variants import (
     COLUMN_NAMES,
     HINGE_ANGLES,
@@ -243,7 +243,7 @@ class Mujoco(MetamorphicHooks):
                 s = Probed(chain.m, chain.d, chain.link_ids, rates, elastic)
                 add_surface(s)
                 found.append(s.found)
-        add_pose_answers(found, states, POSE_FUNCTIONS, pose_function)
+        add_pose_answers(found, states, "mujoco", pose_function)
         return found
 
     def _simulate(

@@ -96,17 +96,6 @@ JACOBIANS = {
 }
 INVERSE_STAGES = ("mj_invPosition", "mj_invVelocity", "mj_invConstraint")
 SENSOR_STAGES = ("mj_sensorPos", "mj_sensorVel", "mj_sensorAcc")
-# adapters/pose_functions.py describes the forms
-POSE_FUNCTIONS = {
-    "mju_axisAngle2Quat": "axis angle -> p", "mju_euler2Quat": "xyz 'xyz' -> p", "mju_mat2Quat": "R -> p",
-    "mju_mulPose": "L.r L.p Q.r Q.p -> r p", "mju_mulQuat": "L.p Q.p -> p",
-    "mju_mulQuatAxis": "Q.p wl -> 2pdot",
-    "mju_negPose": "I.r I.p -> r p", "mju_negQuat": "I.p -> p", "mju_quat2Mat": "p -> R",
-    "mju_quat2Vel": "Q.p 1 -> Q.phi", "mju_rotVecQuat": "wl Q.p -> w", "mju_trnVecPose": "L.r L.p Q.r -> r",
-    "mju_derivQuat": "Q.p w -> pdot", "mju_subQuat": "Q.p M.p -> K.phi",
-    "mju_quatIntegrate": "M.p K.phi 1 -> Q.p", "mju_quatZ2Vec": "R -> p",
-    "mjd_quatIntegrate": "K.phi 1 -> K.R", "mjd_subQuat": "Q.p M.p K.p wl -> wl",
-}  # fmt: skip
 SIZES = {"p": 4, "R": 9, "r": 3, "phi": 3, "w": 3, "pdot": 4, "2pdot": 4}
 
 

@@ -61,7 +61,7 @@ from adapters.pinocchio_common import (
 )
 from adapters.pinocchio_loops import Loops, closed_accelerations
 from adapters.pinocchio_probes import Probed, add_probe_frames
-from adapters.pinocchio_surface import POSE_FUNCTIONS, add_surface, pose_function
+from adapters.pinocchio_surface import add_surface, pose_function
 from adapters.pinocchio_variants import VARIANTS, Change, Spelling
 from adapters.pose_functions import add_pose_answers
 from plumbline.engines.integrators import dop853, rkmk4, sample_steps, semi_implicit_euler
@@ -832,7 +832,7 @@ class Pinocchio(PinocchioAdapter):
             if cut.ends and len(found) < CLOSED_STATES:
                 add_parts(s.found, partial(_add_closed, s, chain))
             found.append(s.found)
-        add_pose_answers(found, states, POSE_FUNCTIONS, pose_function)
+        add_pose_answers(found, states, "pinocchio", pose_function)
         return found
 
     def _simulate(

@@ -41,19 +41,6 @@ FRAMES = {
     "LOCAL": _Frame("_local", "_local"),
     "WORLD": _Frame("_at_origin"),
 }
-POSE_FUNCTIONS = {  # adapters/pose_functions.py describes the forms
-    "exp3": "phi -> R", "log3": "Q.R -> Q.phi", "exp3_quat": "phi -> xyzw", "exp": "phi -> R",
-    "log": "Q.R -> Q.phi",
-    "Jexp3": "Q.phi -> @phidot wl", "Jlog3": "Q.R -> @wl phidot", "skew": "r -> S", "unSkew": "S -> r",
-    "exp6": "xi -> H", "log6": "Q.H -> Q.xi", "exp6_quat": "xi -> rxyzw", "log6_quat": "Q.rxyzw -> Q.xi",
-    "Jexp6": "Q.xi -> @xidot t", "Jlog6": "Q.H -> @t xidot",
-    "XYZQUATToSE3": "rxyzw -> H", "SE3ToXYZQUAT": "H -> rxyzw", "SE3ToXYZQUATtuple": "H -> rxyzw",
-    "rpy.rpyToMatrix": "rpy -> R", "rpy.matrixToRpy": "Q.R -> Q.rpy", "rpy.rotate": "'x' x -> Rx",
-    "rpy.computeRpyJacobian": "Q.rpy -> @rpydot wl", "rpy.computeRpyJacobianInverse": "Q.rpy -> @wl rpydot",
-    "liegroups.SO3": "L.xyzw Q.phi -> xyzw", "liegroups.SE3": "L.rxyzw Q.xi -> rxyzw",
-    "liegroups.R3": "L.r dr -> r", "liegroups.R2": "L.r dr -> r", "liegroups.R1": "L.r dr -> r",
-    "liegroups.Rn": "L.r dr -> r", "liegroups.SO2": "rz z -> Rz", "liegroups.SE2": "rz rx ry z -> Rz r",
-}  # fmt: skip
 OF_MOTIONS = ("exp6", "Jexp6")  # take a pin.Motion
 ANGULAR = {"velocity": "velocity", "acceleration": "acceleration", SPATIAL: "acceleration"}
 BY_RATE, BY_DERIVATIVE = "_by_jacobian_rate", "_by_derivative"

@@ -1,8 +1,9 @@
 """Functions of an engine's library of attitudes, poses and their rates, compared on a mechanism's bodies.
 
-A table says in words like "L.p Q.p -> p" what a function is given and what it returns.  What it is given
-comes from our own formulas, and what it returns is taken back by our own formulas to the positions, axes and
-velocities of the body, which have a truth.  Poses are that of the body, which has no letter, and
+`adapters/surface/pose_functions.json` says by engine and name, in words like "L.p Q.p -> p", what a function
+is given and what it returns.  What it is given comes from our own formulas, and what it returns is taken back
+by our own formulas to the positions, axes and velocities of the body, which have a truth.  Poses are that of
+the body, which has no letter, and
 
     Q       one near a fixed one, where no form of an attitude is near a singular one; rates are given there
     L, I    with body = L Q and I = body⁻¹
@@ -21,19 +22,22 @@ velocities of the body, which have a truth.  Poses are that of the body, which h
     pdot 2pdot phidot xyzdot rpydot xidot    rates of the forms
 
 A result "@pdot w" is a matrix that takes the first to the second.  "Rx" is the turn by x alone and "Tx" the
-shift by one coordinate, as a matrix of any kind; -Rx and -Tx are their inverses.  Numbers, and texts in
+shift by one coordinate, as a matrix of any kind; -Rx and -Tx are their inverses (of Exudyn, Plücker matrices
+of shifts alone are inverse to those of shifts with turns).  Numbers, and texts in
 quotes, are given as they stand.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from typing import Any
 
 import numpy as np
 
 from plumbline.engines.missing_names import add_parts
+from plumbline.layout import ROOT
 from plumbline.model.datatypes import Array, Call, Float, State
 from plumbline.model.kinematics import (
     angular_velocity,
@@ -265,24 +269,35 @@ def _vector_of(matrix: Array) -> Array:
     return np.array([matrix[2, 1], matrix[0, 2], matrix[1, 0]])
 
 
+@cache
+def pose_table(engine: str) -> Mapping[str, str]:
+    """By name of an engine's functions what each is given and returns."""
+    text = (ROOT / "adapters" / "surface" / "pose_functions.json").read_text(encoding="utf-8")
+    found: dict[str, dict[str, str]] = json.loads(text)
+    return found[engine]
+
+
 def add_pose_answers(
     answers: Sequence[dict[str, dict[Call, Array]]],
     states: Sequence[State],
-    table: Mapping[str, str],
+    engine: str,
     call: Callable[[str, Sequence[Any], Sequence[str]], Sequence[Any]],
 ) -> None:
-    """Call all functions of a table on all bodies at the first states, and add what they say to the answers.
+    """Call all functions of an engine on all bodies at the first states; add what they say to the answers.
 
     Args:
         answers: of the surface, at these states.
-        table: by name of the engine what a function is given and returns.
+        engine: whose table it is.
         call: takes a name, the values that it is given and the forms of the results to the results.
 
     """
     for answer, state in zip(answers, states[:POSE_STATES], strict=False):
         turns = rotation_matrix(state.p)
         bodies = [_Body(state, k, turns[k] @ state.omega[k]) for k in range(len(state.p))]
-        add_parts(answer, *(partial(_add_pose_answer, answer, one, call, bodies) for one in table.items()))
+        add_parts(
+            answer,
+            *(partial(_add_pose_answer, answer, one, call, bodies) for one in pose_table(engine).items()),
+        )
 
 
 def _add_pose_answer(
