@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from inspect import signature
 from typing import Any, Generic, TypeVar
 
@@ -12,7 +12,7 @@ import exudyn
 import numpy as np
 
 from plumbline.engines.metamorphic_hooks import MetamorphicHooks
-from plumbline.model.datatypes import Array, Call, EngineFailure, Float, Model
+from plumbline.model.datatypes import Array, EngineFailure, Float, Model
 
 Sample = TypeVar("Sample")
 items: Any = exudyn.itemInterface  # its constructors are untyped
@@ -50,12 +50,6 @@ class ExudynAdapter(MetamorphicHooks):
     def version(self) -> str:
         """Return the version of the Exudyn that is loaded."""
         return _version()
-
-
-def whole_column(names: Mapping[str, str]) -> Sequence[tuple[Call, Callable[[Model], bool]]]:
-    """Names by class or module, as `Adapter.column_names` has those of all mechanisms."""
-    every = [f"{owner}.{name}".removeprefix(".") for owner, own in names.items() for name in own.split()]
-    return [(tuple(every), lambda _: True)]
 
 
 def make_system() -> tuple[Any, Any]:

@@ -44,12 +44,12 @@ from adapters.exudyn_common import (
     run_solver,
     set_linear_solver,
     silence_engine,
-    whole_column,
     written_items,
 )
 from adapters.exudyn_surface import Probes, pose_function
 from adapters.exudyn_variants import VARIANTS, Change, Joint, Piece
 from adapters.pose_functions import add_pose_answers
+from plumbline.engines.variants import names_of_column
 from plumbline.model.datatypes import (
     Array,
     Call,
@@ -292,29 +292,6 @@ class ExudynChain:
         return found
 
 
-# Names of Exudyn that all rows of the column are by, by class or module.
-COLUMN_NAMES = {
-    "":
-        "ConfigurationType MainSolverImplicitSecondOrder MainSystem OutputVariableType "
-        "SimulationSettings SystemContainer SystemData",
-    "MainSolverImplicitSecondOrder":
-        "ComputeJacobianAE ComputeMassMatrix ComputeODE2RHS FinalizeSolver GetSystemJacobian "
-        "GetSystemMassMatrix GetSystemResidual InitializeSolver SetSystemJacobian",
-    "MainSystem":
-        "AddLoad AddMarker AddNode AddObject Assemble GetObjectOutput systemData",
-    "OutputVariableType":
-        "KineticEnergy",
-    "SystemData":
-        "GetAECoordinates GetNodeLTGAE GetODE2Coordinates GetODE2Coordinates_t GetODE2Coordinates_tt "
-        "GetObjectLTGAE SetODE2Coordinates SetODE2Coordinates_t SetODE2Coordinates_tt",
-    "itemInterface":
-        "LoadForceVector LoadMassProportional LoadTorqueVector MarkerBodyMass MarkerBodyRigid "
-        "NodeGenericData NodeRigidBodyEP ObjectConnectorDistance ObjectConnectorLinearSpringDamper "
-        "ObjectConnectorRigidBodySpringDamper ObjectConnectorSpringDamper "
-        "ObjectConnectorTorsionalSpringDamper ObjectGround ObjectJointSpherical ObjectRigidBody",
-}  # fmt: skip
-
-
 class Exudyn(ExudynAdapter):
     """Maximal coordinates with Euler parameters: the closest peer of the notes' own form."""
 
@@ -355,7 +332,7 @@ class Exudyn(ExudynAdapter):
         ),
     )
     variants = VARIANTS
-    column_names = whole_column(COLUMN_NAMES)
+    column_names = names_of_column("exudyn", {})
     usual_linear_solver = "EigenSparse"
     linear_solvers = ("EXUdense", "EigenDense")
     gaps: ClassVar[Mapping[str, str]] = {

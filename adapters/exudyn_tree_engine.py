@@ -49,10 +49,10 @@ from adapters.exudyn_common import (
     set_explicit_method,
     set_linear_solver,
     silence_engine,
-    whole_column,
     written_items,
 )
 from adapters.exudyn_tree_variants import VARIANTS, TreeChange
+from plumbline.engines.variants import names_of_column
 from plumbline.model.datatypes import (
     Array,
     Float,
@@ -428,23 +428,6 @@ _ODE23, _DOPRI5 = "Bogacki and Shampine's method of order 3", "Dormand and Princ
 _TO_SECOND = "velocity Verlet; of order 2 without terms of velocities"
 
 
-# Names of Exudyn that all rows of the column are by, by class or module.
-COLUMN_NAMES = {
-    "":
-        "JointType MainSolverExplicit Matrix3DList Vector3DList",
-    "JointType":
-        "PrismaticX PrismaticY PrismaticZ RevoluteX RevoluteY RevoluteZ",
-    "MainSolverExplicit":
-        "ComputeMassMatrix ComputeODE2RHS FinalizeSolver GetErrorString GetSystemMassMatrix "
-        "GetSystemResidual InitializeSolver",
-    "MainSystem":
-        "AddSensor GetObjectParameter",
-    "itemInterface":
-        "MarkerKinematicTreeRigid NodeGenericODE2 ObjectGenericODE2 ObjectKinematicTree "
-        "SensorKinematicTree",
-}  # fmt: skip
-
-
 class ExudynTree(ExudynAdapter):
     """Minimal coordinates: nothing to drift, and angles that can become singular."""
 
@@ -492,7 +475,7 @@ class ExudynTree(ExudynAdapter):
     builds_trees = builds_elements = True
     loops_unsupported_reason = "a kinematic tree of Exudyn has no joints that close loops"
     variants = VARIANTS
-    column_names = whole_column(COLUMN_NAMES)
+    column_names = names_of_column("exudyn-tree", {})
     usual_linear_solver = "EXUdense"
     linear_solvers = ("EigenSparse",)
     welding_unsupported_reason = (

@@ -23,8 +23,8 @@ from adapters import mujoco_actuation as actuation
 from adapters import mujoco_shapes as shapes
 from adapters.mujoco_common import bodies_of, compiler_of, dense_rows, member, through_inverse
 from adapters.pose_functions import FIXED_PLACE, Pose, rate_maps
-from plumbline.engines.variants import Variant, variants_of
-from plumbline.model.datatypes import Array, Call, Model
+from plumbline.engines.variants import Variant, names_of_column, variants_of
+from plumbline.model.datatypes import Array, Model
 from plumbline.model.kinematics import quaternion_conjugate, quaternion_product, rotation_matrix
 from plumbline.model.probe_frames import PROBE_ATTITUDE
 
@@ -582,40 +582,17 @@ def _has_kind(*kinds: str) -> Callable[[Model], bool]:
     return lambda model: not set(kinds).isdisjoint(model.kind)
 
 
-COLUMN_NAMES: tuple[tuple[Call, Callable[[Model], bool]], ...] = (
-    (
-        (
-            "mj_forward", "mj_setConst", "mj_rnePostConstraint", "MjOption", "MjsCompiler", "MjsJoint",
-            "mjtDisableBit", "mjtEnableBit", "mjtJoint", "mjtObj", "mjtObj.mjOBJ_BODY", "MjData.qpos",
-            "MjData.qvel", "MjData.xmat", "MjData.cfrc_int", "MjData.xfrc_applied", "MjData.qfrc_applied",
-            "MjOption.gravity", "MjOption.disableflags", "MjOption.enableflags",
-            "mjtEnableBit.mjENBL_ENERGY", "mjtOrientation.mjORIENTATION_QUAT", "mjtOrientation",
+COLUMN_NAMES = names_of_column(
+    "mujoco",
+    {
+        "without constraints": _is_free,
+        "balls and rods": _has_kind("ball", "rod"),
+        "free bodies": _has_kind("free"),
+        "loops": _has_loops,
+        "pitches": lambda model: any(kind.has_pitch for kind in model.kinds),
+        "springs between points": lambda model: len(model.spring_body) > 0,
+        "moments and drag": lambda model: any(
+            np.any(x) for x in (model.moment, model.drag_force, model.drag_moment)
         ),
-        lambda model: True,
-    ),
-    (("mj_fullM", "MjData.M"), _is_free),
-    (("mjtJoint.mjJNT_BALL",), _has_kind("ball", "rod")),
-    (("mjtJoint.mjJNT_FREE",), _has_kind("free")),
-    (
-        ("MjsEquality", "MjsSite", "mjtConstraint", "mjtConstraint.mjCNSTR_EQUALITY", "mjtEq",
-         "mjtEq.mjEQ_WELD", "mjtSolver", "mjtSolver.mjSOL_NEWTON", "mjtJacobian",
-         "mjtJacobian.mjJAC_AUTO", "mjtObj.mjOBJ_SITE", "MjOption.iterations", "MjOption.solver",
-         "MjOption.tolerance", "MjOption.jacobian", "MjData.qacc", "MjData.qfrc_constraint",
-         "MjData.efc_force"),
-        lambda model: model.has_loops,
-    ),
-    (
-        ("mjtEq.mjEQ_JOINT", "mjtObj.mjOBJ_JOINT"),
-        lambda model: any(kind.has_pitch for kind in model.kinds),
-    ),
-    (
-        ("MjsSite", "MjsTendon", "MjsTendonPath", "MjsWrap", "mjtWrap", "mjtWrap.mjWRAP_SITE",
-         "mjtTendon"),
-        lambda model: len(model.spring_body) > 0,
-    ),
-    (
-        ("MjsActuator", "mjtBias", "mjtTrn", "mjtTrn.mjTRN_SITE", "mjtBias.mjBIAS_AFFINE", "mjtGain",
-         "MjData.actuator_force", "MjData.qfrc_actuator"),
-        lambda model: any(np.any(x) for x in (model.moment, model.drag_force, model.drag_moment)),
-    ),
-)  # fmt: skip
+    },
+)

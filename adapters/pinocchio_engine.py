@@ -66,6 +66,7 @@ from adapters.pinocchio_variants import VARIANTS, Change, Spelling
 from adapters.pose_functions import add_pose_answers
 from plumbline.engines.integrators import dop853, rkmk4, sample_steps, semi_implicit_euler
 from plumbline.engines.missing_names import add_parts
+from plumbline.engines.variants import names_of_column
 from plumbline.model.datatypes import (
     Array,
     Call,
@@ -98,17 +99,6 @@ ROD_AXIAL_INERTIA = 1 / 3  # of a rod about its own axis, over the trace of the 
 # Of constraintDynamics: accuracy, damping (any from 1e-12 to 1e-3 does), largest number of steps.
 PROXIMAL_SETTINGS = 1e-15, 1e-8, 50
 MAX_DENSE_JOINTS = 10  # joints up to which their 3 × 3 blocks are solved faster as one matrix
-USUAL_NAMES = (
-    "Data", "Data.f", "Force", "Frame", "FrameType", "FrameType.OP_FRAME", "Inertia", "JointData",
-    "JointModel", "Model", "Model.addFrame", "Model.addJoint", "Model.appendBodyToJoint", "Model.armature",
-    "Model.createData", "Model.frames", "Model.gravity", "Model.inertias", "Model.jointPlacements",
-    "Model.joints", "Model.njoints", "Model.nq", "Model.nv", "Model.parents", "Motion", "ReferenceFrame",
-    "SE3", "StdVec_Force", "neutral",
-)  # fmt: skip
-NAMES_OF_LOOPS = (
-    "ContactType", "ContactType.CONTACT_6D", "ProximalSettings", "RigidConstraintData",
-    "RigidConstraintModel", "StdVec_RigidConstraintData", "StdVec_RigidConstraintModel",
-)  # fmt: skip
 CLOSED_STATES = 2  # at which loops are closed in all ways
 FIXED_STEPS = {"semi-implicit-euler": semi_implicit_euler, "rkmk4": rkmk4}
 
@@ -746,8 +736,7 @@ def _has_joint(kind: str) -> Callable[[Model], bool]:
 
 USUAL_JOINTS = tuple(f"{kind}{axis}" for kind in "RPH" for axis in "XYZ")
 COLUMN_NAMES = (
-    (USUAL_NAMES, lambda _: True),
-    (NAMES_OF_LOOPS, lambda model: model.has_loops),
+    *names_of_column("pinocchio", {"loops": lambda model: model.has_loops}),
     *(
         ((f"JointModel{kind}", f"JointData{kind}"), _has_joint(kind))
         for kind in (*USUAL_JOINTS, "Spherical", "FreeFlyer", "Composite")

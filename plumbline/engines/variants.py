@@ -8,10 +8,12 @@ in one table; its build hook reads what each changes.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from plumbline.layout import ROOT
 from plumbline.model.datatypes import Call, Model
 
 VariantKind = Literal["option", "spelling", "vectors"]
@@ -41,6 +43,18 @@ def variants_of(kind: VariantKind, change: Callable[..., Any], usual: Suits) -> 
         return Variant(kind, tuple(names.split()), change(**changed), suits)
 
     return make
+
+
+def names_of_column(column: str, mechanisms: Mapping[str, Suits]) -> Sequence[tuple[Call, Suits]]:
+    """Read the names of its engine that a column itself uses, as `Adapter.column_names` has them.
+
+    Args:
+        mechanisms: by word of `adapters/surface/column_names.json` those on which it does; "all" is given.
+
+    """
+    text = (ROOT / "adapters" / "surface" / "column_names.json").read_text(encoding="utf-8")
+    suits: Mapping[str, Suits] = {"all": lambda _: True, **mechanisms}
+    return [(tuple(names), suits[word]) for word, names in json.loads(text)[column].items()]
 
 
 @dataclass(frozen=True)
