@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-import plumbline
 from adapters.reference_engine import Reference
 from plumbline.model.datatypes import EngineFailure
 from plumbline.model.kinematics import (
@@ -49,11 +48,6 @@ def test_a_singular_model_fails_with_its_cause():
         Reference().evaluate(thin_body, [state])
     with pytest.raises(EngineFailure, match="inertia of body 1 is singular"):
         Reference().simulate(thin_body, state, np.array([0.0, 1.0]), "dop853", 1e-6)
-
-
-def test_the_version_is_the_checkouts():
-    assert Reference().version() == plumbline.__version__
-    assert Reference.package == plumbline.__name__
 
 
 @pytest.mark.full

@@ -22,7 +22,6 @@ from plumbline.measurements.state_relations import (
     check_state_relations,
 )
 from plumbline.model.datatypes import JOINT_ELEMENTS
-from plumbline.model.equivalent import reorder_bodies, rotate_world, siblings_reversed
 from plumbline.model.kinematics import complete_state, quaternion_product
 from plumbline.model.loops import loop_gaps
 from plumbline.model.random_mechanisms import random_loop_mechanism, random_tree
@@ -33,7 +32,6 @@ from plumbline.truth.rounding_bound import state_rounding_bound
 from tests.helpers.random_chains import random_chain
 from tests.helpers.shared_answers import sharing
 
-Q = np.array([0.5, -0.5, 0.5, 0.5])
 TREE = load_scenario(find_scenario_file("tree-of-seven"))
 BY_TENDONS = "by tendon equalities"
 LOOP_ENGINES = ["reference", "mujoco", "pinocchio", "pinocchio-maximal", "exudyn"]
@@ -67,24 +65,6 @@ def test_time_reversal_and_permuted_siblings_hold_on_a_tree():
     model = replace(TREE.model, drag_force=np.zeros(8), drag_moment=np.zeros(8))
     found = ratios(Mujoco(), model, [TREE.state])
     assert found["time reversed"] <= 1 and found["siblings permuted"] <= 1
-
-
-def test_permuted_siblings_are_the_same_tree():
-    order = siblings_reversed(TREE.model)
-    assert order.tolist() == [7, 0, 6, 4, 5, 1, 2, 3]
-    model, state = reorder_bodies(TREE.model, TREE.state, order)
-    assert np.all(model.body[:, 0] < np.arange(8))
-    back, again = reorder_bodies(model, state, np.argsort(order))
-    assert back.kind == TREE.model.kind and np.array_equal(back.body, TREE.model.body)
-    assert np.array_equal(again.r, TREE.state.r)
-
-
-def test_a_rotated_tree_is_rotated_as_a_whole():
-    model, state = rotate_world(TREE.model, TREE.state, Q)
-    turn = np.array([[0.0, -1, 0], [0, 0, 1], [-1, 0, 0]])
-    np.testing.assert_allclose(state.r, TREE.state.r @ turn.T, atol=1e-15)
-    np.testing.assert_allclose(state.v, TREE.state.v @ turn.T, atol=1e-14)
-    np.testing.assert_array_equal(model.point[1:7], TREE.model.point[1:7])
 
 
 class WorldUpOnly(Reference):

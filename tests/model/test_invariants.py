@@ -8,7 +8,6 @@ import pytest
 from plumbline.model.datatypes import Trajectory
 from plumbline.model.invariants import (
     INVARIANT_UNITS,
-    angular_momentum,
     attitude_error,
     compute_invariants,
     first_departure,
@@ -16,7 +15,6 @@ from plumbline.model.invariants import (
     joint_vector_rates,
     kinetic_energy,
     position_error,
-    potential_energy,
     work_of_loads,
 )
 from plumbline.model.kinematics import (
@@ -27,7 +25,7 @@ from plumbline.model.kinematics import (
     state_from_minimal,
 )
 from plumbline.model.random_mechanisms import random_tree
-from tests.helpers import newton_euler, pendulums
+from tests.helpers import pendulums
 from tests.helpers.nightly_tests import SLOW
 from tests.helpers.random_chains import random_chain
 
@@ -78,20 +76,6 @@ def test_attitude_error_is_the_largest_rotation_angle(angle):
     assert attitude_error(p * 1.1, q * 0.7) == pytest.approx(np.full(4, angle), rel=1e-6)
     assert attitude_error(p[1], q[1]) == pytest.approx(angle, rel=1e-6)
     assert np.array_equal(attitude_error(p, -p), np.zeros(4))
-
-
-@pytest.mark.parametrize("rods", [[False], [True, False, True]], ids=str)
-def test_energies_and_momentum_are_sums_over_bodies(rods):
-    model, state = random_chain(np.random.default_rng(72), rods)
-    kinetic = kinetic_energy(model, state.v, state.omega)
-    assert kinetic == pytest.approx(newton_euler.kinetic_energy(model, state), rel=1e-14)
-    assert potential_energy(model, state.r) == pytest.approx(
-        newton_euler.potential_energy(model, state), rel=1e-13
-    )
-    momentum = angular_momentum(model, state.r, state.p, state.v, state.omega)
-    np.testing.assert_allclose(momentum, newton_euler.angular_momentum(model, state), rtol=0, atol=1e-14)
-    two = [np.stack([x, 2 * x]) for x in (state.v, state.omega)]
-    assert kinetic_energy(model, *two)[1] == pytest.approx(4 * kinetic, rel=1e-14)
 
 
 def rotating_trajectory(model, angle, rate, times):

@@ -8,7 +8,6 @@ import pytest
 from plumbline.model.datatypes import KINDS, Model
 from plumbline.model.random_mechanisms import random_tree
 from plumbline.model.sampling import random_states
-from reference_impl.direct import DirectSystem
 from reference_impl.euler_parameters import euler_parameter_rate
 from reference_impl.fast.chain_elimination import StructuredSystem
 from reference_impl.joints import constraint_rows
@@ -66,25 +65,6 @@ def test_states_of_trees_are_on_the_manifold_and_rows_differentiate_off_it(seed)
         np.testing.assert_allclose((moved.C.imag / step)[held], rate[held], atol=1e-13 * scale)
         bend = moved.constraint_rate(v, pdot).imag / step
         np.testing.assert_allclose(bend[held], -rows.gamma[held], atol=1e-13 * scale)
-
-
-def test_the_solution_of_a_tree_obeys_newton_and_euler_on_every_body():
-    rng = np.random.default_rng(3)
-    model = random_tree(rng, 9)
-    (state,) = random_states(model, 1, 3)
-    at = state.r, state.p, state.v, euler_parameter_rate(state.p, state.omega)
-    x = DirectSystem(model).solve(*at)
-    dense = DirectSystem(model).solve_with_dense_factors(*at)
-    np.testing.assert_allclose(
-        x.acceleration, dense.acceleration, atol=1e-12 * np.max(np.abs(x.acceleration))
-    )
-    wanted = model.mass[:, None] * (x.acceleration - model.gravity) - model.force
-    wanted += model.drag_force[:, None] * state.v
-    found = x.joint_reaction.copy()
-    for k, far in enumerate(model.body[:, 0]):
-        if far >= 0:
-            found[far] -= x.joint_reaction[k]
-    np.testing.assert_allclose(found, wanted, atol=1e-12 * np.max(np.abs(wanted)))
 
 
 def test_the_structured_form_refuses_trees():

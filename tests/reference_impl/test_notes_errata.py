@@ -77,6 +77,23 @@ def test_E1_the_length_changes_neither_jacobians_nor_gamma():
     np.testing.assert_array_equal(one[1], other[1])
 
 
+def test_E1_the_ball_is_the_limit_of_the_rod():
+    """A rod that starts along the ball's reaction swings about it ever less: positions differ by O(ℓ)."""
+    rng = np.random.default_rng(2)
+    ball = random_model(rng, [False])
+    r, p, v, pdot = state_on_manifold(ball, rng)
+    times = np.linspace(0, 0.5, 6)
+    truth = integrate_dop853(ball, r, p, v, pdot, times, 1e-10)
+    pull = DirectSystem(ball).solve(r, p, v, pdot).joint_reaction
+    direction = -pull / np.linalg.norm(pull)
+    errors = []
+    for length in (1e-2, 1e-3):
+        rod = ball.changed(length=np.array([length]))
+        run = integrate_dop853(rod, r + length * direction, p, v, pdot, times, 1e-9)
+        errors.append(np.max(np.abs(run.r - truth.r)))
+    assert errors[0] < 0.1 and errors[1] < 0.15 * errors[0], errors
+
+
 # --- E2, E3 ---------------------------------------------------------------------------------------------
 
 

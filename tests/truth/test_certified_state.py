@@ -5,7 +5,6 @@ import sys
 import numpy as np
 import pytest
 
-from plumbline.model.kinematics import rotation_matrix
 from plumbline.truth import TruthUnavailable, import_truth_tool
 from plumbline.truth.certified_state import (
     MAX_RELATIVE_RADIUS,
@@ -57,21 +56,6 @@ def test_precision_rises_until_the_radius_is_small():
 
 def max_norm(v):
     return float(np.max(np.linalg.norm(v, axis=-1)))
-
-
-def test_energy_momentum_and_mass_matrix_follow_their_definitions():
-    model, state = random_chain(np.random.default_rng(2), [1, 0, 1])
-    reported = certify_state(model, state, mass_matrix=True).quantities
-    A = rotation_matrix(state.p)
-    spin = np.einsum("kij,kj->ki", model.inertia, state.omega)
-    kinetic = 0.5 * np.sum(model.mass * np.sum(state.v**2, 1)) + 0.5 * np.sum(state.omega * spin)
-    momentum = np.sum(np.cross(state.r, model.mass[:, None] * state.v) + (A @ spin[..., None])[..., 0], 0)
-    assert reported.kinetic_energy == pytest.approx(kinetic, rel=1e-13)
-    assert reported.potential_energy == pytest.approx(9.81 * np.sum(model.mass * state.r[:, 2]), rel=1e-13)
-    assert reported.angular_momentum == pytest.approx(momentum, rel=1e-12)
-    rates = np.concatenate([state.udot[model.rods].ravel(), state.omega.ravel()])
-    assert 0.5 * rates @ reported.mass_matrix @ rates == pytest.approx(kinetic, rel=1e-13)
-    assert np.array_equal(reported.mass_matrix, reported.mass_matrix.T)
 
 
 def test_a_singular_system_is_not_certified():

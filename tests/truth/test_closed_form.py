@@ -15,7 +15,6 @@ from plumbline.model.kinematics import quaternion_product, rotation_matrix, stat
 from plumbline.truth.closed_form import CLOSED_FORMS, ClosedFormMismatch, closed_form_motion
 from plumbline.truth.closed_form.tops_and_pendulums import elliptic_f, elliptic_pi, jacobi
 from tests.helpers.catalogue import catalogue_scenarios
-from tests.helpers.relative_equilibria import relative_equilibrium
 
 TIMES = np.arange(41) * 0.05
 CLOSED_FORM_SCENARIOS = {
@@ -184,15 +183,6 @@ def test_planar_pendulum(angle, rate):
         ScenarioStub("planar-pendulum", model, make_state(model, p, [0.0, rate, 0.0]))
     )
     assert max(position, attitude) < (5e-12 if abs(angle) > 2.5 else 1e-12)
-
-
-def test_two_bodies_in_steady_conical_motion():
-    case = CLOSED_FORM_SCENARIOS["double-conical"]
-    fast = np.array([2 * case.state.omega[0, 2]])
-    assert fast > 0
-    p, omega, u = relative_equilibrium(case.model, 6.0, case.state.p, case.state.u)
-    state = state_from_minimal(case.model, p, omega, u, np.zeros_like(u))
-    assert max(closed_form_errors(ScenarioStub("double-conical", case.model, state))) < 1e-11
 
 
 @pytest.mark.parametrize(
