@@ -50,7 +50,9 @@ def test_rods_are_the_printed_forms_identically(n):
         assert x.is_zero(general - as_printed)
 
 
-@pytest.mark.parametrize("rods", [[False], [False, False], [True, False], [False, True]], ids=str)
+@pytest.mark.parametrize(
+    "rods", [[False], [True], [False, False], [True, True], [True, False], [False, True]], ids=str
+)
 def test_every_mix_of_two_differentiates(rods):
     """C_r, C_p differentiate C for every p; γ does too for balls, and up to E3 for rods."""
     x, _, joints = symbolic_chain(rods)

@@ -5,7 +5,7 @@ import pytest
 
 from reference_impl import notes
 from reference_impl.direct import DirectSystem, check_state_solvable, solve_dense
-from reference_impl.euler_parameters import I3, A, A_rate, L, dAs_dp, dot
+from reference_impl.euler_parameters import I3, A, A_rate, G, H, L, dAs_dp, dot
 from reference_impl.integrate import integrate_dop853
 from reference_impl.joints import constraint_rows
 from reference_impl.mechanism import Mechanism
@@ -197,6 +197,19 @@ def test_E5_the_reaction_of_a_rod_is_minus_2_lambda_d():
     x, d = DirectSystem(chain).solve(*state), constraint_rows(chain, *state).d
     np.testing.assert_allclose(x.joint_reaction, -2 * x.multiplier[:, None] * d, atol=1e-14)
     np.testing.assert_allclose(np.abs(x.tension), np.linalg.norm(x.joint_reaction, axis=1), rtol=1e-14)
+
+
+# --- E6 -------------------------------------------------------------------------------------------------
+
+
+def test_E6_the_recognised_text_without_transposes_is_not_the_derivative():
+    x = Symbols(bodies=2, attachments=3)
+    pendulum = notes.DoublePendulum(x.r, x.p, x.v, x.pdot, x.s, x.length)
+    (_, s2, s3), (p1, p2) = x.s, x.p
+    lost = 4 * ((x.r[0] - x.r[1]) @ H(p1, s2)) - 4 * (s3 @ A(p2) @ H(p1, s2))
+    assert not x.is_zero(lost - x.gradient(pendulum.C[1], p1))
+    unequal = 2 * (x.v[0] - x.v[1]) + 4 * (s2 @ L(x.pdot[0]) @ G(p1).T)
+    assert not x.is_zero(unequal - pendulum.C2_r_rate[:3])
 
 
 # --- E7 -------------------------------------------------------------------------------------------------
