@@ -133,9 +133,9 @@ def _add_readings(s: Probed, name: str, data: pin.Data, derived: pin.Data, read:
         s.add_twists((of_point, f"frame_angular_{of_rotation}"), call, twists)
 
 
-def _computed(s: Probed, name: str, of: str, f: int, *_: pin.Data) -> Iterator[Reading]:
-    """What functions say that need no other before."""
-    other, reference = s.m.createData(), getattr(pin.ReferenceFrame, name)
+def _computed(s: Probed, name: str, of: str, f: int, other: pin.Data, _: pin.Data) -> Iterator[Reading]:
+    """What functions say that need no other before, and change the data."""
+    reference = getattr(pin.ReferenceFrame, name)
     if of == "Joint":
         if name == "LOCAL":
             J = s.square(pin.computeJointJacobian(s.m, other, s.q, f))
