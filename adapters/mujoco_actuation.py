@@ -17,6 +17,7 @@ from adapters.mujoco_common import (
     add_actuator,
     add_sensor,
     bodies_of,
+    children_of,
     dense_rows,
     member,
     named_joints,
@@ -301,10 +302,10 @@ def forward_with_group_off(m: Any, d: Any) -> None:
 
 
 def forward_without_gravity(m: Any, d: Any) -> None:
-    """Apply the weights as forces on the bodies, with gravity compensated or, without such bodies, off."""
-    loads, flags, is_compensated = d.xfrc_applied.copy(), m.opt.disableflags, np.any(m.body_gravcomp)
-    d.xfrc_applied[:, :3] += m.body_mass[:, None] * m.opt.gravity
-    if not is_compensated:
+    """Apply weights as forces on the bodies whose gravity is compensated, or on all with gravity off."""
+    loads, flags, share = d.xfrc_applied.copy(), m.opt.disableflags, m.body_gravcomp
+    d.xfrc_applied[:, :3] += ((share if np.any(share) else 1.0) * m.body_mass)[:, None] * m.opt.gravity
+    if not np.any(share):
         m.opt.disableflags = flags | int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
     mujoco.mj_forward(m, d)
     m.opt.disableflags = flags
@@ -316,6 +317,13 @@ def with_gravcomp(spec: Any) -> Any:
     """Mark all bodies, so that the compiler counts them."""
     for body in bodies_of(spec):
         body.gravcomp = 1.0
+    return spec
+
+
+def with_gravcomp_of_attached(spec: Any) -> Any:
+    """Mark the bodies that are fixed to others."""
+    for body in bodies_of(spec):
+        body.gravcomp = 0.0 if children_of(body, "joint") else 1.0
     return spec
 
 

@@ -95,6 +95,12 @@ JACOBIANS = {
     "mj_angmomMat": ("subtree_angular_momentum",),
 }
 INVERSE_STAGES = ("mj_invPosition", "mj_invVelocity", "mj_invConstraint")
+STILL_SENSORS = {"FRAMELINACC": False, "ACCELEROMETER": True}  # by name whether in own axes
+# By range of forces the names that only a step with it uses.
+CLAMPED = {
+    "actuator_forcerange": ("mjtBias.mjBIAS_AFFINE", "mjtTrn.mjTRN_TENDON"),
+    "tendon_actfrcrange": ("mjtBias.mjBIAS_AFFINE", "mjtObj.mjOBJ_TENDON"),
+}
 SENSOR_STAGES = ("mj_sensorPos", "mj_sensorVel", "mj_sensorAcc")
 SIZES = {"p": 4, "R": 9, "r": 3, "phi": 3, "w": 3, "pdot": 4, "2pdot": 4}
 
@@ -149,6 +155,8 @@ def _add_relative_probes(spec: Any, links: Sequence[Any], model: Model) -> None:
     anchor = spec.worldbody.add_site()
     set_attributes(anchor, name=ANCHOR, pos=anchor_point(model), quat=PROBE_ATTITUDE)
     far = 1e3 * (1.0 + float(np.linalg.norm(anchor.pos)))  # it is not reached
+    for name in STILL_SENSORS:
+        add_sensor(spec, name, "SITE", ANCHOR)
     for k, (link, point) in enumerate(zip(links, probe_points(model), strict=True)):
         probe = f"probe {k}"
         shape, camera = link.add_geom(), link.add_camera()
@@ -165,6 +173,8 @@ def _add_relative_probes(spec: Any, links: Sequence[Any], model: Model) -> None:
         add_actuator(spec, probe, "TENDON", probe, 2.0 * np.eye(6)[0])
         for i, gear in enumerate(np.eye(6)[:3]):
             add_actuator(spec, f"{probe} {i}", "SITE", probe, gear, refsite=ANCHOR)
+        slide = {"slidersite": probe, "cranklength": 1.0}
+        add_actuator(spec, f"{probe} crank", "SLIDERCRANK", ANCHOR, np.eye(6)[0], **slide)
         for name in ("TENDONLIMITPOS", "TENDONLIMITVEL"):
             add_sensor(spec, name, "TENDON", probe, f"{name} {k}")
         for name, (kind, _, _) in DISTANCE_SENSORS.items():
@@ -173,7 +183,8 @@ def _add_relative_probes(spec: Any, links: Sequence[Any], model: Model) -> None:
 
 def add_surface(s: Probed) -> None:
     """Read all after the forward dynamics at one state."""
-    parts = _add_sensors, _add_frames, _add_momenta, _add_relative, _add_tendon_limits, *ARRAYS, _add_torques
+    parts = (_add_sensors, _add_frames, _add_momenta, _add_relative, _add_still, _add_cranks,
+             _add_tendon_limits, *ARRAYS, _add_torques)  # fmt: skip
     add_parts(s.found, *(partial(part, s) for part in parts))
 
 
@@ -252,6 +263,40 @@ def _add_relative(s: Probed) -> None:
     s.add("frame_position_from_anchor", ("MjData.actuator_length", by), length)
     s.add("frame_velocity", ("MjData.actuator_velocity", by), speeds)
     s.add("frame_velocity", ("MjData.actuator_moment", by), (moment @ d.qvel)[on_sites] @ turn.T)
+
+
+def _add_still(s: Probed) -> None:
+    """Add accelerations as differences from what is said of the anchor, which stays where it is."""
+    m, d, anchor = s.m, s.d, s.m.site(ANCHOR).id
+    turns = [d.site_xmat[site].reshape(3, 3) for site in (anchor, *s.sites)]
+    for name, is_local in STILL_SENSORS.items():
+        own = [d.sensor(f"{name} {ANCHOR}").data.copy(), *s.sensors(name)]
+        still, *moving = (turn @ x if is_local else x for turn, x in zip(turns, own, strict=True))
+        s.add("frame_acceleration", (f"mjtSensor.mjSENS_{name}",), np.array(moving) - still)
+    vectors = np.zeros((len(turns), 6))
+    for site, out in zip((anchor, *s.sites), vectors, strict=True):
+        mujoco.mj_objectAcceleration(m, d, mujoco.mjtObj.mjOBJ_SITE, site, out, 0)
+    call = "mj_objectAcceleration", "mjtObj.mjOBJ_SITE"
+    s.add("frame_acceleration", call, vectors[1:, 3:] - vectors[0, 3:])
+
+
+def _add_cranks(s: Probed) -> None:
+    """Add the distances from the anchor by slides along the frames' axes, with cranks that all reach it."""
+    own, cranks, anchor = copy(s.m), s.ids("actuator", " crank"), s.m.site(ANCHOR).id
+    arms = s.d.site_xpos[anchor] - s.d.site_xpos[s.sites]
+    own.actuator_cranklength[cranks] = L = 1.5 * np.linalg.norm(arms, axis=1)
+    other, axes = data_like(own, s.d), s.d.site_xmat[s.sites].reshape(-1, 3, 3)[:, :, 2]
+    mujoco.mj_fwdPosition(own, other)
+    mujoco.mj_fwdVelocity(own, other)
+    turning = np.cross(s.sensors("FRAMEANGVEL"), axes)
+    along, speed = np.sum(arms * axes, 1), np.sum(arms * turning - s.sensors("FRAMELINVEL") * axes, 1)
+    rest = along - other.actuator_length[cranks]
+    distance, by = np.sqrt(L**2 + along**2 - rest**2), "mjtTrn.mjTRN_SLIDERCRANK"
+    moment = dense_rows(other.actuator_moment, own, other, "moment")
+    s.add("frame_distance", ("MjData.actuator_length", by), distance[:, None])
+    for name, rate in (("velocity", other.actuator_velocity[cranks]), ("moment", moment[cranks] @ s.d.qvel)):
+        change = (along * speed - rest * (speed - rate)) / distance
+        s.add("frame_distance_rate", (f"MjData.actuator_{name}", by), change[:, None])
 
 
 def _add_tendon_limits(s: Probed) -> None:
@@ -431,6 +476,25 @@ def _add_implicit_steps(s: Probed, dynamics: dict[Call, Array]) -> None:
             LU = dense_rows(other.qLU, m, other, "D")
             twice = ((np.triu(LU, 1) + np.eye(m.nv)).T @ v) @ (np.tril(LU) @ v) + h * v @ D @ v
             s.add("kinetic_energy", ("MjData.qLU",), twice / 2)
-        change = times_mass(m, d, (other.qvel - v) / h) - D @ (other.qvel - v)
-        call = "mj_implicit", f"mjtIntegrator.mjINT_{name}", "MjData.qDeriv", "mjtDisableBit.mjDSBL_ACTUATION"
-        dynamics[call] = d.qfrc_bias + change - rotors
+        call = "mj_implicit", f"mjtIntegrator.mjINT_{name}"
+        for more, end in [
+            (("MjData.qDeriv", "mjtDisableBit.mjDSBL_ACTUATION"), other),
+            *((names, _clamped_step(s, own, limit)) for limit, names in CLAMPED.items() if hasattr(m, limit)),
+        ]:
+            change = times_mass(m, d, (end.qvel - v) / h) - D @ (end.qvel - v)
+            dynamics[*call, *more] = d.qfrc_bias + change - rotors
+
+
+def _clamped_step(s: Probed, usual: Any, limit: str) -> Any:
+    """Take an implicit step with dampers on the tendons whose force a limit makes zero."""
+    own, a = copy(usual), s.ids("actuator")
+    own.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
+    own.actuator_gainprm[:] = own.actuator_biasprm[:] = 0.0  # of all others
+    own.actuator_biastype[a], own.actuator_biasprm[a, 2] = mujoco.mjtBias.mjBIAS_AFFINE, -7.0
+    of = s.ids("tendon") if limit.startswith("tendon") else a
+    getattr(own, limit)[of] = 0.0
+    getattr(own, limit.replace("range", "limited"))[of] = True
+    other = data_like(own, s.d, "qfrc_applied", "xfrc_applied")
+    mujoco.mj_forward(own, other)
+    mujoco.mj_implicit(own, other)
+    return other

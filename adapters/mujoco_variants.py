@@ -403,6 +403,11 @@ _option = variants_of("option", Change, _is_free)
 _spelling = variants_of("spelling", Change, _is_free)
 
 
+def _has_attached(model: Model) -> bool:
+    """Whether bodies of a mechanism without constraints are fixed to others."""
+    return _is_free(model) and any(kind.is_rigid for kind in model.kinds)
+
+
 def _has_elements(*names: str) -> Callable[[Model], bool]:
     """Whether a mechanism without constraints has one of these elements of joints."""
     return lambda model: _is_free(model) and any(np.any(getattr(model, name)) for name in names)
@@ -555,6 +560,12 @@ VARIANTS = (
     ),
     _spelling(
         "MjData.qfrc_gravcomp", describe=actuation.with_gravcomp, forward=actuation.forward_without_gravity
+    ),
+    _spelling(
+        "MjsBody MjData.qfrc_gravcomp",
+        _has_attached,
+        describe=actuation.with_gravcomp_of_attached,
+        forward=actuation.forward_without_gravity,
     ),
     _option("mjtDisableBit.mjDSBL_GRAVITY", forward=actuation.forward_without_gravity),
     _spelling("MjSpec", describe=lambda spec: spec.copy()),
