@@ -173,8 +173,8 @@ def _add_relative_probes(spec: Any, links: Sequence[Any], model: Model) -> None:
         add_actuator(spec, probe, "TENDON", probe, 2.0 * np.eye(6)[0])
         for i, gear in enumerate(np.eye(6)[:3]):
             add_actuator(spec, f"{probe} {i}", "SITE", probe, gear, refsite=ANCHOR)
-        slide = {"slidersite": probe, "cranklength": 1.0}
-        add_actuator(spec, f"{probe} crank", "SLIDERCRANK", ANCHOR, np.eye(6)[0], **slide)
+        slide = {"slidersite": ANCHOR, "cranklength": 1.0}
+        add_actuator(spec, f"{probe} crank", "SLIDERCRANK", probe, np.eye(6)[0], **slide)
         for name in ("TENDONLIMITPOS", "TENDONLIMITVEL"):
             add_sensor(spec, name, "TENDON", probe, f"{name} {k}")
         for name, (kind, _, _) in DISTANCE_SENSORS.items():
@@ -281,15 +281,14 @@ def _add_still(s: Probed) -> None:
 
 
 def _add_cranks(s: Probed) -> None:
-    """Add the distances from the anchor by slides along the frames' axes, with cranks that all reach it."""
+    """Add the distances from the anchor by slides along its axis, with cranks that reach them."""
     own, cranks, anchor = copy(s.m), s.ids("actuator", " crank"), s.m.site(ANCHOR).id
-    arms = s.d.site_xpos[anchor] - s.d.site_xpos[s.sites]
+    arms = s.d.site_xpos[s.sites] - s.d.site_xpos[anchor]
     own.actuator_cranklength[cranks] = L = 1.5 * np.linalg.norm(arms, axis=1)
-    other, axes = data_like(own, s.d), s.d.site_xmat[s.sites].reshape(-1, 3, 3)[:, :, 2]
+    other, axis = data_like(own, s.d), s.d.site_xmat[anchor].reshape(3, 3)[:, 2]
     mujoco.mj_fwdPosition(own, other)
     mujoco.mj_fwdVelocity(own, other)
-    turning = np.cross(s.sensors("FRAMEANGVEL"), axes)
-    along, speed = np.sum(arms * axes, 1), np.sum(arms * turning - s.sensors("FRAMELINVEL") * axes, 1)
+    along, speed = arms @ axis, s.sensors("FRAMELINVEL") @ axis
     rest = along - other.actuator_length[cranks]
     distance, by = np.sqrt(L**2 + along**2 - rest**2), "mjtTrn.mjTRN_SLIDERCRANK"
     moment = dense_rows(other.actuator_moment, own, other, "moment")
