@@ -176,6 +176,41 @@ def test_the_supported_versions_work_beside_the_installed_ones(tmp_path):
     assert len(orders) == 6 and all(1.9 < order < 2.1 for order in orders)
 
 
+# What the engines' changelogs say to be mended since: scenario, version before, quantity, and by which call.
+MENDED = [
+    ("sprung-universal", "mujoco@3.2.6", "kinetic_energy", "mj_mulM2"),
+    ("sprung-universal", "mujoco@3.3.0", "frame_acceleration", "mj_jacDot"),
+    ("sprung-universal", "mujoco@3.3.3", "acceleration_by_spelling", "mjtObj.mjOBJ_TENDON"),
+    ("hand-on-welds", "mujoco@3.4.0", "acceleration_by_spelling", "MjsBody, MjData.qfrc_gravcomp"),
+    ("sprung-universal", "mujoco@3.4.0", "inverse_dynamics", "mjtBias.mjBIAS_AFFINE, mjtTrn.mjTRN_TENDON"),
+    ("sprung-universal", "mujoco@3.17.0", "inverse_dynamics", "mjtBias.mjBIAS_AFFINE, mjtObj.mjOBJ_TENDON"),
+    ("sprung-universal", "mujoco@3.17.0", "frame_acceleration", "mjtSensor.mjSENS_ACCELEROMETER"),
+    ("helical-screw", "pinocchio@3.7.0", "acceleration_by_option", "buildReducedModel"),
+    ("helical-screw", "pinocchio@3.7.0", "all", "add mimic momenta: crashed"),
+    ("helical-screw", "pinocchio@3.8.0", "mass_matrix_by_spelling", "appendModel, FrameType.BODY"),
+    ("sprung-hinge", "exudyn@1.10.0", "all_by_spelling", "MainSystem.CreateTorsionalSpringDamper"),
+    ("tree-of-seven", "exudyn-tree@1.11.0", "acceleration", ""),
+]
+
+
+@pytest.mark.full
+@pytest.mark.timeout(1800)
+def test_defects_of_older_versions_are_reported_by_quantity_and_call():
+    wrong = []
+    for scenario in sorted({one[0] for one in MENDED}):
+        names = sorted({one[1] for one in MENDED if one[0] == scenario})
+        sound = ["mujoco", "pinocchio", "exudyn"] if scenario != "tree-of-seven" else ["exudyn-tree"]
+        chosen = loader.load_scenarios([scenario])
+        result = run_plan(Plan(chosen, [*sound, *names], "state", limits=Limits(600)), quiet)
+        rows = [r for r in result.rows if r.verdict in ("disagrees", "failed")]
+        wrong += [(scenario, r.engine, r.quantity, r.reason) for r in rows]
+    for scenario, engine, quantity, words in MENDED:
+        told = [w for *who, w in wrong if tuple(who) == (scenario, engine, quantity)]
+        assert told and words in told[0], (scenario, engine, quantity)
+        since = [w for *who, w in wrong if tuple(who) == (scenario, engine.partition("@")[0], quantity)]
+        assert not (since and words in since[0]), (scenario, engine, quantity)
+
+
 @pytest.mark.full
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize(("version", "sound"), [("1.9.0", False), ("1.10.0", False), ("1.11.0", True)])
