@@ -356,6 +356,8 @@ class _Fit:
             self.is_active = False
             return
         self.x = self.x + self.step
+        first = self.combination[0]  # of two that have opposite signs the other one goes on
+        self.is_active = bool(first.can_vanish or first.nominal[0] or self.x[0] > 0)
 
     def result(self, accepted: float) -> Explanation | None:
         """What was found, if it explains the difference by amounts that differ from the right ones."""
