@@ -121,6 +121,8 @@ class LazyGroup(click.Group):
             return super().main(*args, **extra)
         except OSError:
             sys.exit(ExitCode.MACHINE_FAILED)
+        finally:
+            _drop_words_that_cannot_be_written()
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run a command; an interruption or an internal error ends with its own exit code and a sentence."""
@@ -190,6 +192,15 @@ def _make_streams_writable() -> None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115
         elif getattr(stream, "errors", "") == "strict":
             stream.reconfigure(errors="backslashreplace")
+
+
+def _drop_words_that_cannot_be_written() -> None:
+    """Empty the buffers of full disks: Python would try again at its end, and exit with its own code 120."""
+    for stream in filter(None, (sys.stdout, sys.stderr)):
+        try:
+            stream.flush()
+        except OSError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 @contextmanager
