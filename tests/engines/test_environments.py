@@ -161,13 +161,29 @@ def test_the_supported_versions_work_beside_the_installed_ones(tmp_path):
         found.setdefault(r.engine, set()).add((r.level, what))
     of_rk4 = {("step", "RK4"), ("trajectory", "RK4")}  # of order 2 before 4.0
     of_names = {("surface", "MjData.jnt"), ("surface", FULL_INERTIA)}
+    clamped = "mj_implicit, mjtIntegrator.mjINT_IMPLICIT, mjtBias.mjBIAS_AFFINE"
     sparse = {("relations", "by EXUdense"), ("relations", "by EigenDense")}  # its sparse start before 1.11
     sparse |= {("step", "trapezoidal"), ("step", "generalized-alpha")}
     no_rates = {("surface", "itemInterface.NodeRigidBodyRotVecLG")}
     assert found == {
-        "mujoco@3.2.0": of_rk4 | {("surface", "all_variants"), ("relations", "all")},
-        "mujoco@3.3.0": of_rk4 | of_names | {("surface", "mj_jacDot"), ("relations", "root moved")},
-        "mujoco@3.12.0": of_rk4 | of_names,
+        "mujoco@3.2.0": of_rk4 | {("surface", "MjModel"), ("surface", "MjSpec"), ("relations", "all")},
+        "mujoco@3.3.0": of_rk4
+        | of_names
+        | {
+            ("surface", "mj_jacDot"),
+            ("surface", f"{clamped}, mjtTrn.mjTRN_TENDON"),
+            ("relations", "root moved"),
+        },
+        "mujoco@3.12.0": of_rk4
+        | of_names
+        | {
+            ("surface", f"{clamped}, mjtObj.mjOBJ_TENDON"),
+            ("surface", "mj_objectAcceleration, mjtObj.mjOBJ_SITE"),
+        },
+        "pinocchio@3.3.1": {
+            ("surface", "appendModel, FrameType.BODY"),
+            ("surface", "buildReducedModel, Model.addJointFrame"),
+        },
         "exudyn@1.9.0": sparse | no_rates,
         "exudyn@1.10.0": sparse | no_rates,
         "exudyn@1.11.0": no_rates,
