@@ -62,6 +62,10 @@ LEFT_TO_THE_NIGHT = (
     "smaller mistakes; of this family the study of {} runs, and a nightly or `run --level trajectory` runs "
     "all"
 )
+REPEATS = (
+    "not run: every step of a run is that of the declared formula, which here is that of {}, whose study this "
+    "would repeat; a nightly or `run --level trajectory` runs all"
+)
 LIFTED = ("acceleration", "angular_acceleration")  # computed here where an engine returns those of its joints
 NO_INDEPENDENT_TRUTH = "no independent truth: python-flint is not installed, and the reference is no judge"
 NO_REGULAR_POSE = (
@@ -287,17 +291,27 @@ class ScenarioRun:
                 following = self._diagnosis_tasks(outcome, found)
             if key.kind == TaskKind.STEP:
                 following += self._study_tasks(key, found.rows)
+            found.rows = mark_aliases(found.rows)
         self._pending |= {task.key for task in following}
         return following
 
     def _awaited_steps(self, key: TaskKey) -> TaskKey | None:
         """The steps that decide whether a refinement study runs; None where it always does."""
-        studied = self._plan.studied.get(self.scenario.family) if not self._plan.has_all_studies else None
-        if key.kind != TaskKind.TRAJECTORY or studied in (None, self.scenario.name):
+        if key.kind != TaskKind.TRAJECTORY or self._plan.has_all_studies:
             return None
         integrator, steps = self._integrator(key), replace(key, kind=TaskKind.STEP)
         is_low = integrator.kind == "step" and integrator.order <= LOW_ORDER
-        return steps if is_low and steps in self._keys else None
+        is_studied = self._studied in (None, self.scenario.name) and not self._repeats(integrator)
+        return steps if is_low and not is_studied and steps in self._keys else None
+
+    @property
+    def _studied(self) -> str | None:
+        """The scenario of this family whose studies always run."""
+        return self._plan.studied.get(self.scenario.family)
+
+    def _repeats(self, integrator: Integrator) -> str | None:
+        """The integrator whose method this one's is here, declared as its alias where nothing drags."""
+        return None if self.scenario.model.has_drag else integrator.alias_of
 
     def _is_due(self, key: TaskKey) -> bool:
         """Whether a cell need not wait for steps, and is not left to the night."""
@@ -309,9 +323,12 @@ class ScenarioRun:
         study = replace(steps, kind=TaskKind.TRAJECTORY)
         if study not in self._keys or self._awaited_steps(study) is None:
             return []
-        if not decides_without_study(rows, self._resolutions(self._integrator(study))[0]):
+        integrator = self._integrator(study)
+        repeated, reason = self._repeats(integrator), LEFT_TO_THE_NIGHT.format(self._studied)
+        coarsest = np.inf if repeated else self._resolutions(integrator)[0]
+        if not decides_without_study(rows, coarsest):
             return [self._cell_task(study)] if study.needed_truth in self.truths else []
-        reason = LEFT_TO_THE_NIGHT.format(self._plan.studied[self.scenario.family])
+        reason = REPEATS.format(repeated) if repeated else reason
         row = self._context(study.engine).make_row(
             "trajectory", study.integrator, "all", Verdict.INFORMATION, reason
         )
@@ -487,7 +504,6 @@ class ScenarioRun:
         is_refused = any(row.verdict == Verdict.UNSUPPORTED and row.quantity == "all" for row in found.rows)
         if key.kind == TaskKind.STATE and is_singular(self._singular_value) and not is_refused:
             found.rows.append(singular_pose_row(self._context(key.engine), self._singular_value))
-        found.rows = mark_aliases(found.rows)
         if key.kind == TaskKind.STATE and self._engines[key.engine].is_lifted:
             found.rows = [
                 replace(row, extra=row.extra | {"lifted": 1.0}) if row.quantity in LIFTED else row

@@ -224,7 +224,24 @@ def test_every_study_runs_at_night_and_on_the_plainest_scenario(engines):
         bench = ScenarioRun(plan, chosen, {"mujoco": engines["mujoco"]})
         truth = next(x for x in bench.tasks() if x.key.kind == TaskKind.MOTION_TRUTH)
         following = [x.key.integrator for x in bench.on_outcome(outcome_of(truth))]
-        assert following == ["Euler", "implicit", "implicitfast", "RK4"]
+        repeated = ["implicitfast"] if has_all_studies or chosen.model.has_drag else []
+        assert following == ["Euler", "implicit", *repeated, "RK4"]
+
+
+@pytest.mark.parametrize("name", ["tumbling-ball", "loaded-ball"])
+def test_a_study_that_repeats_another_is_left_to_the_night(engines, name):
+    """Implicitfast is Euler unless something drags; in so slow a motion other studies stay."""
+    plan, chosen = two_of_a_family(False, name, "drag-rod")
+    bench = ScenarioRun(plan, chosen, {"mujoco": engines["mujoco"]})
+    truth = next(x for x in bench.tasks() if x.key.kind == TaskKind.MOTION_TRUTH)
+    bench.on_outcome(outcome_of(truth))
+    following = bench.on_outcome(outcome_of(steps_of(bench, "mujoco", "implicitfast")))
+    rows = [r for r in bench.findings().rows if (r.level, r.integrator) == ("trajectory", "implicitfast")]
+    if chosen.model.has_drag:
+        assert [task.key.kind for task in following] == [TaskKind.TRAJECTORY] and not rows
+    else:
+        assert not following and [row.verdict for row in rows] == ["information"]
+        assert "that of Euler, whose study this would repeat" in rows[0].reason
 
 
 def test_a_worker_that_ends_in_what_is_asked_besides_costs_that_only(engines):
