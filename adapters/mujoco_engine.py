@@ -124,7 +124,8 @@ LARGEST_REGULARISATIONS, RATIO, REGULARISATIONS = (0.027, 2.7e-4, 2.7e-6), 3.0, 
 SEQUENCES = (1.0, 1.3, 1.7, 1.15, 1.5)  # of them: factors of the largest; three are compared
 # Of motions: the error of smaller ones is rounding, and as 1/R what steps leave of gaps in dependent rows.
 LARGEST_RUN_REGULARISATION, RUN_REGULARISATIONS = 2.7e-4, 3
-RUN_SOLREF = -(STABILISATION**2), -2 * STABILISATION  # of welds
+# Of welds: MuJoCo divides by the impedance and by its square, and multiplies the stiffness by it again.
+RUN_SOLREF = -MAX_IMPEDANCE * STABILISATION**2, -2 * MAX_IMPEDANCE * STABILISATION
 RUN_ITERATIONS = 3  # of Newton's method on welds, a linear problem: the second and third remove rounding
 NO_SAME_FRAME = 0  # mjSAMEFRAME_NONE; the first versions have no enumeration
 MAX_ORDER_ERROR = 0.1

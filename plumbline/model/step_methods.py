@@ -45,6 +45,9 @@ class JointSpaceMethod:
     # of a free body: r and ṙ in the world beside its rotation, or a rigid motion with the twist in its frame
     free_coordinates: Literal["point and rotation", "rigid motion"] = "point and rotation"
     gap_correction: float = 0.0  # a [1/s]: gaps x of loops are to follow ẍ = −2 a ẋ − a² x
+    # x: the logarithm of the pose of one end in the other, which x follows as a twist; or the distance of their
+    # points in the world, and the vector of the quaternion from the second end to the first
+    gap_form: Literal["logarithm", "distance and quaternion"] = "logarithm"
     stages: tuple[tuple[float, ...], ...] = ()  # the tableau's rows below the diagonal
     weights: tuple[float, ...] = ()
     new_velocity_share: float = 1.0  # x in q₁ = q ⊕ h (x v₁ + (1−x) v): 0 is explicit Euler
@@ -88,6 +91,7 @@ def classical_runge_kutta(
     rod_axial_inertia: float = 1.0,
     free_coordinates: Literal["point and rotation", "rigid motion"] = "point and rotation",
     gap_correction: float = 0.0,
+    gap_form: Literal["logarithm", "distance and quaternion"] = "logarithm",
 ) -> JointSpaceMethod:
     """Return the classical Runge-Kutta method of order 4.
 
@@ -96,6 +100,7 @@ def classical_runge_kutta(
         rod_axial_inertia: of `JointSpaceMethod`; of no effect for joint angles.
         free_coordinates: of `JointSpaceMethod`.
         gap_correction: of `JointSpaceMethod`.
+        gap_form: of `JointSpaceMethod`.
 
     """
     return JointSpaceMethod(
@@ -104,6 +109,7 @@ def classical_runge_kutta(
         rod_axial_inertia,
         free_coordinates=free_coordinates,
         gap_correction=gap_correction,
+        gap_form=gap_form,
         stages=((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)),
         weights=(1 / 6, 1 / 3, 1 / 3, 1 / 6),
     )

@@ -622,40 +622,38 @@ class _MovingTree(Tree):
         return rates, after
 
     def closing_wrenches(self, ends: Sequence[tuple[int, int]]) -> list[Mapping[int, tuple[Any, Any]]]:
-        """Moments about and forces along the axes of each end b, at its centre, and against them on c."""
+        """Wrenches on each end b, and against them on c, that belong to the rows of `closing_shares`."""
         found: list[Mapping[int, tuple[Any, Any]]] = []
         for b, c in ends:
-            lever = self.r[b] - self.r[c]
-            axes = [self.A[b][..., i : i + 1] for i in range(3)]
-            found += [self.end_wrench(b, c, e, is_force=False) for e in axes]
-            found += [self.end_wrench(b, c, e, is_force=True, lever=lever) for e in axes]
+            if self.charts.method.gap_form == "logarithm":  # about and along the axes of b, at its centre
+                turns = pushes = self.A[b]
+                lever = self.r[b] - self.r[c]
+            else:
+                e = self._turn_between(c, b)
+                turns = self.A[c] @ np.swapaxes(_rate_of_vector(e, np.eye(3, dtype=LongDouble)), -1, -2)
+                pushes, lever = np.eye(3, dtype=LongDouble), None
+            axes = [x[..., i : i + 1] for x in (turns, pushes) for i in range(3)]
+            found += [self.end_wrench(b, c, e, i > 2, lever) for i, e in enumerate(axes)]
         return found
+
+    def _turn_between(self, b: int, c: int) -> Array:
+        """The quaternion from the attitude of b to that of c."""
+        return quaternion_product(quaternion_conjugate(self.p[b]), self.p[c])
 
     def closing_shares(self, ends: Sequence[tuple[int, int]], found: Solution) -> Array:
         """Compute 1 and the λ (..., 1 + 6 L, 1) of the wrenches that hold the loops closed."""
-        num, a = self.num, LongDouble(self.charts.method.gap_correction)
-        answers, lead = list[Array](), self.rates[0].shape[:-1]
-        for b, c in ends:
-            back, here = self.A[b].mT, self.r[b]
-            twist, change = list[Array](), list[Array]()
-            for k in (b, c):
-                w, v, at, A, alpha = (
+        num, lead = self.num, self.rates[0].shape[:-1]
+        rows_of = {"logarithm": self._twist_rows, "distance and quaternion": self._distance_rows}
+        answers = list[Array]()
+        for pair in ends:
+            motions = [
+                [
                     np.broadcast_to(x[k], (*lead, *x[k].shape[-2:]))
                     for x in (self.w, self.v, self.r, found.acceleration, found.turning)
-                )
-                twist.append(np.concatenate([w, v - num.cross(w, at)], -2)[..., 0])
-                carried = num.widened(num.cross(w, v), A)
-                change.append(np.concatenate([alpha, A + num.mul(num.cross_matrix(at), alpha) - carried], -2))
-            apart = twist[0] - twist[1]
-            turn = rotation_vector(quaternion_product(quaternion_conjugate(self.p[b]), self.p[c]))
-            gap = np.concatenate([turn, _log_shift(turn, (back @ (self.r[c] - here))[..., 0])], -1)
-            wanted = (-_twist_cross(apart, twist[1]) - 2 * a * apart)[..., None]
-            missing = change[0] - change[1]
-            missing = np.concatenate([missing[..., :1] - wanted, missing[..., 1:]], -1)
-            moving = missing[..., 3:, :] - num.mul(num.cross_matrix(here), missing[..., :3, :])
-            rows = np.concatenate([back @ missing[..., :3, :], back @ moving], -2)
-            rows[..., 0] -= a * a * gap
-            answers.append(rows)
+                ]
+                for k in pair
+            ]
+            answers.append(rows_of[self.charts.method.gap_form](pair, *motions))
         rows = np.concatenate(answers, -2)
         K, missing = rows[..., 1:], -rows[..., 0]
         size = np.einsum("...ii->...i", K)
@@ -669,6 +667,47 @@ class _MovingTree(Tree):
         for _ in range(PROXIMAL_STEPS):
             push = push + rotate_vectors(inverse, missing - rotate_vectors(K, push))
         return np.concatenate([np.ones_like(push[..., :1]), scale * push], -1)[..., None]
+
+    def _twist_rows(self, pair: tuple[int, int], *motions: Sequence[Array]) -> Array:
+        """What is missing of the rate of the twist of one end in the other, by the solution and each wrench."""
+        num, a, (b, c) = self.num, LongDouble(self.charts.method.gap_correction), pair
+        back, here = self.A[b].mT, self.r[b]
+        twist, change = list[Array](), list[Array]()
+        for w, v, at, A, alpha in motions:
+            twist.append(np.concatenate([w, v - num.cross(w, at)], -2)[..., 0])
+            carried = num.widened(num.cross(w, v), A)
+            change.append(np.concatenate([alpha, A + num.mul(num.cross_matrix(at), alpha) - carried], -2))
+        apart = twist[0] - twist[1]
+        turn = rotation_vector(self._turn_between(b, c))
+        gap = np.concatenate([turn, _log_shift(turn, (back @ (self.r[c] - here))[..., 0])], -1)
+        wanted = (-_twist_cross(apart, twist[1]) - 2 * a * apart)[..., None]
+        missing = change[0] - change[1]
+        missing = np.concatenate([missing[..., :1] - wanted, missing[..., 1:]], -1)
+        moving = missing[..., 3:, :] - num.mul(num.cross_matrix(here), missing[..., :3, :])
+        rows = np.concatenate([back @ missing[..., :3, :], back @ moving], -2)
+        rows[..., 0] -= a * a * gap
+        return np.asarray(rows)
+
+    def _distance_rows(self, pair: tuple[int, int], *motions: Sequence[Array]) -> Array:
+        """What is missing of ẍ, x the vector of a quaternion e, then a distance.
+
+        In the frame of the second end, with the difference β of the angular velocities,
+
+            ė = ½ β e,    ẍ = ½ (e₀ β̇ + β̇ × x + ė₀ β + β × ẋ)
+        """
+        a, (b, c) = LongDouble(self.charts.method.gap_correction), pair
+        back, e = self.A[c].mT, self._turn_between(c, b)
+        (w, v, at, A, alpha), (w_c, v_c, at_c, A_c, alpha_c) = motions
+        spin, carried = ((back @ x)[..., 0] for x in (w - w_c, w_c))
+        rate = _rate_of_vector(e, spin[..., None])[..., 0]
+        scalar_rate = -np.sum(spin * e[..., 1:], -1, keepdims=True) / 2
+        turning = back @ (alpha - alpha_c)
+        turning[..., 0] -= cross(carried, spin)
+        turned = _rate_of_vector(e, turning)
+        turned[..., 0] += (scalar_rate * spin + cross(spin, rate)) / 2 + 2 * a * rate + a * a * e[..., 1:]
+        moved = A - A_c
+        moved[..., 0] += (2 * a * (v - v_c) + a * a * (at - at_c))[..., 0]
+        return np.concatenate([turned, moved], -2)
 
 
 # Bₖ/k! of even k from 2 on: 1/12, −1/720, …
@@ -709,6 +748,12 @@ def _twist_cross(a: Array, b: Array) -> Array:
     """Rate of a twist b (..., 6) that is carried by the twist a."""
     w, v = a[..., :3], a[..., 3:]
     return np.concatenate([cross(w, b[..., :3]), cross(w, b[..., 3:]) + cross(v, b[..., :3])], -1)
+
+
+def _rate_of_vector(e: Array, spins: Array) -> Array:
+    """½ (e₀ β + β × x) (..., 3, M) of the columns β of angular velocities, x the vector of a quaternion e."""
+    x = e[..., None, 1:]
+    return np.asarray(np.swapaxes(e[..., None, :1] * spins.mT + cross(spins.mT, x), -1, -2) / 2)
 
 
 def _log_shift(turn: Array, shift: Array) -> Array:
