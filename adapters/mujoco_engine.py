@@ -93,6 +93,7 @@ from plumbline.model.datatypes import (
     Model,
     State,
     StateQuantities,
+    StepRun,
     SurfaceAnswer,
     Trajectory,
     Unsupported,
@@ -133,12 +134,15 @@ MIN_SOFTNESS = 1e-9  # a smaller relative effect of R is rounding
 MAX_NOISE = 1e-11  # relative, of differences that grow as R falls: more is too much to extrapolate
 ROD_AXIAL_INERTIA = 0.01  # J_z of a rod over the mean principal inertia of the body that it carries
 IDENTITY_QUATERNION = np.array([1.0, 0.0, 0.0, 0.0])
+GAP_FORM: Literal["distance and quaternion"] = "distance and quaternion"  # of welds
 
 
 def _euler(implicit_forces: Literal["joint dampers", "applied", "all"], note: str) -> Any:
     """An integrator of order 1."""
-    rods = ROD_AXIAL_INERTIA / 3
-    method = JointSpaceMethod("semi-implicit Euler", "joint rotations", rods, implicit_forces=implicit_forces)
+    method = JointSpaceMethod(
+        "semi-implicit Euler", "joint rotations", ROD_AXIAL_INERTIA / 3, implicit_forces=implicit_forces,
+        gap_correction=STABILISATION, gap_form=GAP_FORM,
+    )  # fmt: skip
     return {"order": 1, "error_exponents": (1, 2, 3, 4, 5, 6), "note": note, "method": method}
 
 
@@ -164,7 +168,9 @@ class Mujoco(MetamorphicHooks):
             4,
             (4, 5, 6, 7, 8),
             note="classical Runge–Kutta on the rotation group",
-            method=classical_runge_kutta("joint rotations", ROD_AXIAL_INERTIA / 3),
+            method=classical_runge_kutta(
+                "joint rotations", ROD_AXIAL_INERTIA / 3, gap_correction=STABILISATION, gap_form=GAP_FORM
+            ),
         ),
     )
     options = loop_options = (DENSE,)
@@ -177,9 +183,9 @@ class Mujoco(MetamorphicHooks):
         "matrix has both"
     }
     builds_trees = builds_elements = moves_loops = True
-    loop_steps_unsupported_reason = (
-        "not compared: MuJoCo's constraints are soft, the forces in a step are those of its regularised "
-        "solver, which has no formula; their limit is compared in motions"
+    steps_unsupported_reason = (
+        "not compared: MuJoCo holds a joint of this mechanism by an equality, for whose steps no formula is "
+        "written here; the limit of its motions is compared"
     )
     welding_unsupported_reason = ""
     variants = VARIANTS
@@ -256,30 +262,40 @@ class Mujoco(MetamorphicHooks):
             return self._rigid_run(model, state, times, integrator, resolution)
         return self._sampled_run(_MujocoChain(model), state, times, integrator, resolution)
 
+    def _step(self, model: Model, state: State, times: Array, integrator: Integrator, step: float) -> StepRun:
+        if not self.is_soft(model):
+            return StepRun(self._simulate(model, state, times, integrator, step))
+        if (
+            not model.has_loops
+            or any(kind.has_pitch for kind in model.kinds)
+            or self.option in self.joint_options
+        ):
+            raise Unsupported(self.steps_unsupported_reason)
+        runs = [self._rigid_run(model, state, times, integrator, step, factor) for factor in SEQUENCES[:2]]
+        # what rounding and the remaining regularisation leave in one step, in one sequence or the other
+        errors = [2 * _largest_norm(np.diff(x, axis=0)) for x in _apart(*runs)]
+        return StepRun(replace(runs[0], limit_error=np.array(errors)))
+
     def _rigid_run(
-        self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
-    ) -> Trajectory:
+        self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float,
+        factor: float = 1.0,
+    ) -> Trajectory:  # fmt: skip
         """Run at falling regularisations, extrapolate to none; the last order's change is the uncertainty."""
         runs = list[Trajectory]()
         for k in range(RUN_REGULARISATIONS):
             soft = _SoftMechanism(model, self.option)
             tree = soft.tree
-            tree.soften(LARGEST_RUN_REGULARISATION / RATIO**k)
+            tree.soften(factor * LARGEST_RUN_REGULARISATION / RATIO**k)
             tree.m.opt.iterations = RUN_ITERATIONS
             tree.m.eq_solref[:] = RUN_SOLREF
             run = self._sampled_run(tree, soft.state(state), times, integrator, resolution)
             runs.append(soft.cut.source_run(run))
-        limit: dict[str, Any] = {}
-        change: dict[str, Array] = {}
-        for name in ("r", "p", "v", "pdot"):
-            column = [getattr(run, name) for run in runs]
-            limit[name], change[name] = _at_zero(column)
-        error = np.array([_largest_norm(change[name]) for name in ("r", "p", "v")])
-        error[1] *= 2  # |δp| of a unit quaternion is half the rotation angle
-        before = limit["p"] - change["p"], limit["pdot"] - change["pdot"]
-        spins = [kinematics.angular_velocity(*pair) for pair in (before, (limit["p"], limit["pdot"]))]
-        error = np.append(error, _largest_norm(spins[1] - spins[0]))
-        return replace(runs[-1], **limit, limit_error=error)
+        limit, before = dict[str, Any](), dict[str, Any]()
+        for name in ("r", "p", "v", "pdot", "coordinates", "velocities"):
+            limit[name], change = _at_zero([getattr(run, name) for run in runs])
+            before[name] = limit[name] - change
+        changes = _apart(replace(runs[-1], **limit), replace(runs[-1], **before))
+        return replace(runs[-1], **limit, limit_error=np.array([_largest_norm(x) for x in changes]))
 
     def _sampled_run(
         self, chain: _MujocoChain, state: State, times: Array, integrator: Integrator, resolution: float
@@ -713,6 +729,12 @@ def _three_limits(soft: _SoftMechanism, state: State, there: State, largest: flo
         if len(found) == 3:
             return found
     raise refusals[0]
+
+
+def _apart(one: Trajectory, other: Trajectory) -> list[Array]:
+    """Differences of positions, attitudes, ṙ and ω′; |δp| of a unit quaternion is half the rotation angle."""
+    spins = [kinematics.angular_velocity(run.p, run.pdot) for run in (one, other)]
+    return [one.r - other.r, 2 * (one.p - other.p), one.v - other.v, spins[0] - spins[1]]
 
 
 def _largest_norm(difference: Array) -> float:

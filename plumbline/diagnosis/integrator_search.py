@@ -348,12 +348,14 @@ def _other_formulas(declared: JointSpaceMethod, model: Model) -> Iterator[tuple[
     euler = JointSpaceMethod(
         "semi-implicit Euler", declared.coordinates, declared.rod_axial_inertia,
         free_coordinates=declared.free_coordinates, gap_correction=declared.gap_correction,
+        gap_form=declared.gap_form,
     )  # fmt: skip
     is_euler, turns = declared.formula == "semi-implicit Euler", declared.coordinates == "joint rotations"
     is_implicit, verlet = declared.implicit_forces != "none", replace(euler, formula="velocity Verlet")
     classical = classical_runge_kutta(
-        declared.coordinates, declared.rod_axial_inertia, declared.free_coordinates, declared.gap_correction
-    )
+        declared.coordinates, declared.rod_axial_inertia, declared.free_coordinates,
+        declared.gap_correction, declared.gap_form,
+    )  # fmt: skip
     reused = "step, with the last acceleration of the step before in place of its first"
     names = [(f"rod {k + 1}",) * int(model.rods[k]) + (f"body {k + 1}",) for k in range(model.n)]
     moved = enumerate(itertools.chain.from_iterable(names) if is_euler else ())

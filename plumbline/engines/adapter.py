@@ -128,7 +128,6 @@ class Adapter(ABC):
     builds_elements: ClassVar[bool] = False  # … and of mechanisms with rotors, springs, dampers and efforts
     loops_unsupported_reason: ClassVar[str] = ""  # why states of mechanisms with loops are not, if so
     moves_loops: ClassVar[bool] = False  # whether motions of mechanisms with loops are simulated
-    loop_steps_unsupported_reason: ClassVar[str] = ""  # why single steps of such motions have no formula
     reproduction_template: ClassVar[str] = ""  # template of stand-alone scripts; without one there are none
     variants: ClassVar[Sequence[Variant]] = ()  # other ways to ask the engine
     variant: Variant | None = None  # the one in use
@@ -306,8 +305,6 @@ class Adapter(ABC):
 
         """
         self._check_motion(model)
-        if self.is_soft(model) and self.loop_steps_unsupported_reason:
-            raise Unsupported(self.loop_steps_unsupported_reason, "steps of loops")
         check_state(model, state)
         times = np.asarray(step * np.arange(count + 1), float)
         with self._checked_refusals(model):

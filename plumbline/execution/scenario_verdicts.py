@@ -63,10 +63,11 @@ LEFT_TO_THE_NIGHT = (
     "all"
 )
 REPEATS = (
-    "not run: every step of a run is that of the declared formula, which here is that of {}, whose study this "
-    "would repeat; a nightly or `run --level trajectory` runs all"
+    "not run: every step of a run is that of the declared formula, which here is that of {}, whose study "
+    "this would repeat; a nightly or `run --level trajectory` runs all"
 )
-LIFTED = ("acceleration", "angular_acceleration")  # computed here where an engine returns those of its joints
+# of bodies; computed here where an engine returns those of its joints
+ACCELERATIONS = ("acceleration", "angular_acceleration")
 NO_INDEPENDENT_TRUTH = "no independent truth: python-flint is not installed, and the reference is no judge"
 NO_REGULAR_POSE = (
     "every pose that the loops allow is singular, as of a truss with its bars in one line: forces have no "
@@ -146,6 +147,7 @@ class ScenarioRun:
         self._findings: dict[TaskKey, JudgingResult] = {}
         self._has_retried_truth = False
         self._failures_besides = dict[TaskKey, list[str]]()  # how the workers of states ended
+        self._awaiting_states = dict[str, list[Outcome]]()  # steps, by engine
         self.left_to_the_night = 0  # number of tasks
         self._packed_truths: dict[TaskKind, Packed] = {}  # for judges and diagnoses in workers
 
@@ -287,8 +289,17 @@ class ScenarioRun:
             ]
         else:
             found = self._findings[key] = self._judged(outcome)
-            if key.kind in (TaskKind.STATE, TaskKind.STEP):
-                following = self._diagnosis_tasks(outcome, found)
+            if key.kind == TaskKind.STATE:
+                following = self._diagnosis_tasks(outcome)
+                following += [
+                    task
+                    for o in self._awaiting_states.pop(key.engine, ())
+                    for task in self._diagnosis_tasks(o)
+                ]
+            elif key.kind == TaskKind.STEP and self._states_of(key) in self._pending:
+                self._awaiting_states.setdefault(key.engine, []).append(outcome)
+            elif key.kind == TaskKind.STEP:
+                following = self._diagnosis_tasks(outcome)
             if key.kind == TaskKind.STEP:
                 following += self._study_tasks(key, found.rows)
             found.rows = mark_aliases(found.rows)
@@ -506,27 +517,44 @@ class ScenarioRun:
             found.rows.append(singular_pose_row(self._context(key.engine), self._singular_value))
         if key.kind == TaskKind.STATE and self._engines[key.engine].is_lifted:
             found.rows = [
-                replace(row, extra=row.extra | {"lifted": 1.0}) if row.quantity in LIFTED else row
+                replace(row, extra=row.extra | {"lifted": 1.0}) if row.quantity in ACCELERATIONS else row
                 for row in found.rows
             ]
         if self._plan.user_rtol is not None:
             found.rows = [replace(row, user_rtol=self._plan.user_rtol) for row in found.rows]
         return found
 
-    def _diagnosis_tasks(self, answer: Outcome, found: JudgingResult) -> list[Task]:
+    @staticmethod
+    def _states_of(steps: TaskKey) -> TaskKey:
+        return replace(steps, kind=TaskKind.STATE, integrator="")
+
+    def _disputed(self, key: TaskKey) -> list[Row]:
+        """The rows of a cell's level that disagree, those on record marked."""
+        # rows of the surface name the call that is wrong
+        rows = self._findings[key].rows if key in self._findings else ()
+        disputed = [
+            row for row in rows if row.verdict == Verdict.DISAGREES and row.level == _LEVELS[key.kind]
+        ]
+        model = self.scenario.model
+        if not self._known or not disputed:
+            return disputed
+        return self._known.mark_known(disputed, model.n, inertia_ratio(model), model.kind)
+
+    def _diagnosis_tasks(self, answer: Outcome) -> list[Task]:
         """The task that searches the cause of a cell's disagreement, or measures how the error scatters.
 
         A mechanism that is on record is not searched again: the scatter is measured, by which it is checked.
+        Nor are steps where the accelerations of states disagree, of which they are made.
         """
-        level = _LEVELS[answer.key.kind]  # rows of the surface name the call that is wrong
-        disputed = [row for row in found.rows if row.verdict == Verdict.DISAGREES and row.level == level]
-        model, marked = self.scenario.model, disputed
-        if self._known and disputed:
-            marked = self._known.mark_known(disputed, model.n, inertia_ratio(model), model.kind)
-        is_known = all(row.known_issue is not None for row in marked)
         key: TaskKey = answer.key
+        disputed, model = self._disputed(key), self.scenario.model
+        is_known = all(row.known_issue is not None for row in disputed)
         if not disputed:
             return []
+        if key.kind == TaskKind.STEP and not is_known:
+            of_states = self._disputed(self._states_of(key))
+            if any(row.quantity in ACCELERATIONS and row.known_issue is None for row in of_states):
+                return []
         from plumbline.diagnosis.diagnose import explain_disagreement  # few runs need them
         from plumbline.diagnosis.integrator_search import explain_disagreeing_steps
 

@@ -45,7 +45,7 @@ class JointSpaceMethod:
     # of a free body: r and ṙ in the world beside its rotation, or a rigid motion with the twist in its frame
     free_coordinates: Literal["point and rotation", "rigid motion"] = "point and rotation"
     gap_correction: float = 0.0  # a [1/s]: gaps x of loops are to follow ẍ = −2 a ẋ − a² x
-    # x: the logarithm of the pose of one end in the other, which x follows as a twist; or the distance of their
+    # x: the logarithm of the pose of one end in the other, followed as a twist; or the distance of their
     # points in the world, and the vector of the quaternion from the second end to the first
     gap_form: Literal["logarithm", "distance and quaternion"] = "logarithm"
     stages: tuple[tuple[float, ...], ...] = ()  # the tableau's rows below the diagonal

@@ -10,7 +10,8 @@ Cut open, the ends b and c of a loop are two parts of one body.  With the twists
 
     V̇_b − V̇_c = −(V_b − V_c) × V_c − 2 a (V_b − V_c) + a² log(b⁻¹ c)
 
-in the frame of b, with the correction of gaps a that the method declares.  The forces λ of rows that depend
+in the frame of b, with the correction of gaps a that the method declares, or ẍ = −2 a ẋ − a² x of the gaps x
+that it declares in place of the logarithm.  The forces λ of rows that depend
 on others are not unique, v̇ is: proximal iterations find it.
 
 Arrays have leading axes ``...`` for many states at once.
@@ -642,7 +643,7 @@ class _MovingTree(Tree):
 
     def closing_shares(self, ends: Sequence[tuple[int, int]], found: Solution) -> Array:
         """Compute 1 and the λ (..., 1 + 6 L, 1) of the wrenches that hold the loops closed."""
-        num, lead = self.num, self.rates[0].shape[:-1]
+        lead = self.rates[0].shape[:-1]
         rows_of = {"logarithm": self._twist_rows, "distance and quaternion": self._distance_rows}
         answers = list[Array]()
         for pair in ends:
@@ -669,7 +670,7 @@ class _MovingTree(Tree):
         return np.concatenate([np.ones_like(push[..., :1]), scale * push], -1)[..., None]
 
     def _twist_rows(self, pair: tuple[int, int], *motions: Sequence[Array]) -> Array:
-        """What is missing of the rate of the twist of one end in the other, by the solution and each wrench."""
+        """What is missing of the rate of one end's twist in the other, by the solution and each wrench."""
         num, a, (b, c) = self.num, LongDouble(self.charts.method.gap_correction), pair
         back, here = self.A[b].mT, self.r[b]
         twist, change = list[Array](), list[Array]()

@@ -239,8 +239,10 @@ class FormulaSteps:
                 continue
             index, h = self.places[i]
             place = Place(index, h, count)
+            soft = _limit_errors(runs[i].trajectory)
             for quantity, error in _errors(self.true[i][count], runs[i], count).items():
-                found[quantity].add(error, limit[quantity], scale[quantity], place)
+                allowed = limit[quantity] + count * self.growth[i, count] * soft[quantity]
+                found[quantity].add(error, allowed, scale[quantity], place)
         return found
 
     def residuals(self, method: JointSpaceMethod, runs: Sequence[StepRun], model: Model) -> Array:
@@ -540,6 +542,12 @@ def _body_differences(one: BodyStates | State, other: BodyStates | State) -> dic
     return {quantity: np.linalg.norm(np.asarray(x, float), axis=-1) for quantity, x in pairs.items()}
 
 
+def _limit_errors(run: Trajectory) -> dict[str, float]:
+    """By quantity what a step is uncertain by, where the run is the limit of softer ones."""
+    errors = np.zeros(len(_MOTION)) if run.limit_error is None else run.limit_error
+    return {f"step_{of}": float(error) for of, error in zip(_MOTION, errors, strict=True)}
+
+
 def _errors(true: BodyStates, run: StepRun, count: int) -> dict[str, Array]:
     """Sizes (N,) of the differences."""
     found = _differences(true, run.trajectory, count)
@@ -601,7 +609,7 @@ class StepsFromSamples:
 
     def __init__(
         self, method: JointSpaceMethod, model: Model, charts: StepCharts, coordinates: Array,
-        velocities: Array, h: float, count: int,
+        velocities: Array, h: float, count: int, uncertainty: dict[str, float] | None = None,
     ) -> None:  # fmt: skip
         """Take the steps.
 
@@ -611,6 +619,7 @@ class StepsFromSamples:
             velocities: (S, nv).
             h: step [s].
             count: steps start from so many of the samples; where there is one more, each ends at the next.
+            uncertainty: of a step's result besides rounding, by quantity of `STEP_QUANTITIES`.
 
         Raises:
             EngineFailure: there are other coordinates than the mechanism has.
@@ -633,10 +642,12 @@ class StepsFromSamples:
         converted = 1 / np.maximum(self.middle_cosine, TINY)[:, None]
         self.fastest = np.max(sizes["rate"], axis=-1)  # (S,) rad/s, W of all bodies
         of_samples = _sample_bound(method, model, sizes)
-        self.of_samples = {name: x * converted for name, x in of_samples.items()}
+        self.uncertainty = uncertainty or dict.fromkeys(STEP_QUANTITIES, 0.0)
+        self.of_samples = {name: x * converted + self.uncertainty[name] for name, x in of_samples.items()}
         between = {name: np.maximum(x[:count], x[-count:]) for name, x in sizes.items()}
         of_torques = np.maximum(converted[:count], converted[-count:]) ** 4
-        self.of_step = {name: x * of_torques for name, x in step_bound(method, model, between, h, 1).items()}
+        of_step = step_bound(method, model, between, h, 1)
+        self.of_step = {name: x * of_torques + self.uncertainty[name] for name, x in of_step.items()}
         self.is_of_one_pose = method.formula == "semi-implicit Euler" and method.implicit_forces != "all"
         self.of_totals = self._total_bounds(count, between)
 
@@ -669,8 +680,9 @@ class StepsFromSamples:
         reach, inertia = of_both_ends(reach), np.linalg.norm(model.inertia, axis=(1, 2))
         passed_on = _passed_on(self.method, model, between, 0.0 if self.is_of_one_pose else self.h, 1)
         passed_on = {name: of_both_ends(share)[:, None] * x for name, x in passed_on.items()}
-        energy += (model.mass * between["speed"] * passed_on["step_velocity"]).sum(-1)
-        energy += (between["rate"] * passed_on["step_rate"]) @ inertia
+        unsure = {name: x + self.uncertainty[name] for name, x in passed_on.items()}
+        energy += (model.mass * between["speed"] * unsure["step_velocity"]).sum(-1)
+        energy += (between["rate"] * unsure["step_rate"]) @ inertia
         rates, own = self.of_step, np.zeros(count)
         if _is_momentum_free(model):
             rates = {name: of_both_ends(self.of_samples[name]) + x for name, x in passed_on.items()}
@@ -778,7 +790,9 @@ class RunSteps(StepsFromSamples):
         self.fastest_mode = np.nan  # 1/s, of the linearised equations along the run; of `compare`
         charts = StepCharts(model, method, [state], [run.angle_axes])
         count = len(motion.velocities) - 1
-        super().__init__(method, model, charts, motion.coordinates, motion.velocities, h, count)
+        super().__init__(
+            method, model, charts, motion.coordinates, motion.velocities, h, count, _limit_errors(motion)
+        )
 
     def compare(self) -> dict[str, StepDeviations]:
         """Compare every step.
