@@ -14,7 +14,7 @@ from plumbline.engines.registry import load_adapter
 from plumbline.execution.plan import Plan, TaskKind, task_keys
 from plumbline.judging.rows import RowContext, Verdict
 from plumbline.judging.step_level import judge_steps
-from plumbline.measurements.single_steps import STEP_STATES, step_sizes
+from plumbline.measurements.single_steps import STEP_STATES, run_step_study, step_sizes
 from plumbline.model.datatypes import BALL, KINDS, ROD, SPRING_FIELDS
 from plumbline.model.kinematics import complete_state
 from plumbline.model.loops import STABILISATION
@@ -427,13 +427,13 @@ def test_accelerations_of_generic_loops_equal_the_certified_ones():
     np.testing.assert_allclose(found.astype(float), true.acceleration, rtol=0, atol=1e-12 * scale)
 
 
-@pytest.mark.parametrize("engine", ["pinocchio", "exudyn"])
+@pytest.mark.parametrize("engine", ["mujoco", "pinocchio", "exudyn"])
 @pytest.mark.parametrize("name", [LOOPS[0], *(pytest.param(x, marks=SLOW) for x in LOOPS[1:])])
 def test_honest_engines_take_the_declared_step_on_loops(name, engine):
     model, states = loop_subject(name)
     for integrator in methods(engine):
         rows = judged(load_adapter(engine), integrator, model, states)
-        assert len(rows) == (4 if engine == "pinocchio" else 1)
+        assert len(rows) == (1 if engine == "exudyn" else 4)
         assert all(row.verdict == Verdict.AGREES and row.ratio < 0.5 for row in rows), rows
 
 
@@ -462,29 +462,54 @@ WRONG_LOOP_METHODS = {
     "a correction wrong by 1e-6": ("rkmk4", {"gap_correction": 50 * (1 + 1e-6)}),
     "weights wrong by 1e-6": ("rkmk4", {"weights": (1 / 6, 1 / 3 + 1e-6, 1 / 3 - 1e-6, 1 / 6)}),
     "stale velocity": ("semi-implicit-euler", {"new_velocity_share": 0.0}),
+    "gaps in the other engine's form": ("rkmk4", {"gap_form": "distance and quaternion"}),
 }
+IN_MUJOCO = {"semi-implicit-euler": "implicit", "rkmk4": "RK4"}
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(x, marks=SLOW * ("by 1e-6" not in x)) for x in WRONG_LOOP_METHODS]
-)
-def test_every_other_step_of_a_loop_is_reported(name):
+    ("name", "engine"),
+    [
+        pytest.param(x, engine, marks=SLOW * ("by 1e-6" not in x))
+        for x in WRONG_LOOP_METHODS for engine in ("mujoco", "pinocchio")
+    ],
+)  # fmt: skip
+def test_every_other_step_of_a_loop_is_reported(name, engine):
     integrator, change = WRONG_LOOP_METHODS[name]
     model, states = loop_subject("four-bar")
-    method = load_adapter("pinocchio").integrator(integrator)
+    if engine == "mujoco":
+        integrator, change = (
+            IN_MUJOCO[integrator],
+            change | {"gap_form": "logarithm"} * ("gap_form" in change),
+        )
+    method = load_adapter(engine).integrator(integrator)
     wrong = replace(method, method=replace(method.method, **change))
-    assert disagreeing(judged(load_adapter("pinocchio"), wrong, model, states))
+    assert disagreeing(judged(load_adapter(engine), wrong, model, states))
 
 
-def test_steps_that_have_no_formula_say_why():
-    model, states = loop_subject("bricard")
-    for engine, words in (
-        ("mujoco", "not compared: MuJoCo"),
-        ("pinocchio", "not compared: rows of the loops"),
-    ):
-        integrator = methods(engine)[0]
-        (row,) = judged(load_adapter(engine), integrator, model, states)
-        assert words in row.reason and row.verdict in (Verdict.UNSUPPORTED, Verdict.INFORMATION)
+def test_every_step_of_a_run_of_a_loop_is_compared_with_what_the_limit_is_uncertain_by():
+    model, states = loop_subject("slider-crank")
+    integrator = load_adapter("mujoco").integrator("implicit")
+    answer = run_step_study("mujoco", integrator, model, states[:1])
+    limit = answer.run.run.trajectory.limit_error
+    assert np.all(limit > 0) and np.max(limit) < 1e-11
+    assert not disagreeing(judge_steps(CONTEXT, integrator, model, states[:1], answer).rows)
+    heavier = replace(model, mass=model.mass * [1 + 1e-7, 1, 1])
+    assert disagreeing(judge_steps(CONTEXT, integrator, heavier, states[:1], answer).rows)
+
+
+@pytest.mark.parametrize(
+    ("name", "engine", "words"),
+    [
+        ("helical-screw", "mujoco", "not compared: MuJoCo holds a joint"),
+        ("bricard", "pinocchio", "not compared: rows of the loops"),
+        ("bricard", "mujoco", "not compared: rows of the loops"),
+    ],
+)
+def test_steps_that_have_no_formula_say_why(name, engine, words):
+    model, states = loop_subject(name)
+    (row,) = judged(load_adapter(engine), methods(engine)[0], model, states)
+    assert words in row.reason and row.verdict in (Verdict.UNSUPPORTED, Verdict.INFORMATION)
 
 
 def test_steps_of_loops_are_small_enough_to_close_gaps():
