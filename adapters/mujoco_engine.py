@@ -134,6 +134,8 @@ MIN_SOFTNESS = 1e-9  # a smaller relative effect of R is rounding
 MAX_NOISE = 1e-11  # relative, of differences that grow as R falls: more is too much to extrapolate
 ROD_AXIAL_INERTIA = 0.01  # J_z of a rod over the mean principal inertia of the body that it carries
 IDENTITY_QUATERNION = np.array([1.0, 0.0, 0.0, 0.0])
+# of positions, attitudes, ṙ and ω′: |δp| of a unit quaternion is half the rotation angle
+ERROR_UNITS = np.array([1.0, 2.0, 1.0, 1.0])
 GAP_FORM: Literal["distance and quaternion"] = "distance and quaternion"  # of welds
 
 
@@ -271,43 +273,74 @@ class Mujoco(MetamorphicHooks):
             or self.option in self.joint_options
         ):
             raise Unsupported(self.steps_unsupported_reason)
-        runs = [self._rigid_run(model, state, times, integrator, step, factor) for factor in SEQUENCES[:2]]
-        # what rounding and the remaining regularisation leave in one step, in one sequence or the other
-        errors = [2 * _largest_norm(np.diff(x, axis=0)) for x in _apart(*runs)]
-        return StepRun(replace(runs[0], limit_error=np.array(errors)))
+        return StepRun(self._limit_of_steps(model, state, times, integrator, step))
+
+    def _softened(self, model: Model, factor: float) -> list[_SoftMechanism]:
+        """The mechanism at falling regularisations."""
+        found = [_SoftMechanism(model, self.option) for _ in range(RUN_REGULARISATIONS)]
+        for k, soft in enumerate(found):
+            soft.tree.soften(factor * LARGEST_RUN_REGULARISATION / RATIO**k)
+            soft.tree.m.opt.iterations = RUN_ITERATIONS
+            soft.tree.m.eq_solref[:] = RUN_SOLREF
+        return found
 
     def _rigid_run(
-        self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float,
-        factor: float = 1.0,
-    ) -> Trajectory:  # fmt: skip
+        self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
+    ) -> Trajectory:
         """Run at falling regularisations, extrapolate to none; the last order's change is the uncertainty."""
         runs = list[Trajectory]()
-        for k in range(RUN_REGULARISATIONS):
-            soft = _SoftMechanism(model, self.option)
-            tree = soft.tree
-            tree.soften(factor * LARGEST_RUN_REGULARISATION / RATIO**k)
-            tree.m.opt.iterations = RUN_ITERATIONS
-            tree.m.eq_solref[:] = RUN_SOLREF
-            run = self._sampled_run(tree, soft.state(state), times, integrator, resolution)
+        for soft in self._softened(model, 1.0):
+            run = self._sampled_run(soft.tree, soft.state(state), times, integrator, resolution)
             runs.append(soft.cut.source_run(run))
         limit, before = dict[str, Any](), dict[str, Any]()
-        for name in ("r", "p", "v", "pdot", "coordinates", "velocities"):
+        for name in ("r", "p", "v", "pdot"):
             limit[name], change = _at_zero([getattr(run, name) for run in runs])
             before[name] = limit[name] - change
-        changes = _apart(replace(runs[-1], **limit), replace(runs[-1], **before))
-        return replace(runs[-1], **limit, limit_error=np.array([_largest_norm(x) for x in changes]))
+        spins = [kinematics.angular_velocity(x["p"], x["pdot"]) for x in (limit, before)]
+        changes = [limit[name] - before[name] for name in ("r", "p", "v")] + [spins[0] - spins[1]]
+        error = ERROR_UNITS * [_largest_norm(change) for change in changes]
+        return replace(runs[-1], **limit, limit_error=error)
+
+    def _limit_of_steps(
+        self, model: Model, state: State, times: Array, integrator: Integrator, step: float
+    ) -> Trajectory:
+        """Extrapolate every step to no regularisation, and take the next one from there.
+
+        The uncertainty of a step is twice the largest difference between the limits of two sequences.
+        """
+        softs = [soft for factor in SEQUENCES[:2] for soft in self._softened(model, factor)]
+        trees, start, errors = [soft.tree for soft in softs], softs[0].state(state), list[list[float]]()
+        first = trees[0]
+        for tree in trees:
+            tree.prepare(start, integrator, step)
+
+        def advance(_: int) -> None:
+            q, v = first.d.qpos.copy(), first.d.qvel.copy()
+            ends, samples = list[Array](), list[tuple[Array, ...]]()
+            for tree in trees:
+                tree.d.qpos, tree.d.qvel = q, v
+                mujoco.mj_step(tree.m, tree.d)
+                ends.append(np.concatenate([tree.d.qpos, tree.d.qvel]))
+            for some in (ends[RUN_REGULARISATIONS:], ends[:RUN_REGULARISATIONS]):
+                first.d.qpos, first.d.qvel = np.split(_at_zero(some)[0], [first.m.nq])
+                mujoco.mj_normalizeQuat(first.m, first.d.qpos)
+                samples.append(first.sample())
+            errors.append([_largest_norm(x - y) for x, y in zip(*samples, strict=True)])
+
+        run = softs[0].cut.source_run(self._sampled_run(first, start, times, integrator, step, advance))
+        return replace(run, limit_error=2 * ERROR_UNITS * np.max(errors, axis=0))
 
     def _sampled_run(
-        self, chain: _MujocoChain, state: State, times: Array, integrator: Integrator, resolution: float
-    ) -> Trajectory:
-        chain.m.opt.timestep = resolution
-        chain.m.opt.integrator = member(f"mjtIntegrator.mjINT_{integrator.name.upper()}")
-        chain.set_state(state)
+        self, chain: _MujocoChain, state: State, times: Array, integrator: Integrator, resolution: float,
+        advance: Callable[[int], None] | None = None,
+    ) -> Trajectory:  # fmt: skip
+        chain.prepare(state, integrator, resolution)
         counts = np.round(times / resolution).astype(int)
         t, rows = [0.0], [(*chain.sample(), *chain.joint_sample())]
+        advance = advance or (lambda count: mujoco.mj_step(chain.m, chain.d, nstep=count))
         with _raise_on_warnings(chain.d):
             for done in np.diff(counts):
-                mujoco.mj_step(chain.m, chain.d, nstep=int(done))
+                advance(int(done))
                 t.append(chain.d.time)  # the engine's own clock: the contract's checks notice a reset
                 rows.append((*chain.sample(), *chain.joint_sample()))
         r, p, v, omega, joint_q, joint_v = (np.array(column) for column in zip(*rows, strict=True))
@@ -482,6 +515,12 @@ class _MujocoChain:
         """Scale the regularisation R of all constraints: nothing else depends on these numbers."""
         for name, usual in zip(SOFTNESS, self.softness, strict=True):
             getattr(self.m, name)[:] = scale * usual
+
+    def prepare(self, state: State, integrator: Integrator, step: float) -> None:
+        """Set what a run starts with."""
+        self.m.opt.timestep = step
+        self.m.opt.integrator = member(f"mjtIntegrator.mjINT_{integrator.name.upper()}")
+        self.set_state(state)
 
     def body_frames(self, state: State) -> tuple[Array, Array]:
         """Return the quaternions (nbody, 4) of all bodies and E (nbody, 3, nu): their ω = E ν, own frames."""
@@ -729,12 +768,6 @@ def _three_limits(soft: _SoftMechanism, state: State, there: State, largest: flo
         if len(found) == 3:
             return found
     raise refusals[0]
-
-
-def _apart(one: Trajectory, other: Trajectory) -> list[Array]:
-    """Differences of positions, attitudes, ṙ and ω′; |δp| of a unit quaternion is half the rotation angle."""
-    spins = [kinematics.angular_velocity(run.p, run.pdot) for run in (one, other)]
-    return [one.r - other.r, 2 * (one.p - other.p), one.v - other.v, spins[0] - spins[1]]
 
 
 def _largest_norm(difference: Array) -> float:

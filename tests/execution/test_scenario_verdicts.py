@@ -172,6 +172,39 @@ def steps_of(bench, engine, integrator):
     return task
 
 
+@pytest.mark.parametrize("are_states_first", [True, False])
+@pytest.mark.parametrize(
+    ("quantity", "recorded", "searched"),
+    [
+        ("acceleration", (), ["state"]),
+        ("joint_reaction", (), ["state", "step"]),
+        ("acceleration", ("acceleration",), ["state", "step"]),
+    ],
+)
+def test_steps_are_not_searched_where_the_accelerations_they_are_made_of_disagree(
+    engines, quantity, recorded, searched, are_states_first
+):
+    chosen = loader.load_scenario(loader.find_scenario_file("tumbling-ball"))
+    plan = Plan([chosen], ["mujoco"], random_state_count=1)
+    bench = ScenarioRun(plan, chosen, {"mujoco": engines["mujoco"]}, known=Recorded(*recorded))
+    steps = steps_of(bench, "mujoco", "Euler")
+    truth = next(x for x in bench.tasks() if x.key.kind == TaskKind.STATE_TRUTH)
+    (states,) = bench.on_outcome(outcome_of(truth))
+    wrong = []
+    for task, wanted in ((states, quantity), (steps, "run_rate")):
+        found = outcome_of(replace(task, needs_answer=None))
+        rows = [
+            replace(row, verdict="disagrees") if row.quantity == wanted else row
+            for row in found.judge_result.rows
+        ]
+        wrong.append(replace(found, judge_result=replace(found.judge_result, rows=rows)))
+    following = [
+        x for one in (wrong if are_states_first else wrong[::-1]) for x in bench.on_outcome(one)
+        if x.key.kind == TaskKind.DIAGNOSIS
+    ]  # fmt: skip
+    assert ["step" if x.key.integrator else "state" for x in following] == searched
+
+
 def two_of_a_family(has_all_studies, name="double-tumbling-rods", plainer="double-loaded-balls"):
     """A scenario whose family has a plainer one in the same run."""
     chosen, other = loader.load_scenarios([name, plainer])

@@ -478,10 +478,8 @@ def test_every_other_step_of_a_loop_is_reported(name, engine):
     integrator, change = WRONG_LOOP_METHODS[name]
     model, states = loop_subject("four-bar")
     if engine == "mujoco":
-        integrator, change = (
-            IN_MUJOCO[integrator],
-            change | {"gap_form": "logarithm"} * ("gap_form" in change),
-        )
+        other = {"gap_form": "logarithm"} if "gap_form" in change else {}
+        integrator, change = IN_MUJOCO[integrator], change | other
     method = load_adapter(engine).integrator(integrator)
     wrong = replace(method, method=replace(method.method, **change))
     assert disagreeing(judged(load_adapter(engine), wrong, model, states))
