@@ -39,6 +39,11 @@ class Edit:
     expected: str = ""  # words of the diagnosis; empty: it need only be reported
     is_control: bool = False  # another computation of the same numbers
 
+    @property
+    def fits(self) -> bool:
+        """Whether the file has the text once."""
+        return (ROOT / self.file).read_text(encoding="utf-8").count(self.old) == 1
+
 
 EDITS = [Edit(**entry) for entry in table(__file__)]
 
@@ -47,7 +52,7 @@ EDITS = [Edit(**entry) for entry in table(__file__)]
 def edited(edit: Edit) -> Iterator[None]:
     """Give every caller the engine whose text is edited."""
     text = (ROOT / edit.file).read_text(encoding="utf-8")
-    assert text.count(edit.old) == 1, f"the edit {edit.name!r} does not fit {edit.file}"
+    assert edit.fits, f"the edit {edit.name!r} does not fit {edit.file}"
     first = edit.file.removesuffix(".py").replace("/", ".")
     adapter = ENGINES[edit.engine].partition(":")[0]
     import_module(adapter)
