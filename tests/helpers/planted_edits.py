@@ -51,7 +51,6 @@ EDITS = [Edit(**entry) for entry in table(__file__)]
 @contextmanager
 def edited(edit: Edit) -> Iterator[None]:
     """Give every caller the engine whose text is edited."""
-    text = (ROOT / edit.file).read_text(encoding="utf-8")
     assert edit.fits, f"the edit {edit.name!r} does not fit {edit.file}"
     first = edit.file.removesuffix(".py").replace("/", ".")
     adapter = ENGINES[edit.engine].partition(":")[0]
