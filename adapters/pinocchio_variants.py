@@ -170,7 +170,10 @@ def _appended_to_first(model: pin.Model) -> pin.Model:
     first, rest = pin.Model(), pin.Model()
     joint = first.addJoint(0, model.joints[1], model.jointPlacements[1], model.names[1])
     place, own = first.addJointFrame(joint), model.inertias[1]
-    away = pin.SE3(pin.exp3(np.array([0.3, -0.5, 0.2])), np.array([0.1, 0.2, -0.3]))
+    # there and back without rounding, which would give a body at the origin a potential energy
+    away = pin.SE3(
+        np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.array([0.125, 0.25, -0.375])
+    )
     for k, share in enumerate((0.25, 0.75)):
         part = away.actInv(pin.Inertia(share * own.mass, own.lever, share * own.inertia))
         rest.addFrame(pin.Frame(f"part {k}", 0, away, pin.FrameType.BODY, part))

@@ -271,7 +271,8 @@ class Search:
         difference, wanted = self.difference, self.difference.values[mask]
         if np.max(np.abs(wanted), initial=0.0) < MIN_RATIO_OF_VECTORS:
             return []
-        every = self.vectors
+        if not (every := self.vectors):
+            return []
         lanes = [((one,), one.nominal + STEP * one.scale * e) for one in every for e in np.eye(3)]
         slopes = difference.evaluate(lanes)[:, mask].reshape(len(every), 3, -1).mT
         slopes = np.where(np.isfinite(slopes), slopes, 0.0)

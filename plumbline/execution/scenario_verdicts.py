@@ -341,7 +341,7 @@ class ScenarioRun:
             return [self._cell_task(study)] if study.needed_truth in self.truths else []
         reason = REPEATS.format(repeated) if repeated else reason
         row = self._context(study.engine).make_row(
-            "trajectory", study.integrator, "all", Verdict.INFORMATION, reason
+            "trajectory", study.integrator, "all", Verdict.INFORMATION, reason, alias_of=repeated
         )
         self._findings[study] = JudgingResult([row])
         self._pending.discard(study)
