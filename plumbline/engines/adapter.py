@@ -255,9 +255,8 @@ class Adapter(ABC):
             for quantity, by_call in answer.items():
                 for call, value in by_call.items():
                     label = f"{self.name}._surface: {quantity} by {', '.join(call)}"
-                    check_numbers(
-                        value, "R D", {}, label, must_be_finite=False
-                    )  # the row of that call says it
+                    # the row of that call says what is not finite
+                    check_numbers(value, "R D", {}, label, must_be_finite=False)
         return answers
 
     def simulate(

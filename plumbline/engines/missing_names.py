@@ -83,7 +83,6 @@ def _note(found: dict[str, dict[Call, Array]], kind: str, words: str) -> None:
 
 
 def _label(part: Callable[[], object]) -> str:
-    """What a part adds, by the function that it calls or is a part of."""
-    whole = getattr(part, "func", part)
-    names = whole.__code__.co_names if whole.__name__ == "<lambda>" else (whole.__name__,)
-    return next((name for name in names if "add" in name), whole.__name__).replace("_", " ").strip()
+    """What a part does, by the name of its function, which may be partial."""
+    name: str = getattr(part, "func", part).__name__
+    return name.replace("_", " ").strip()

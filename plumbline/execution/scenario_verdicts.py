@@ -290,12 +290,8 @@ class ScenarioRun:
         else:
             found = self._findings[key] = self._judged(outcome)
             if key.kind == TaskKind.STATE:
-                following = self._diagnosis_tasks(outcome)
-                following += [
-                    task
-                    for o in self._awaiting_states.pop(key.engine, ())
-                    for task in self._diagnosis_tasks(o)
-                ]
+                answers = [outcome, *self._awaiting_states.pop(key.engine, ())]
+                following = [task for answer in answers for task in self._diagnosis_tasks(answer)]
             elif key.kind == TaskKind.STEP and self._states_of(key) in self._pending:
                 self._awaiting_states.setdefault(key.engine, []).append(outcome)
             elif key.kind == TaskKind.STEP:
@@ -530,12 +526,9 @@ class ScenarioRun:
 
     def _disputed(self, key: TaskKey) -> list[Row]:
         """The rows of a cell's level that disagree, those on record marked."""
-        # rows of the surface name the call that is wrong
         rows = self._findings[key].rows if key in self._findings else ()
-        disputed = [
-            row for row in rows if row.verdict == Verdict.DISAGREES and row.level == _LEVELS[key.kind]
-        ]
-        model = self.scenario.model
+        level, model = _LEVELS[key.kind], self.scenario.model  # rows of the surface name the wrong call
+        disputed = [row for row in rows if row.verdict == Verdict.DISAGREES and row.level == level]
         if not self._known or not disputed:
             return disputed
         return self._known.mark_known(disputed, model.n, inertia_ratio(model), model.kind)

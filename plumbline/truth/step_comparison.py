@@ -643,7 +643,7 @@ class StepsFromSamples:
         self.fastest = np.max(sizes["rate"], axis=-1)  # (S,) rad/s, W of all bodies
         of_samples = _sample_bound(method, model, sizes)
         self.uncertainty = uncertainty or dict.fromkeys(STEP_QUANTITIES, 0.0)
-        self.of_samples = {name: x * converted + self.uncertainty[name] for name, x in of_samples.items()}
+        self.of_samples = {name: x * converted for name, x in of_samples.items()}
         between = {name: np.maximum(x[:count], x[-count:]) for name, x in sizes.items()}
         of_torques = np.maximum(converted[:count], converted[-count:]) ** 4
         of_step = step_bound(method, model, between, h, 1)
