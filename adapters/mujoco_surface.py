@@ -389,7 +389,7 @@ def _add_torques(s: Probed) -> None:
         dynamics[function, "MjData.qfrc_inverse"] = d.qfrc_inverse + d.qfrc_passive - rotors
     dynamics |= _joint_forces(m, d)
     dynamics[INVERSE_STAGES] = _inverse_by_stages(m, d)
-    add_parts(s.found, partial(_add_implicit_steps, s, dynamics), partial(_add_sum, s))
+    add_parts(s.found, partial(_add_implicit_steps, s), partial(_add_sum, s))
     if not np.any(m.dof_damping):
         flags = m.opt.enableflags
         m.opt.enableflags = flags | int(mujoco.mjtEnableBit.mjENBL_INVDISCRETE)
@@ -448,7 +448,7 @@ def _inverse_by_stages(m: Any, d: Any) -> Array:
     return np.asarray(force - other.qfrc_constraint)
 
 
-def _add_implicit_steps(s: Probed, dynamics: dict[Call, Array]) -> None:
+def _add_implicit_steps(s: Probed) -> None:
     """Take a step by each implicit method; its matrix, less what it adds to M, gives the energy."""
     m, d, v, rotors = s.m, s.d, s.d.qvel, s.m.dof_armature * s.d.qacc
     own, h = copy(m), 0.1 / max(float(np.max(np.abs(v), initial=0.0)), 1.0)
@@ -481,7 +481,7 @@ def _add_implicit_steps(s: Probed, dynamics: dict[Call, Array]) -> None:
             *((names, _clamped_step(s, own, limit)) for limit, names in CLAMPED.items() if hasattr(m, limit)),
         ]:
             change = times_mass(m, d, (end.qvel - v) / h) - D @ (end.qvel - v)
-            dynamics[*call, *more] = d.qfrc_bias + change - rotors
+            s.add_forces("inverse_dynamics", {(*call, *more): d.qfrc_bias + change - rotors})
 
 
 def _clamped_step(s: Probed, usual: Any, limit: str) -> Any:
