@@ -111,6 +111,7 @@ from plumbline.model.redescription import (
 from plumbline.model.step_methods import JointSpaceMethod, classical_runge_kutta
 from plumbline.model.welding import BodyParts, RigidPart, undivided_bodies
 
+HELD_STEPS = "steps of held joints"  # a gap
 DENSE, TENDONS, HELD = "dense mass matrix", "tendon equalities", "joint equalities"  # options
 TENDON_MOTIONS = (
     "motions on tendons are not compared: their equality lacks J̇ q̇, so that they stretch; the lack itself is "
@@ -182,13 +183,11 @@ class Mujoco(MetamorphicHooks):
     unmoved_options = MappingProxyType({TENDONS: TENDON_MOTIONS})
     gaps: ClassVar[Mapping[str, str]] = {
         "mass_matrix": "MuJoCo holds the pitch of a joint by an equality of a slide and a hinge: its mass "
-        "matrix has both"
+        "matrix has both",
+        HELD_STEPS: "not compared: MuJoCo holds a joint of this mechanism by an equality, for whose steps no "
+        "formula is written here; the limit of its motions is compared",
     }
     builds_trees = builds_elements = moves_loops = True
-    steps_unsupported_reason = (
-        "not compared: MuJoCo holds a joint of this mechanism by an equality, for whose steps no formula is "
-        "written here; the limit of its motions is compared"
-    )
     welding_unsupported_reason = ""
     variants = VARIANTS
     column_names = COLUMN_NAMES
@@ -272,7 +271,7 @@ class Mujoco(MetamorphicHooks):
             or any(kind.has_pitch for kind in model.kinds)
             or self.option in self.joint_options
         ):
-            raise Unsupported(self.steps_unsupported_reason)
+            raise Unsupported(self.gaps[HELD_STEPS], HELD_STEPS)
         return StepRun(self._limit_of_steps(model, state, times, integrator, step))
 
     def _softened(self, model: Model, factor: float) -> list[_SoftMechanism]:

@@ -29,8 +29,13 @@ from plumbline.judging import outlier, relation_rows
 from plumbline.judging.known_issues import KnownIssues
 from plumbline.judging.long_runs import judge_long_runs
 from plumbline.judging.rows import Fingerprints, JudgingResult, Level, Row, RowContext, Verdict, mark_aliases
-from plumbline.judging.state_level import judge_states, singular_pose_row
-from plumbline.judging.step_level import decides_without_study, judge_steps
+from plumbline.judging.state_level import SINGULAR_POSE, judge_states, singular_pose_row
+from plumbline.judging.step_level import (
+    all_steps_agree,
+    compares_every_step,
+    decides_without_study,
+    judge_steps,
+)
 from plumbline.judging.trajectory_level import judge_trajectory
 from plumbline.measurements import relations
 from plumbline.measurements.long_run_study import plan_long_run, run_long_run_study
@@ -66,6 +71,7 @@ REPEATS = (
     "not run: every step of a run is that of the declared formula, which here is that of {}, whose study "
     "this would repeat; a nightly or `run --level trajectory` runs all"
 )
+STEPS_AGREE = "every step of a run is that of the declared formula"
 # of bodies; computed here where an engine returns those of its joints
 ACCELERATIONS = ("acceleration", "angular_acceleration")
 NO_INDEPENDENT_TRUTH = "no independent truth: python-flint is not installed, and the reference is no judge"
@@ -220,7 +226,7 @@ class ScenarioRun:
                 found.rows.append(self._context(name).make_row("state", "-", "all", verdict, info.missing))
             for key in self._keys:
                 if key.engine == name and key in self._findings:
-                    found.rows += self._findings[key].rows
+                    found.rows += self._rows(key)
                     found.tables += self._findings[key].tables
                     found.deviations |= self._findings[key].deviations
             for engine, kind in self._gaps:
@@ -230,6 +236,18 @@ class ScenarioRun:
                     found.rows.append(row(_LEVELS[kind], "-", "all", Verdict.INFORMATION, reason))
         found.rows = outlier.annotate_outliers(found.rows, self._is_certified)
         return found
+
+    def _rows(self, key: TaskKey) -> list[Row]:
+        """The rows of a cell; what a study leaves open is information where every step of a run agrees."""
+        rows, steps = self._findings[key].rows, self._findings.get(replace(key, kind=TaskKind.STEP))
+        if key.kind != TaskKind.TRAJECTORY or steps is None or not all_steps_agree(steps.rows):
+            return rows
+        return [
+            replace(row, verdict=Verdict.INFORMATION, reason=f"{row.reason}; {STEPS_AGREE}")
+            if row.verdict == Verdict.UNRESOLVED and row.quantity != SINGULAR_POSE
+            else row
+            for row in rows
+        ]
 
     @property
     def _is_certified(self) -> bool:
@@ -332,8 +350,8 @@ class ScenarioRun:
             return []
         integrator = self._integrator(study)
         repeated, reason = self._repeats(integrator), LEFT_TO_THE_NIGHT.format(self._studied)
-        coarsest = np.inf if repeated else self._resolutions(integrator)[0]
-        if not decides_without_study(rows, coarsest):
+        is_decided = decides_without_study(rows, self._resolutions(integrator))
+        if not is_decided and not (repeated and compares_every_step(rows)):
             return [self._cell_task(study)] if study.needed_truth in self.truths else []
         reason = REPEATS.format(repeated) if repeated else reason
         row = self._context(study.engine).make_row(

@@ -40,8 +40,9 @@ NO_COORDINATES = (
 )
 TOTALS = ("run_energy", "run_momentum", "run_equations")  # of the whole mechanism
 DECISIVE = {"run_velocity", "run_rate"}  # rows
-# rad, coarsest step × fastest rate up to which limits may be known to rounding: measured, docs/coverage.md
-MAX_RESOLVED_TURN = 1 / 14
+# The product of all steps × fastest rate, as what extrapolation leaves of errors of order 1, up to which
+# limits may be known to rounding: measured at seven steps from 1/14 rad on (docs/coverage.md).
+MAX_RESOLVED_TURNS = (1 / 14) ** 7 / 2**21
 DECIDED, UNDECIDED = (
     {Verdict.AGREES, Verdict.DISAGREES},
     {Verdict.UNRESOLVED, Verdict.FAILED, Verdict.HARNESS_FAILED},
@@ -71,26 +72,37 @@ def judge_steps(
     return JudgingResult([*rows, *_run_rows(context, integrator, model, states[0], answer)])
 
 
-def decides_without_study(rows: Sequence[Row], coarsest: float) -> bool:
+def decides_without_study(rows: Sequence[Row], steps: Sequence[float]) -> bool:
     """Find out whether the steps of a run decide, so that a refinement study of low order adds nothing.
 
     Args:
         rows: of `judge_steps`, of one integrator.
-        coarsest: step of the study [s].
+        steps: of the study [s].
 
     Returns:
-        Whether the rates of all bodies, in which every number of the mechanism shows, are compared at every
-        step that differs, no row failed or is unresolved, and the motion is too fast for the study's limit
-        to be known to rounding (docs/coverage.md).
+        Whether every step is compared, and the motion is too fast for these steps to give a limit that is
+        known to rounding (docs/coverage.md).
+
+    """
+    fastest = max((float(row.extra.get("fastest_mode", 0.0)) for row in rows), default=0.0)
+    return compares_every_step(rows) and float(np.prod([h * fastest for h in steps])) > MAX_RESOLVED_TURNS
+
+
+def compares_every_step(rows: Sequence[Row]) -> bool:
+    """Find out whether the rates of all bodies, in which every number of the mechanism shows, are compared.
+
+    Returns:
+        Whether they are at every step that differs, and no row failed or is unresolved.
 
     """
     if any(row.verdict in UNDECIDED or row.extra.get("left_out_wrong_steps") for row in rows):
         return False
-    decided = {row.quantity: row for row in rows if row.verdict in DECIDED}
-    if not decided.keys() >= DECISIVE:
-        return False
-    turn = coarsest * max(float(decided[name].extra.get("fastest_mode", 0.0)) for name in DECISIVE)
-    return turn > MAX_RESOLVED_TURN
+    return {row.quantity for row in rows if row.verdict in DECIDED} >= DECISIVE
+
+
+def all_steps_agree(rows: Sequence[Row]) -> bool:
+    """Find out whether every step of a run is that of the declared formula."""
+    return compares_every_step(rows) and not any(row.verdict == Verdict.DISAGREES for row in rows)
 
 
 def _single_step_rows(

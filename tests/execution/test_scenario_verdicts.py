@@ -277,6 +277,26 @@ def test_a_study_that_repeats_another_is_left_to_the_night(engines, name):
         assert "that of Euler, whose study this would repeat" in rows[0].reason
 
 
+@pytest.mark.parametrize(("of_steps", "expected"), [("agrees", "information"), ("disagrees", "unresolved")])
+def test_what_a_study_leaves_open_is_information_where_every_step_agrees(engines, of_steps, expected):
+    chosen = loader.load_scenario(loader.find_scenario_file("tumbling-ball"))
+    bench = ScenarioRun(Plan([chosen], ["mujoco"], random_state_count=1), chosen, engines)
+    truth = next(x for x in bench.tasks() if x.key.kind == TaskKind.MOTION_TRUTH)
+    studies = bench.on_outcome(outcome_of(truth))
+    study = next(x for x in studies if (x.key.engine, x.key.integrator) == ("mujoco", "RK4"))
+    for task, quantity, verdict in (
+        (study, "position_limit", "unresolved"), (steps_of(bench, "mujoco", "RK4"), "run_rate", of_steps),
+    ):  # fmt: skip
+        found = outcome_of(task)
+        rows = [
+            replace(row, verdict=verdict) if row.quantity == quantity else row
+            for row in found.judge_result.rows
+        ]
+        bench.on_outcome(replace(found, judge_result=replace(found.judge_result, rows=rows)))
+    (row,) = [r for r in bench.findings().rows if (r.integrator, r.quantity) == ("RK4", "position_limit")]
+    assert row.verdict == expected
+
+
 def test_a_worker_that_ends_in_what_is_asked_besides_costs_that_only(engines):
     bench = make_scenario_run(engines, "state")
     (truth,) = bench.tasks()
