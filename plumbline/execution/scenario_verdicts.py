@@ -239,7 +239,8 @@ class ScenarioRun:
 
     def _rows(self, key: TaskKey) -> list[Row]:
         """The rows of a cell; what a study leaves open is information where every step of a run agrees."""
-        rows, steps = self._findings[key].rows, self._findings.get(replace(key, kind=TaskKind.STEP))
+        rows = mark_aliases(self._findings[key].rows)
+        steps = self._findings.get(replace(key, kind=TaskKind.STEP))
         if key.kind != TaskKind.TRAJECTORY or steps is None or not all_steps_agree(steps.rows):
             return rows
         return [
@@ -316,7 +317,6 @@ class ScenarioRun:
                 following = self._diagnosis_tasks(outcome)
             if key.kind == TaskKind.STEP:
                 following += self._study_tasks(key, found.rows)
-            found.rows = mark_aliases(found.rows)
         self._pending |= {task.key for task in following}
         return following
 
@@ -372,8 +372,7 @@ class ScenarioRun:
             The rows; none of a truth or a diagnosis.
 
         """
-        found = self._findings.get(outcome.key)
-        return found.rows if found else []
+        return self._rows(outcome.key) if outcome.key in self._findings else []
 
     def fingerprints(self) -> dict[str, Fingerprints]:
         """Collect what identifies the answers of each engine.
