@@ -241,7 +241,7 @@ def _add_forward_derivatives(s: Probed) -> None:
     inverse = np.triu(s.square(by_tau))
     inverse = inverse + np.triu(inverse, 1).T
     by = "computeABADerivatives", "Data.ddq_dv", "Data.ddq_dtau"
-    s.add_accelerations(by, s.square(by_v) @ v / 2 + inverse @ (tau - g))
+    s.add_accelerations(by, s.square(by_v) @ v / 2 + inverse @ (tau - g), "by_aba")
 
 
 def _add_batch(s: Probed) -> None:
