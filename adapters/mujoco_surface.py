@@ -266,7 +266,7 @@ def _add_relative(s: Probed) -> None:
 
 
 def _add_still(s: Probed) -> None:
-    """Add accelerations as differences from what is said of the anchor, which stays where it is."""
+    """Add accelerations relative to that reported of the anchor, which does not move."""
     m, d, anchor = s.m, s.d, s.m.site(ANCHOR).id
     turns = [d.site_xmat[site].reshape(3, 3) for site in (anchor, *s.sites)]
     for name, is_local in STILL_SENSORS.items():

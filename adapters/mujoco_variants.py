@@ -512,6 +512,7 @@ VARIANTS = (
     _option(
         "MjOption.ls_iterations MjOption.ls_tolerance",
         _has_loops,
+        # other limits than by default: Newton's whole step is right of a linear problem, whatever they are
         remake=_set_options(**THREE, ls_iterations=7, ls_tolerance=1e-3),
     ),
     _option(

@@ -121,7 +121,7 @@ def _add_hessians(s: Probed) -> None:
 
 
 def _add_readings(s: Probed, name: str, data: pin.Data, derived: pin.Data, read: Reader) -> None:
-    """Add in one reference frame what is read of frames, and of joints as said of the frames on them."""
+    """Add in one reference frame what functions of frames return, and those of joints moved to frames."""
     found, frame = defaultdict[tuple[str, str, str], list[Any]](list), FRAMES[name]
     for f, joint in zip(s.frames, s.joints, strict=True):
         of_joint = (_at_frame(s, name, f, data, x) for x in read(s, name, "Joint", joint, data, derived))
@@ -148,7 +148,7 @@ def _computed(s: Probed, name: str, of: str, f: int, other: pin.Data, _: pin.Dat
 
 
 def _at_frame(s: Probed, name: str, f: int, data: pin.Data, reading: Reading) -> Reading:
-    """Move what is said of a joint to the frame on it."""
+    """Move what a function of a joint returns to the frame on it."""
     function, what, by, twist = reading
     vector, frame = np.array(getattr(twist, "vector", twist)), s.m.frames[f]
     joint, place = frame.parentJoint, frame.placement

@@ -16,7 +16,7 @@ from plumbline.scenario.loader import Scenario
 def run_night(
     out: Path, *engines: str, scenarios: Sequence[Scenario] = (), **more: Any
 ) -> tuple[RunResult, Path]:
-    """A night of "rest" and no random scenarios on MuJoCo, but for what is said."""
+    """A night of "rest" and no random scenarios on MuJoCo, unless options say otherwise."""
     options = {
         "random_count": 0, "seed": 11, "jobs": 1, "limits": Limits(), "is_full_catalogue": False,
         "extra_refinements": 0, "progress": lambda *_: None,
