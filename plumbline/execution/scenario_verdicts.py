@@ -33,7 +33,6 @@ from plumbline.judging.state_level import SINGULAR_POSE, judge_states, singular_
 from plumbline.judging.step_level import (
     all_steps_agree,
     compares_every_step,
-    decides_without_study,
     judge_steps,
 )
 from plumbline.judging.trajectory_level import judge_trajectory
@@ -61,15 +60,10 @@ _LEVELS: dict[TaskKind, Level] = {
     TaskKind.TRAJECTORY: "trajectory",
     TaskKind.LONG_RUN: "invariants",
 }
-LOW_ORDER = 2  # studies up to it cost most
+LOW_ORDER = 2  # studies up to it cost most and see least
 LEFT_TO_THE_NIGHT = (
-    "not run: every step of a run is compared with the declared formula, which in so fast a motion detects "
-    "smaller mistakes; of this family the study of {} runs, and a nightly or `run --level trajectory` runs "
-    "all"
-)
-REPEATS = (
-    "not run: every step of a run is that of the declared formula, which here is that of {}, whose study "
-    "this would repeat; a nightly or `run --level trajectory` runs all"
+    "not run: every step of a run is compared with the declared formula, and the study of {} runs; of this "
+    "family all run on {}, and a nightly or `run --level trajectory` runs all"
 )
 STEPS_AGREE = "every step of a run is that of the declared formula"
 # of bodies; computed here where an engine returns those of its joints
@@ -324,19 +318,20 @@ class ScenarioRun:
         """The steps that decide whether a refinement study runs; None where it always does."""
         if key.kind != TaskKind.TRAJECTORY or self._plan.has_all_studies:
             return None
-        integrator, steps = self._integrator(key), replace(key, kind=TaskKind.STEP)
-        is_low = integrator.kind == "step" and integrator.order <= LOW_ORDER
-        is_studied = self._studied in (None, self.scenario.name) and not self._repeats(integrator)
-        return steps if is_low and not is_studied and steps in self._keys else None
+        steps, is_studied = replace(key, kind=TaskKind.STEP), self._studied in (None, self.scenario.name)
+        return steps if self._sharper(key) and not is_studied and steps in self._keys else None
+
+    def _sharper(self, key: TaskKey) -> str | None:
+        """The integrator of the engine whose study always runs, instead of that of another of low order."""
+        own, every = self._integrator(key), self._engines[key.engine].integrators
+        first = max((one for one in every if one.has_motions), key=lambda one: one.order)
+        is_low = own.kind == "step" and own.order <= LOW_ORDER
+        return first.name if is_low and first.name != own.name else None
 
     @property
     def _studied(self) -> str | None:
         """The scenario of this family whose studies always run."""
         return self._plan.studied.get(self.scenario.family)
-
-    def _repeats(self, integrator: Integrator) -> str | None:
-        """The integrator whose method this one's is here, declared as its alias where nothing drags."""
-        return None if self.scenario.model.has_drag else integrator.alias_of
 
     def _is_due(self, key: TaskKey) -> bool:
         """Whether a cell need not wait for steps, and is not left to the night."""
@@ -348,14 +343,11 @@ class ScenarioRun:
         study = replace(steps, kind=TaskKind.TRAJECTORY)
         if study not in self._keys or self._awaited_steps(study) is None:
             return []
-        integrator = self._integrator(study)
-        repeated, reason = self._repeats(integrator), LEFT_TO_THE_NIGHT.format(self._studied)
-        is_decided = decides_without_study(rows, self._resolutions(integrator))
-        if not is_decided and not (repeated and compares_every_step(rows)):
+        if not compares_every_step(rows):
             return [self._cell_task(study)] if study.needed_truth in self.truths else []
-        reason = REPEATS.format(repeated) if repeated else reason
+        reason = LEFT_TO_THE_NIGHT.format(self._sharper(study), self._studied)
         row = self._context(study.engine).make_row(
-            "trajectory", study.integrator, "all", Verdict.INFORMATION, reason, alias_of=repeated
+            "trajectory", study.integrator, "all", Verdict.INFORMATION, reason
         )
         self._findings[study] = JudgingResult([row])
         self._pending.discard(study)

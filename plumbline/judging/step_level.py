@@ -39,10 +39,8 @@ NO_COORDINATES = (
     "not compared: the adapter returns no coordinates with the samples, from which the next step could start"
 )
 TOTALS = ("run_energy", "run_momentum", "run_equations")  # of the whole mechanism
-DECISIVE = {"run_velocity", "run_rate"}  # rows
-# The product of all steps × fastest rate, as what extrapolation leaves of errors of order 1, up to which
-# limits may be known to rounding: measured at seven steps from 1/14 rad on (docs/coverage.md).
-MAX_RESOLVED_TURNS = (1 / 14) ** 7 / 2**21
+# rows in which every number of the mechanism shows: of formulas, and of Exudyn's implicit methods
+DECISIVE = {"run_velocity", "run_rate"}, {"run_equations"}
 DECIDED, UNDECIDED = (
     {Verdict.AGREES, Verdict.DISAGREES},
     {Verdict.UNRESOLVED, Verdict.FAILED, Verdict.HARNESS_FAILED},
@@ -72,37 +70,27 @@ def judge_steps(
     return JudgingResult([*rows, *_run_rows(context, integrator, model, states[0], answer)])
 
 
-def decides_without_study(rows: Sequence[Row], steps: Sequence[float]) -> bool:
-    """Find out whether the steps of a run decide, so that a refinement study of low order adds nothing.
+def compares_every_step(rows: Sequence[Row], decisive: Sequence[set[str]] = DECISIVE) -> bool:
+    """Find out whether the steps of a run decide, so that a refinement study of low order adds little.
 
     Args:
         rows: of `judge_steps`, of one integrator.
-        steps: of the study [s].
+        decisive: the rows of one of these sets are needed.
 
     Returns:
-        Whether every step is compared, and the motion is too fast for these steps to give a limit that is
-        known to rounding (docs/coverage.md).
-
-    """
-    fastest = max((float(row.extra.get("fastest_mode", 0.0)) for row in rows), default=0.0)
-    return compares_every_step(rows) and float(np.prod([h * fastest for h in steps])) > MAX_RESOLVED_TURNS
-
-
-def compares_every_step(rows: Sequence[Row]) -> bool:
-    """Find out whether the rates of all bodies, in which every number of the mechanism shows, are compared.
-
-    Returns:
-        Whether they are at every step that differs, and no row failed or is unresolved.
+        Whether every step that differs is compared by decisive rows, and no row failed or is unresolved.
 
     """
     if any(row.verdict in UNDECIDED or row.extra.get("left_out_wrong_steps") for row in rows):
         return False
-    return {row.quantity for row in rows if row.verdict in DECIDED} >= DECISIVE
+    compared = {row.quantity for row in rows if row.verdict in DECIDED}
+    return any(compared >= some for some in decisive)
 
 
 def all_steps_agree(rows: Sequence[Row]) -> bool:
-    """Find out whether every step of a run is that of the declared formula."""
-    return compares_every_step(rows) and not any(row.verdict == Verdict.DISAGREES for row in rows)
+    """Find out whether every step of a run, and where it starts, is that of the declared formula."""
+    is_right = not any(row.verdict == Verdict.DISAGREES for row in rows)
+    return is_right and compares_every_step(rows, DECISIVE[:1])
 
 
 def _single_step_rows(
@@ -200,7 +188,6 @@ def _run_rows(
         return one(Verdict.UNSUPPORTED, attempt.refusal, attempt.gap)
     if not HAS_EXTENDED_PRECISION:
         return one(Verdict.UNSUPPORTED, NO_EXTENDED_PRECISION)
-    more = dict[str, float]()
     if isinstance(method, ConstrainedMethod):
         parts = constrained_deviations(method, model, run, h)
         found = {f"run_{name}": joined(some) for name, some in parts.items()}
@@ -215,10 +202,9 @@ def _run_rows(
         except EngineFailure as error:
             return one(Verdict.FAILED, str(error))
         found = steps.compare()
-        more = {"fastest_mode": steps.fastest_mode} if np.isfinite(steps.fastest_mode) else {}
     alias = None if model.has_drag else integrator.alias_of
     return [
-        _run_row(context, integrator, quantity, deviations, h, run, alias, answer.cpu_time, more)
+        _run_row(context, integrator, quantity, deviations, h, run, alias, answer.cpu_time)
         for quantity, deviations in found.items()
     ]
 
@@ -240,7 +226,7 @@ def _left_out_words(found: StepDeviations, unit: str) -> tuple[str, float]:
 
 def _run_row(
     context: RowContext, integrator: Integrator, quantity: str, found: StepDeviations, h: float,
-    run: StepRun, alias: str | None, cpu_time: float, more: dict[str, float],
+    run: StepRun, alias: str | None, cpu_time: float,
 ) -> Row:  # fmt: skip
     """The row of one quantity at every step: the worst step decides, the first wrong one is named."""
     (name, unit), ratios = RUN_QUANTITIES[quantity], found.ratios
@@ -251,7 +237,7 @@ def _run_row(
     body = column if has_bodies else 0
     sharp = (found.bounds <= MAX_STEP_BOUND * found.effects) | (found.effects == 0)
     sharp &= ~left_out[:, None]
-    extra = more | {"step": h, "worst_step": worst + 1.0, "comparisons": float(ratios.size)}
+    extra = {"step": h, "worst_step": worst + 1.0, "comparisons": float(ratios.size)}
     what = f"{name} of {count} steps of {h:.4g} s"
     if ratio > 1:
         first = int(wrong[0])

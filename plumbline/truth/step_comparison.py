@@ -787,7 +787,6 @@ class RunSteps(StepsFromSamples):
         motion = run.trajectory
         assert motion.coordinates is not None and motion.velocities is not None
         self.state, self.motion, self.angle_axes = state, motion, run.angle_axes
-        self.fastest_mode = np.nan  # 1/s, of the linearised equations along the run; of `compare`
         charts = StepCharts(model, method, [state], [run.angle_axes])
         count = len(motion.velocities) - 1
         super().__init__(
@@ -843,7 +842,6 @@ class RunSteps(StepsFromSamples):
         some = _every_few(len(self.states))
         with np.errstate(all="ignore"):
             rates = fastest_rates(self.model, [self.states[n] for n in some])
-        self.fastest_mode = float(np.max(rates))
         # implicit steps divide by 1 − step × rate, and the rates may change between these samples
         most = MAX_TURN / 2 if self.method.implicit_forces == "all" else MAX_TURN
         fast = _spread(rates, some)[1:] * self.h > most

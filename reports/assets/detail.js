@@ -200,7 +200,7 @@ function chosenRow(index, row, i) {
 const EXTRA = {
   calls: ["Calls compared", ""], relative: ["Error over scale", ""], bound_relative: ["Tolerance over scale, largest", ""], states: ["States compared", ""], compared_states: ["With a tolerance tight enough", ""], comparisons: ["Comparisons", ""], scenarios: ["Scenarios", ""], state: ["Worst state", ""], body: ["Worst body", ""],
   visible: ["Effect of a detectable mistake", "row"], growth: ["Growth of a perturbation", ""], resolution: ["Finest step or tolerance", ""], scale: ["Scale", "row"],
-  whole: ["Drift at the end", "row"], limit: ["Drift of the limit", "row"], limit_tolerance: ["Tolerance of the limit", "row"], limit_error: ["Uncertainty of the limit", "row"], asked: ["Requested duration", "s"], end: ["End", "s"], step: ["Step size", "s"], steps: ["Steps", ""], worst_step: ["Worst step", ""], first_step: ["First wrong step", ""], wrong_steps: ["Wrong steps", ""], left_out_steps: ["Steps not compared", ""], left_out_wrong_steps: ["Of these, steps that differ", ""], fastest_mode: ["Fastest rate", "1/s"], scatter: ["Scatter of the error over the tolerance", ""],
+  whole: ["Drift at the end", "row"], limit: ["Drift of the limit", "row"], limit_tolerance: ["Tolerance of the limit", "row"], limit_error: ["Uncertainty of the limit", "row"], asked: ["Requested duration", "s"], end: ["End", "s"], step: ["Step size", "s"], steps: ["Steps", ""], worst_step: ["Worst step", ""], first_step: ["First wrong step", ""], wrong_steps: ["Wrong steps", ""], left_out_steps: ["Steps not compared", ""], left_out_wrong_steps: ["Of these, steps that differ", ""], scatter: ["Scatter of the error over the tolerance", ""],
 };
 
 /** @param {import("./report_data").RowDetail} row */
