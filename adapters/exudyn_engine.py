@@ -67,8 +67,8 @@ from plumbline.model.kinematics import (
     JointFrame,
     elastic_energy,
     joint_coordinates,
+    remembered_velocity_jacobian,
     rotation_matrix,
-    velocity_jacobian,
 )
 from plumbline.model.loops import independent_rows
 from plumbline.model.step_methods import ConstrainedMethod, generalized_alpha
@@ -644,7 +644,7 @@ def _constraint_accelerations(chain: ExudynChain, C: Array) -> Array:
 
 def _coordinate_rate_map(chain: ExudynChain) -> Array:
     """Return the matrix from ν = (u̇ of the rods, ω′ of all bodies) to (ṙ, θ̇) of all bodies."""
-    rates = velocity_jacobian(chain.model, chain.state).reshape(chain.model.n, 6, -1)
+    rates = remembered_velocity_jacobian(chain.model, chain.state).reshape(chain.model.n, 6, -1)
     both = np.concatenate([rates[:, :3], chain.rates @ rates[:, 3:]], axis=1)
     return both.reshape(chain.width * chain.model.n, -1)
 

@@ -71,9 +71,9 @@ from plumbline.model.kinematics import (
     own_rates,
     quaternion_product,
     quaternion_rate,
+    remembered_velocity_jacobian,
     rotate_vectors,
     rotation_matrix,
-    velocity_jacobian,
 )
 from plumbline.model.step_methods import (
     JointSpaceMethod,
@@ -134,7 +134,9 @@ class _Linkage:
         self.W = np.zeros((0, len(self.nu)))
         self.motions: list[tuple[int, int, int]] = []  # link, joint and its coordinate
         self.link_axes: list[Array] = []  # as `_axes`, at each body
-        self._body_spins = self.attitude @ velocity_jacobian(model, state).reshape(model.n, 6, -1)[:, 3:]
+        self._body_spins = (
+            self.attitude @ remembered_velocity_jacobian(model, state).reshape(model.n, 6, -1)[:, 3:]
+        )
         # Of the last link: its number, its axes in the world, the point in it where the next one hangs, and
         # its angular velocity in the world as a matrix on ν.
         self._last, self._axes, self._hang = -1, np.eye(3), np.zeros(3)

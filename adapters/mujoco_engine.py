@@ -528,7 +528,9 @@ class _MujocoChain:
         q[0, 0] = 1
         E = np.zeros((self.m.nbody, 3, kinematics.rate_count(self.model)))
         q[self.link_ids] = state.p
-        E[self.link_ids] = kinematics.velocity_jacobian(self.model, state).reshape(self.model.n, 6, -1)[:, 3:]
+        E[self.link_ids] = kinematics.remembered_velocity_jacobian(self.model, state).reshape(
+            self.model.n, 6, -1
+        )[:, 3:]
         for j, (b, u) in enumerate(zip(np.array(self.link_ids)[rods] - 1, state.u[rods], strict=True)):
             q[b] = kinematics.turn_of_z(-u)  # the rod's turn about its own axis has no effect
             q[b] /= np.linalg.norm(q[b])

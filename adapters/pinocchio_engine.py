@@ -86,10 +86,10 @@ from plumbline.model.kinematics import (
     quaternion_conjugate,
     quaternion_product,
     quaternion_rate,
+    remembered_velocity_jacobian,
     rotation_matrix,
     rotation_vector,
     turn_of_z,
-    velocity_jacobian,
 )
 from plumbline.model.loops import STABILISATION, cut_open
 from plumbline.model.step_methods import JointSpaceMethod, classical_runge_kutta
@@ -275,7 +275,7 @@ class PinocchioChain:
     def _frames(self, state: State) -> tuple[Array, Array]:
         """Return the joints' frames, quaternions (nj, 4) scalar first, and S (nj, 3, nu) of their ω = S ν."""
         model, of_rods = self.source_model, np.flatnonzero(self.source_model.rods).tolist()
-        jacobian = velocity_jacobian(model, state).reshape(model.n, 6, -1)
+        jacobian = remembered_velocity_jacobian(model, state).reshape(model.n, 6, -1)
         frames, S = np.zeros((self.joint_count, 4)), np.zeros((self.joint_count, 3, jacobian.shape[-1]))
         for k, (kind, row) in enumerate(zip(model.kinds, self.body_rows, strict=True)):
             if not kind.is_rigid:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import lru_cache
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -542,16 +543,22 @@ def velocity_jacobian(model: Model, state: State) -> Float[Array, "... rows nu"]
         if kind.has_attitude:
             out[..., k, 3:, own] = np.eye(3)
         else:
-            joint, x = JointFrame(model, k, above), state.x[..., k, :]
-            shift = joint.motion(x, state.xdot[..., k, :])[0][0]
-            tip = tip + cross_matrix(-shift) @ spin
-            for i, (_, *pair) in enumerate(joint.axes(x)):
+            x = state.x[..., k, :]
+            motions = JointFrame(model, k, above).axes(x)
+            for i, (_, along, _) in enumerate(motions):
+                if along is not None:
+                    tip = tip + cross_matrix(-x[..., i, None] * along) @ spin
+            for i, (_, *pair) in enumerate(motions):
                 for moved, vector in zip((tip, spin), pair, strict=True):
                     if vector is not None:
                         moved[..., own.start + i] += vector
             out[..., k, 3:, :] = a[..., k, :, :].mT @ spin
         out[..., k, :3, :] = tip - near[..., k, :, :] @ out[..., k, 3:, :]
     return out.reshape(*a.shape[:-3], 6 * n, -1)
+
+
+# Adapters ask at the same states by every option and variant; states and models do not change.
+remembered_velocity_jacobian = lru_cache(maxsize=64)(velocity_jacobian)
 
 
 def mass_matrix(model: Model, state: State) -> Float[Array, "... nu nu"]:

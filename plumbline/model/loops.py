@@ -591,7 +591,7 @@ def independent_rows(
     return np.sort(order[: int(np.sum(size > RANK_TOLERANCE * size[0]))])
 
 
-@lru_cache(maxsize=1)  # adapters reduce many answers at one state
+@lru_cache(maxsize=64)  # adapters reduce many answers at the same states
 def determinate_projectors(model: Model, state: State) -> Float[Array, "joints 6 6"] | None:
     """Find what dependent rows leave of each joint's wrench: forces F and moments N/ℓ about the near points.
 
