@@ -643,14 +643,12 @@ class PinocchioChain:
 class _SpelledTree(PinocchioChain):
     """A tree whose joints are other models than usual, at one state."""
 
-    def __init__(
-        self, model: Model, algorithm: str, parts: BodyParts | None, change: Change, state: State
-    ) -> None:
+    def __init__(self, usual: PinocchioChain, change: Change, state: State) -> None:
         """Build it beside the usual one, which has the coordinates and what takes ν to velocities."""
-        self.usual, self.spellings = PinocchioChain(model, algorithm, parts), change.joints
+        self.usual, self.spellings = usual, change.joints
         self.usual_q, self.usual_v = self.usual.coordinates(state)
         self.q, self.blocks = list[Array](), list[Array]()  # by joint
-        super().__init__(model, algorithm, parts)
+        super().__init__(usual.source_model, usual.algorithm, usual.parts)
 
     def _add_joint(self, parent: int, joint: Any, placement: pin.SE3, name: str) -> int:
         own, spelling = self.usual.joints[len(self.q)], self.spellings.get(joint.shortname(), Spelling())
@@ -787,7 +785,8 @@ class Pinocchio(PinocchioAdapter):
         parts = None if cut.ends else self.body_pieces(model)
         given = cut.model, self.option or self.usual_algorithm, parts
         if change.joints:
-            return [_SpelledTree(*given, change, state).quantities(state) for state in states]
+            usual = PinocchioChain(*given)
+            return [_SpelledTree(usual, change, state).quantities(state) for state in states]
         chain = PinocchioChain(*given, cut.ends, change)
         return [cut.source_quantities(chain.quantities(cut.state(state))) for state in states]
 
