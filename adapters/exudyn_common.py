@@ -5,7 +5,8 @@ from __future__ import annotations
 import contextlib
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from inspect import signature
+from functools import cache
+from inspect import Parameter, signature
 from typing import Any, Generic, TypeVar
 
 import exudyn
@@ -310,14 +311,20 @@ def make_rigid_body(node: Any, mass: float, J: Float[Array, "3 3"]) -> Any:
 
 def sizes_of_body(**sizes: Any) -> Mapping[str, Any]:
     """Name mass and inertia of a body as the version does."""
-    if "mass" not in signature(items.ObjectRigidBody).parameters:  # before 1.12
+    if "mass" not in _parameters(items.ObjectRigidBody):  # before 1.12
         sizes = {f"physics{name.capitalize()}": value for name, value in sizes.items()}
     return sizes
 
 
 def known_arguments(function: Callable[..., Any], given: Mapping[str, Any]) -> Mapping[str, Any]:
     """Leave out what older versions of a function have not."""
-    return {name: value for name, value in given.items() if name in signature(function).parameters}
+    return {name: value for name, value in given.items() if name in _parameters(function)}
+
+
+@cache
+def _parameters(function: Callable[..., Any]) -> Mapping[str, Parameter]:
+    """Return a function's parameters: every body of every system asks for them."""
+    return signature(function).parameters
 
 
 def kinetic_energy(mbs: Any, bodies: list[Any], quadratic_form: float) -> float:

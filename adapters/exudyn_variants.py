@@ -57,7 +57,7 @@ class Joint:
 
 def euler_parameter_rates(p: Float[Array, "4"]) -> Float[Array, "4 3"]:
     """Return B of Euler parameters."""
-    return np.stack([quaternion_rate(p, axis) for axis in np.eye(3)], axis=1)
+    return quaternion_rate(p, np.eye(3)).T
 
 
 def _angles(p: Float[Array, "4"]) -> Float[Array, "3"]:
