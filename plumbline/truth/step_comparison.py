@@ -62,6 +62,7 @@ from plumbline.truth.step_formulas import (
     first_coordinate_acceleration,
     has_written_rows,
     joint_space_steps,
+    projected_residual,
 )
 
 STEP_ROUNDINGS = 32
@@ -991,11 +992,14 @@ def constrained_deviations(
             for difference, bound, effect in _quadrature_differences(method, run, h, model.has_loops)
         ]
     }
-    if not has_written_rows(model):
+    if has_written_rows(model):
+        residual = constrained_residual(model, method, run)
+    elif method.constraint_level == "position" and not (model.has_loops or model.has_elements):
+        residual = projected_residual(model, run)
+    else:
         return found
-    residual = constrained_residual(model, method, run)
     allowed = np.maximum(method.solver_atol, method.solver_rtol * residual.size)
-    allowed = allowed + STEP_ROUNDINGS * EPS * residual.size
+    allowed = residual.factor * (allowed + STEP_ROUNDINGS * EPS * residual.size)
     columns = (x[:, None] for x in (residual.residual, allowed, residual.size))
     return found | {"equations": [StepDeviations(*columns)]}
 

@@ -19,11 +19,15 @@ from numpy.typing import NDArray
 
 from plumbline.model.datatypes import Model, State, StepRun
 from plumbline.model.kinematics import (
+    angular_velocity,
+    complete_state,
     cross,
     cross_matrix,
     quaternion_conjugate,
     quaternion_product,
     rotate_vectors,
+    velocity_jacobian,
+    with_joint_coordinates,
 )
 from plumbline.model.step_methods import ConstrainedMethod, JointSpaceMethod
 from plumbline.truth.step_charts import BodyStates, LongDouble, StepCharts
@@ -247,8 +251,8 @@ class ConstrainedResidual:
     """How far Exudyn's answer is from its equations; sizes are of the terms, for rounding."""
 
     residual: Array  # (T,) 2-norm of M q̈ + Cᵀ λ − f and of the constraints, N and m or m/s
-    first_residual: Array  # (T,) N, the same of q̈ = 0 and λ = 0
     size: Array  # (T,) norm of the largest terms, N and m or m/s
+    factor: Array  # (T,) of the engine's own residual, at most, in ours
 
 
 def has_written_rows(model: Model) -> bool:
@@ -273,7 +277,58 @@ def constrained_residual(model: Model, method: ConstrainedMethod, run: StepRun) 
     q, qdot, qddot = (x[1:] for x in engine_coordinates(run))
     assert run.multipliers is not None
     multipliers = run.multipliers[1:].astype(LongDouble)
-    r, p, v, pdot = q[..., :3], q[..., 3:], qdot[..., :3], qdot[..., 3:]
+    terms = _inertial_and_applied(model, q, qdot, qddot)
+    C, gaps = _constraint_rows(model, q)
+    used = np.ones((model.n, 4), bool)
+    used[model.rods, 1:3] = False
+    held = rotate_vectors(C.mT, multipliers[:, used])
+    if method.constraint_level == "velocity":
+        gaps = rotate_vectors(C, qdot.reshape(len(qdot), -1))
+    far, near = np.abs(model.point).max(axis=(0, 2))
+    lengths = np.abs(q[..., :3]).max(-1) + far + near + model.length.astype(LongDouble)
+    return ConstrainedResidual(
+        residual=_norm(terms[0] + terms[1] + held, gaps),
+        size=_norm(*terms, held, lengths),
+        factor=np.ones(len(q)),
+    )
+
+
+def projected_residual(model: Model, run: StepRun) -> ConstrainedResidual:
+    """Evaluate the same equations along the motions of a tree's joints, which no joint's force resists.
+
+    The joints have to be together: by constraints on positions they are, but for Newton's tolerance.
+
+    Args:
+        model: a tree without elements.
+        run: T samples with accelerations.
+
+    Returns:
+        The residuals Wᵀ (M q̈ − f) at each sample but the first, W from the rates of the joints to q̇, and how
+        far the bodies are from where the joints' coordinates put them.
+
+    """
+    q, qdot, qddot = (x[1:] for x in engine_coordinates(run))
+    terms = _inertial_and_applied(model, q, qdot, qddot)
+    t, count, none = run.trajectory, len(q), np.zeros((len(q), model.n, 3))
+    omega = angular_velocity(t.p[1:], t.pdot[1:])
+    bodies = State(p=t.p[1:], omega=omega, r=t.r[1:], v=t.v[1:], u=none, udot=none, x=none, xdot=none)
+    bodies = with_joint_coordinates(model, bodies)
+    twists = velocity_jacobian(model, bodies).reshape(count, model.n, 6, -1)
+    there = complete_state(model, bodies)
+    sign = np.where(np.sum(bodies.p * there.p, -1, keepdims=True) < 0, -1.0, 1.0)
+    gaps = np.concatenate([bodies.r - there.r, bodies.p - sign * there.p], -1).reshape(count, -1)
+    turning = _body_rate_matrix(t.p[1:]).mT / 2 @ twists[..., 3:, :]
+    rates = np.concatenate([twists[..., :3, :], turning], -2).reshape(count, 7 * model.n, -1)
+    return ConstrainedResidual(
+        residual=_norm(rotate_vectors(rates.mT, terms[0] + terms[1]), gaps),
+        size=_norm(*terms),
+        factor=np.linalg.norm(rates, axis=(1, 2)),
+    )
+
+
+def _inertial_and_applied(model: Model, q: Array, qdot: Array, qddot: Array) -> tuple[Array, Array]:
+    """M q̈ and −f (T, 7N) of rigid bodies with Euler parameters, joints apart, as Exudyn writes them."""
+    p, v, pdot = q[..., 3:], qdot[..., :3], qdot[..., 3:]
     J, mass = model.inertia.astype(LongDouble), model.mass.astype(LongDouble)[:, None]
     A, G = _euler_parameter_rotation(p), 2 * _body_rate_matrix(p)
     omega = rotate_vectors(G, pdot)
@@ -284,29 +339,13 @@ def constrained_residual(model: Model, method: ConstrainedMethod, run: StepRun) 
     gyroscopic = rotate_vectors(G.mT, cross(omega, rotate_vectors(J, omega)))
     applied = 2 * rotate_vectors(_world_rate_matrix(p).mT, torque)
     turning = rotate_vectors(G.mT, rotate_vectors(J, rotate_vectors(G, qddot[..., 3:])))
-    C, gaps = _constraint_rows(model, q)
-    used = np.ones((model.n, 4), bool)
-    used[model.rods, 1:3] = False
-    held = rotate_vectors(C.mT, multipliers[:, used]).reshape(q.shape)
-    terms = [
-        np.concatenate([mass * qddot[..., :3], turning], -1),
-        np.concatenate([drag - model.force.astype(LongDouble) - gravity, gyroscopic - applied], -1),
-        held,
-    ]
-    if method.constraint_level == "velocity":
-        gaps = rotate_vectors(C, qdot.reshape(len(qdot), -1))
+    inertial = np.concatenate([mass * qddot[..., :3], turning], -1)
+    negative = np.concatenate([drag - model.force.astype(LongDouble) - gravity, gyroscopic - applied], -1)
+    return inertial.reshape(len(q), -1), negative.reshape(len(q), -1)
 
-    def norm(*parts: Any) -> Array:
-        return np.asarray(np.sqrt(sum(np.sum(part**2, axis=-1) for part in parts)), float)
 
-    far, near = np.abs(model.point).max(axis=(0, 2))
-    lengths = np.abs(r).max(-1) + far + near + model.length.astype(LongDouble)
-    flat = np.array(terms).reshape(len(terms), len(q), -1)
-    return ConstrainedResidual(
-        residual=norm(flat.sum(0), gaps),
-        first_residual=norm(flat[1]),
-        size=norm(*flat, lengths),
-    )
+def _norm(*parts: Any) -> Array:
+    return np.asarray(np.sqrt(sum(np.sum(part**2, axis=-1) for part in parts)), float)
 
 
 def first_coordinate_acceleration(model: Model, state: State) -> Array:

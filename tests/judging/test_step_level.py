@@ -16,7 +16,7 @@ from plumbline.judging.rows import RowContext, Verdict
 from plumbline.judging.step_level import judge_steps
 from plumbline.measurements.single_steps import STEP_STATES, run_step_study, step_sizes
 from plumbline.model.datatypes import BALL, KINDS, ROD, SPRING_FIELDS
-from plumbline.model.kinematics import complete_state
+from plumbline.model.kinematics import complete_state, quaternion_exponential, quaternion_product
 from plumbline.model.loops import STABILISATION
 from plumbline.model.random_mechanisms import random_loop_mechanism, random_tree
 from plumbline.model.sampling import compared_states, random_states
@@ -117,6 +117,33 @@ def test_equations_of_a_branching_tree_of_rods_and_balls_are_compared():
         lighter = replace(model, mass=model.mass * [1, 1, 1 - 1e-6, 1])
         wrong = disagreeing(judge_steps(CONTEXT, integrator, lighter, states, answer).rows)
         assert wrong["step_equations"] > 1
+
+
+@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=SLOW) for k in range(1, 12))])
+def test_equations_of_trees_on_other_joints_are_compared_where_these_are_together(seed):
+    """By constraints on velocities joints part by as much as the step's error, and their forces turn."""
+    kinds = [kind for kind in KINDS if kind != "helical"]  # which Exudyn lacks
+    model = random_tree(np.random.default_rng(seed), 4, kinds)
+    states, adapter = random_states(model, 2, seed=3), load_adapter("exudyn")
+    axes = model.turn.copy()
+    axes[1, 0] = quaternion_product(axes[1, 0], quaternion_exponential(np.full(3, 1e-7)))
+    far = model.point.copy()
+    far[1, 0] += 1e-8
+    others = {"mass": model.mass * [1, 1, 1 - 1e-9, 1], "inertia": model.inertia * (1 + 1e-8)}
+    if not model.kinds[1].holds_nothing:
+        others["point"] = far
+    if model.kinds[1].motions and not model.kinds[1].holds_distance:
+        others["turn"] = axes
+    for integrator in methods("exudyn"):
+        answer = stepped(adapter, integrator, model, states)
+        rows = judge_steps(CONTEXT, integrator, model, states, answer).rows
+        assert not disagreeing(rows), [row.reason for row in rows]
+        if integrator.method.constraint_level == "velocity":
+            assert "step_equations" not in {row.quantity for row in rows}
+            continue
+        for name, value in others.items():
+            rows = judge_steps(CONTEXT, integrator, replace(model, **{name: value}), states, answer).rows
+            assert "step_equations" in disagreeing(rows), name
 
 
 @cache
