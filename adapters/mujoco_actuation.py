@@ -50,8 +50,13 @@ GROUP_OFF = 3  # of actuators that are off
 FAR = 1e6  # of limits that are never reached [rad, m, N or N m]
 
 
-def with_actuators(ways: Mapping[str, Mapping[str, str]]) -> Callable[[Any], Any]:
-    """Add to every rate of every joint an actuator of each way, without a force so far."""
+def with_actuators(ways: Mapping[str, Mapping[str, str]], read: str = "") -> Callable[[Any], Any]:
+    """Add to every rate of every joint an actuator of each way, without a force so far.
+
+    Args:
+        read: sensors of their forces to add.
+
+    """
 
     def describe(spec: Any) -> Any:
         for joint in named_joints(spec):
@@ -69,25 +74,23 @@ def with_actuators(ways: Mapping[str, Mapping[str, str]]) -> Callable[[Any], Any
                         actuator.set_to_pid(kp=kp, kv=kv, ki=ki, ctrlspec=total)
                     if actuator.dyntype == mujoco.mjtDyn.mjDYN_USER:
                         actuator.actdim = 1
-        _add_sensors(spec)
+        if read:
+            _add_sensors(spec, read)
         return spec
 
     return describe
 
 
-def _add_sensors(spec: Any) -> None:
-    """Add sensors of the forces of actuators, and of those at scalar joints and at tendons."""
-    scalar = [x for x in named_joints(spec) if DOFS[x.type] == 1]
-    for kind, of, elements in (
-        ("JOINTACTFRC", "JOINT", scalar),
-        ("ACTUATORFRC", "ACTUATOR", spec.actuators),
-        ("TENDONACTFRC", "TENDON", spec.tendons),
-    ):
-        for i, one in enumerate(elements):
-            if not hasattr(mujoco.mjtSensor, f"mjSENS_{kind}"):
-                continue
-            one.name = one.name or f"{of} {i}"
-            add_sensor(spec, kind, of, one.name)
+def _add_sensors(spec: Any, kind: str) -> None:
+    """Add sensors of the forces of actuators: of each, or at scalar joints or tendons."""
+    of, elements = {
+        "JOINTACTFRC": ("JOINT", [x for x in named_joints(spec) if DOFS[x.type] == 1]),
+        "ACTUATORFRC": ("ACTUATOR", spec.actuators),
+        "TENDONACTFRC": ("TENDON", spec.tendons),
+    }[kind]
+    for i, one in enumerate(elements):
+        one.name = one.name or f"{of} {i}"
+        add_sensor(spec, kind, of, one.name)
 
 
 def _actuators(m: Any, way: str) -> Iterator[tuple[int, int, int]]:
@@ -228,7 +231,7 @@ def with_fixed_tendons(spec: Any) -> Any:
             tendon.name = f"of {joint.name}"
             tendon.wrap_joint(joint.name, COEFFICIENT)
             add_actuator(spec, tendon.name, "TENDON", tendon.name, GEAR * np.eye(6)[0])
-    _add_sensors(spec)
+    _add_sensors(spec, "TENDONACTFRC")
     return spec
 
 

@@ -137,11 +137,13 @@ def add_probes(spec: Any, links: Sequence[Any], model: Model) -> None:
         link.name = f"link {k}"
         for name, (kind, _) in SENSORS.items():
             add_sensor(spec, name, kind, site.name if kind == SITE else link.name, f"{name} {k}")
-    for name in ENERGIES if hasattr(mujoco.mjtSensor, "mjSENS_E_KINETIC") else ():
-        set_attributes(spec.add_sensor(), name=name, type=member(f"mjtSensor.mjSENS_{name}"))
-    kinds = {mujoco.mjtJoint.mjJNT_BALL: BALL_SENSORS, mujoco.mjtJoint.mjJNT_FREE: ()}
+    kinds = mujoco.mjtSensor.__members__
+    for name in ENERGIES:  # of which `_add_energies` reports what the version lacks
+        if (kind := kinds.get(f"mjSENS_{name}")) is not None:
+            set_attributes(spec.add_sensor(), name=name, type=kind)
+    own = {mujoco.mjtJoint.mjJNT_BALL: BALL_SENSORS, mujoco.mjtJoint.mjJNT_FREE: ()}
     for joint in named_joints(spec):
-        for name in kinds.get(joint.type, JOINT_SENSORS):
+        for name in own.get(joint.type, JOINT_SENSORS):
             add_sensor(spec, name, "JOINT", joint.name)
     _add_relative_probes(spec, links, model)
 
@@ -183,7 +185,7 @@ def _add_relative_probes(spec: Any, links: Sequence[Any], model: Model) -> None:
 
 def add_surface(s: Probed) -> None:
     """Read all after the forward dynamics at one state."""
-    parts = (_add_sensors, _add_frames, _add_momenta, _add_relative, _add_still, _add_cranks,
+    parts = (_add_sensors, _add_energies, _add_frames, _add_momenta, _add_relative, _add_still, _add_cranks,
              _add_tendon_limits, *ARRAYS, _add_torques)  # fmt: skip
     add_parts(s.found, *(partial(part, s) for part in parts))
 
@@ -201,11 +203,15 @@ def _add_sensors(s: Probed) -> None:
     places = np.array([int(s.m.sensor(f"FRAMEPOS {k}").adr[0]) for k in range(len(s.links))])
     values = s.d.sensordata[places[:, None] + np.arange(3)]
     s.add("frame_position", ("MjData.sensordata", *SENSOR_CLASSES), values)
-    # last: older versions lack them
-    _ = mujoco.mjtSensor.mjSENS_E_KINETIC
-    kinetic, potential = (s.d.sensor(name).data.copy() for name in ENERGIES)
-    s.add("kinetic_energy", ("mjtSensor.mjSENS_E_KINETIC",), kinetic)
-    s.add("gravity_energy", ("mjtSensor.mjSENS_E_POTENTIAL",), potential - s.elastic)
+
+
+def _add_energies(s: Probed) -> None:
+    for name, quantity, of_springs in (
+        ("E_KINETIC", "kinetic_energy", 0.0),
+        ("E_POTENTIAL", "gravity_energy", s.elastic),
+    ):
+        _ = member(f"mjtSensor.mjSENS_{name}")
+        s.add(quantity, (f"mjtSensor.mjSENS_{name}",), s.d.sensor(name).data - of_springs)
 
 
 def _add_frames(s: Probed) -> None:
@@ -304,9 +310,15 @@ def _add_tendon_limits(s: Probed) -> None:
     own.tendon_margin[s.ids("tendon")] = far
     other = data_like(own, s.d)
     mujoco.mj_forward(own, other)
-    if np.count_nonzero(other.efc_type == member(limit)) < len(s.links):
+    rows = np.flatnonzero(other.efc_type == member(limit))
+    if len(rows) < len(s.links):
         return  # a distance that nothing changes has no row
+    rows = rows[np.argsort(other.efc_id[rows])]
     place, speed = (s.sensors(f"TENDONLIMIT{x}", other) for x in ("POS", "VEL"))
+    away, margin, rate = (other.efc_pos[rows, None], other.efc_margin[rows, None], other.efc_vel[rows, None])
+    s.add("frame_distance", ("MjData.efc_pos", limit), away / 1.5)
+    s.add("frame_distance", ("MjData.efc_margin", limit), (place + margin) / 1.5)
+    s.add("frame_distance_rate", ("MjData.efc_vel", limit), rate / 1.5)
     s.add("frame_distance", ("mjtSensor.mjSENS_TENDONLIMITPOS", limit), (place + far) / 1.5)
     s.add("frame_distance_rate", ("mjtSensor.mjSENS_TENDONLIMITVEL", limit), speed / 1.5)
 
@@ -450,7 +462,7 @@ def _inverse_by_stages(m: Any, d: Any) -> Array:
 
 def _add_implicit_steps(s: Probed) -> None:
     """Take a step by each implicit method; its matrix, less what it adds to M, gives the energy."""
-    m, d, v, rotors = s.m, s.d, s.d.qvel, s.m.dof_armature * s.d.qacc
+    m, d, v = s.m, s.d, s.d.qvel
     own, h = copy(m), 0.1 / max(float(np.max(np.abs(v), initial=0.0)), 1.0)
     own.opt.timestep = h
     own.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)  # loads are applied ones
@@ -476,15 +488,18 @@ def _add_implicit_steps(s: Probed) -> None:
             twice = ((np.triu(LU, 1) + np.eye(m.nv)).T @ v) @ (np.tril(LU) @ v) + h * v @ D @ v
             s.add("kinetic_energy", ("MjData.qLU",), twice / 2)
         call = "mj_implicit", f"mjtIntegrator.mjINT_{name}"
-        for more, end in [
-            (("MjData.qDeriv", "mjtDisableBit.mjDSBL_ACTUATION"), other),
-            *((names, _clamped_step(s, own, limit)) for limit, names in CLAMPED.items() if hasattr(m, limit)),
-        ]:
-            change = times_mass(m, d, (end.qvel - v) / h) - D @ (end.qvel - v)
-            s.add_forces("inverse_dynamics", {(*call, *more): d.qfrc_bias + change - rotors})
+        _add_force_of_step(s, (*call, "MjData.qDeriv", "mjtDisableBit.mjDSBL_ACTUATION"), other, D, h)
+        add_parts(s.found, *(partial(_add_clamped_step, s, own, limit, call, D) for limit in CLAMPED))
 
 
-def _clamped_step(s: Probed, usual: Any, limit: str) -> Any:
+def _add_force_of_step(s: Probed, call: Call, end: Any, D: Array, h: float) -> None:
+    """Add the force by the change of the velocities in an implicit step, of the matrix M − h D."""
+    m, d, change = s.m, s.d, end.qvel - s.d.qvel
+    force = d.qfrc_bias + times_mass(m, d, change / h) - D @ change - m.dof_armature * d.qacc
+    s.add_forces("inverse_dynamics", {call: force})
+
+
+def _add_clamped_step(s: Probed, usual: Any, limit: str, call: Call, D: Array) -> None:
     """Take an implicit step with dampers on the tendons whose force a limit makes zero."""
     own, a = copy(usual), s.ids("actuator")
     own.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
@@ -496,4 +511,4 @@ def _clamped_step(s: Probed, usual: Any, limit: str) -> Any:
     other = data_like(own, s.d, "qfrc_applied", "xfrc_applied")
     mujoco.mj_forward(own, other)
     mujoco.mj_implicit(own, other)
-    return other
+    _add_force_of_step(s, (*call, *CLAMPED[limit]), other, D, own.opt.timestep)

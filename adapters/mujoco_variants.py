@@ -435,7 +435,7 @@ def _actuated(
     """Let actuators exert what the joints have."""
     own = " ".join(actuation.names_of(ways))
     of_motors = f"mjtSensor.mjSENS_{read} {MOTORS} MjData.ctrl" if read else "mjtDyn MjData.act"
-    describe, forward = actuation.with_actuators(ways), actuation.forward_by_actuators(ways, read)
+    describe, forward = actuation.with_actuators(ways, read), actuation.forward_by_actuators(ways, read)
     every = names or f"{own} {of_motors} mjtTrn.mjTRN_JOINT"
     return _spelling(every, suits, describe=describe, forward=forward)
 
