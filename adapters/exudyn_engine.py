@@ -46,7 +46,7 @@ from adapters.exudyn_common import (
     silence_engine,
     written_items,
 )
-from adapters.exudyn_surface import Probes, pose_function
+from adapters.exudyn_surface import FEW_BODIES, Probes, pose_function
 from adapters.exudyn_variants import VARIANTS, Change, Joint, Piece
 from adapters.pose_functions import add_pose_answers
 from plumbline.engines.variants import names_of_column
@@ -65,6 +65,7 @@ from plumbline.model.datatypes import (
 )
 from plumbline.model.kinematics import (
     JointFrame,
+    cross,
     elastic_energy,
     joint_coordinates,
     remembered_velocity_jacobian,
@@ -156,7 +157,7 @@ class ExudynChain:
 
     def _add_piece(self, k: int, part: RigidPart, attitude: Array) -> None:
         mbs, state = self.mbs, self.state
-        arm, arm_rate = attitude @ part.centre, attitude @ np.cross(state.omega[k], part.centre)
+        arm, arm_rate = attitude @ part.centre, attitude @ cross(state.omega[k], part.centre)
         velocity, gravity = state.v[k] + arm_rate, self.model.gravity
         piece = Piece(part, state.r[k] + arm, velocity, state.p[k], state.omega[k], gravity)
         node, body = self.change.add_body(mbs, piece)
@@ -191,6 +192,8 @@ class ExudynChain:
     def _add_joint_elements(self, k: int, ends: list[Any]) -> None:
         """Add spring-dampers for the coordinates of joint k that have springs, dampers or efforts."""
         model, far = self.model, self.model.body[k, 0]
+        if not any(np.any(one[k]) for one in (model.stiffness, model.damping, model.effort)):
+            return
         above = rotation_matrix(self.state.p[far]) if far >= 0 else np.eye(3)
         axes = JointFrame(model, k, above).axes(self.x[k])
         for i, ((what, number), (axis, *_)) in enumerate(zip(model.kinds[k].motions, axes, strict=True)):
@@ -383,6 +386,8 @@ class Exudyn(ExudynAdapter):
                 assert chain.probes is not None
                 chain.probes.add_all()
                 found.append(chain.probes.found)
+                if state is states[0] and model.n <= FEW_BODIES:
+                    chain.probes.add_once(model, state)
             add_pose_answers(found, states, "exudyn", pose_function)
         return found
 
@@ -542,7 +547,7 @@ def _evaluate_state(chain: ExudynChain) -> StateQuantities:
         kinetic_energy=kinetic,
         # its own PotentialEnergy is always 0, and springs have none
         potential_energy=elastic_energy(chain.model, chain.state) - float(np.sum(weight * r)),
-        angular_momentum=np.sum(np.cross(r, momentum[:, :3]), 0)
+        angular_momentum=np.sum(cross(r, momentum[:, :3]), 0)
         + np.einsum("kij,kj->i", rotation_matrix(p), spin),
         # Of welded pieces the engine has no mass matrix on ν.
         mass_matrix=None if rates is None else rates.T @ M @ rates,
@@ -570,7 +575,7 @@ def _joint_moments(chain: ExudynChain, force: list[Array], of_p: list[Array]) ->
     about_centre = np.matvec(rates.mT, np.array(of_p))
     centre = np.array([chain.piece_centre[chain.first_piece[i]] for i in near])
     lever = np.matvec(A, chain.model.proximal - centre)
-    return np.asarray(np.matvec(A, about_centre) - np.cross(lever, force))
+    return np.asarray(np.matvec(A, about_centre) - cross(lever, np.array(force)))
 
 
 def _system_matrices(chain: ExudynChain) -> tuple[Array, Array, Array]:

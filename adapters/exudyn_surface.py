@@ -6,22 +6,26 @@ here into those of the probe frame.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from importlib import import_module
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import exudyn
 import numpy as np
+import scipy.linalg
 
 from adapters.exudyn_common import Output, items
+from adapters.exudyn_items import add_item_answers
+from adapters.exudyn_points import add_point_answers
 from adapters.surface_record import SurfaceRecord
 from plumbline.engines.missing_names import add_parts
-from plumbline.model.datatypes import Array, Model
+from plumbline.model.datatypes import Array, Model, State
 from plumbline.model.kinematics import rotation_matrix
 from plumbline.model.probe_frames import PROBE_ATTITUDE, probe_points
 
 TURN = rotation_matrix(PROBE_ATTITUDE)
+FEW_BODIES = 3  # of mechanisms on which what does not depend on the mechanism is compared
 
 
 def _as_given(values: Array) -> Array:
@@ -53,9 +57,51 @@ def _place_of_poses(values: Array) -> Array:
 
 def pose_function(name: str, given: Sequence[Any], forms: Sequence[str]) -> Sequence[Any]:
     """Call a function of attitudes or poses."""
-    module, _, function = name.rpartition(".")
-    result = getattr(import_module(f"exudyn.{module}"), function)(*given)
+    module, _, last = name.rpartition(".")
+    function = getattr(import_module(f"exudyn.{module}"), last)
+    result = COMPLETED[last](function, *given) if last in COMPLETED else function(*given)
     return result if len(forms) > 1 and not forms[0].startswith("@") else [result]
+
+
+def _screw(axis: int, angle: float, shift: float) -> Array:
+    """The pose after a turn about a coordinate axis and a shift along it."""
+    pose, (i, j) = np.eye(4), np.roll(range(3), -axis)[1:]
+    pose[i, i] = pose[j, j] = np.cos(angle)
+    pose[j, i] = np.sin(angle)
+    pose[i, j] = -pose[j, i]
+    pose[axis, 3] = shift
+    return pose
+
+
+def _about_first(axes: Array, R: Array) -> Array:
+    """Axes of which only the first is given, turned about it to R."""
+    rest = axes.T @ R
+    return np.asarray(axes @ _screw(0, np.arctan2(rest[2, 1], rest[1, 1]), 0.0)[:3, :3])
+
+
+def _after_standard(function: Any, H: Array, theta: float, d: float, a: float, alpha: float) -> Array:
+    """H by the inverse of a pose by standard Denavit-Hartenberg parameters, and the function's."""
+    found = np.array(function([theta, d, a, alpha]))
+    return np.asarray(H @ _screw(0, -alpha, -a) @ _screw(2, -theta, -d) @ found)
+
+
+def _after_modified(function: Any, H: Array, alpha: float, d: float, theta: float, r: float) -> Array:
+    """The same of parameters by Khalil and Kleinfinger, of which the function returns two poses."""
+    before, after = map(np.array, function([alpha, d, theta, r]))
+    return np.asarray(H @ _screw(2, -theta, -r) @ _screw(0, -alpha, -d) @ before @ after)
+
+
+# By function whose result is no attitude or pose of a body what makes one of it.
+COMPLETED: Mapping[str, Callable[..., Any]] = {
+    "HT0": lambda function, H: function() @ H,
+    "RotationMatrix2D": lambda function, angle: scipy.linalg.block_diag(function(angle), 1.0),
+    "ComputeOrthonormalBasis": lambda function, R: _about_first(function(2 * R[:, 0]), R),
+    "ComputeOrthonormalBasisVectors": lambda function, R: _about_first(np.stack(function(2 * R[:, 0]), 1), R),
+    "GramSchmidt": lambda function, R: np.stack(function(2 * R[:, 0], R[:, 0] + 3 * R[:, 1]), 1),
+    "projectAngleToPMPi": lambda function, angle: function(angle + 2 * np.pi),
+    "StdDH2HT": _after_standard,
+    "ModDHKK2HT": _after_modified,
+}
 
 
 class _Output(NamedTuple):
@@ -168,6 +214,19 @@ class Probes(SurfaceRecord):
         for kind in ("Node", "Object"):
             by = f"SystemData.Get{kind}LTGODE2", "ConfigurationType.Reference"
             self.add("body_position", by, self._own(total, kind))
+
+    def add_once(self, model: Model, state: State) -> None:
+        """Add what does not depend on the mechanism, and what is slow: of one state."""
+        add_point_answers(self, state)
+        add_item_answers(self, model, state)
+        if not model.has_loops:
+            add_parts(self.found, self._add_degrees_of_freedom)
+
+    def _add_degrees_of_freedom(self) -> None:
+        name, module = "ComputeSystemDegreeOfFreedom", cast("Any", exudyn)
+        for call, compute in ((name, partial(module.ComputeSystemDegreeOfFreedom, self.mbs)),
+                              (f"MainSystem.{name}", self.mbs.ComputeSystemDegreeOfFreedom)):  # fmt: skip
+            self.add("degrees_of_freedom", (call,), compute()["degreeOfFreedom"])
 
     def _own(self, values: Any, kind: str = "Node") -> list[Array]:
         """The first three of each body's or node's own coordinates, of those of the system."""

@@ -231,6 +231,16 @@ def _load_by_function(mbs: Any, node: Any, a: Array, c: Array, k: Array, force: 
     _add_rest(mbs, node, a, 0 * force)
 
 
+def _tree_by_function(mbs: Any, node: Any, a: Array, c: Array, k: Array, force: Array) -> None:
+    """Give the tree, the first object, a function of its generalised forces."""
+
+    def of_forces(mbs: Any, t: float, item: int, q: Any, rates: Any) -> list[float]:
+        return [float(x) for x in force - k * np.array(q) - c * np.array(rates)]
+
+    mbs.SetObjectParameter(mbs.GetObjectNumber(mbs.GetObject(0)["name"]), "forceUserFunction", of_forces)
+    _add_rest(mbs, node, a, 0 * force)
+
+
 @dataclass(frozen=True)
 class TreeChange:
     """What is done otherwise; as it stands nothing."""
@@ -306,6 +316,7 @@ VARIANTS = (
             ),
             ("itemInterface.ObjectGenericODE2ForceUserFunction "
              "itemInterface.ObjectGenericODE2MassMatrixUserFunction", _generic_by_functions, _has_elements),
+            ("itemInterface.ObjectKinematicTreeForceUserFunction", _tree_by_function, _has_elements),
             ("itemInterface.LoadCoordinateLoadUserFunction itemInterface.MarkerNodeCoordinate",
              _load_by_function, _has_elements),
             ("itemInterface.LoadCoordinate itemInterface.NodePointGround",

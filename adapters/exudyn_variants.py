@@ -589,7 +589,7 @@ VARIANTS = (
         "MainSystem.SetNodeParameter MainSystem.SetObjectParameter", add_body=_set_later(_set_parameters)
     ),
     _spelling("MainSystem.ModifyNode MainSystem.ModifyObject", add_body=_set_later(_modify)),
-    _option(_texts("MainSystem", *ASSEMBLY), assemble=_assemble_by_parts),
+    _option(_texts("MainSystem", *ASSEMBLY, "systemIsConsistent"), assemble=_assemble_by_parts),
     _option("SystemData.GetSystemState SystemData.SetSystemState", assemble=_assemble_and_set_state),
     *of_ways(_spelling, _is_open),
     _option(

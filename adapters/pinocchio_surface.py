@@ -260,6 +260,13 @@ def _add_centres(s: Probed) -> None:
     pin.centerOfMass(m, data, q, v, a)
     for quantity, name in (("", "com"), ("_velocity", "vcom"), ("_acceleration", "acom")):
         s.add(f"centre_of_mass{quantity}", ("centerOfMass", f"Data.{name}"), getattr(data, name)[0])
+    pin.forwardKinematics(m, derived, q, v, a)
+    for quantity, name, level in (
+        ("", "com", "POSITION"), ("_velocity", "vcom", "VELOCITY"), ("_acceleration", "acom", "ACCELERATION"),
+    ):  # fmt: skip
+        pin.centerOfMass(m, derived, getattr(pin.KinematicLevel, level))
+        call = "centerOfMass", "KinematicLevel", f"KinematicLevel.{level}"
+        s.add(f"centre_of_mass{quantity}", call, getattr(derived, name)[0])
     jacobian = s.square(pin.jacobianCenterOfMass(m, data, q))
     s.add("centre_of_mass_velocity", ("jacobianCenterOfMass", "Data.Jcom"), s.square(data.Jcom) @ v)
     pin.computeForwardKinematicsDerivatives(m, derived, q, v, a)

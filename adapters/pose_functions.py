@@ -20,10 +20,13 @@ the body, which has no letter, and
     w wl t                  angular velocity in the world and in Q's axes; twist in these, linear part first
     vwl rphidot             ṙ in the world with w in Q's axes, or with the rate of phi
     pdot 2pdot phidot xyzdot rpydot xidot    rates of the forms
+    xyzbend rpybend         rates of angles about as large as √ω, and what the rate of the matrix that takes
+                            rates to ω makes of them: Σ θ̇ᵢ θ̇ⱼ aᵢ × aⱼ of the axes a, in Q's axes, and
+                            xyzbendw in the world's
 
-A result "@pdot w" is a matrix that takes the first to the second.  "Rx" is the turn by x alone and "Tx" the
-shift by one coordinate, as a matrix of any kind; -Rx and -Tx are their inverses (of Exudyn, Plücker matrices
-of shifts alone are inverse to those of shifts with turns).  Numbers, and texts in
+A result "@pdot w" is a matrix that takes the first to the second.  "Rx" is the turn by x alone, "x" its
+angle, and "Tx" the shift by one coordinate, as a matrix of any kind; -Rx and -Tx are their inverses (of
+Exudyn, Plücker matrices of shifts alone are inverse to those of shifts with turns).  Numbers, and texts in
 quotes, are given as they stand.
 """
 
@@ -166,6 +169,11 @@ def rate_maps(Q: Pose) -> dict[str, Array]:
     }  # fmt: skip
 
 
+def _bend(spins: Array) -> Array:
+    """Σ ωᵢ × ωⱼ of turns in a row, i before j."""
+    return np.asarray(np.sum(np.cross(np.cumsum(spins, axis=0) - spins, spins), axis=0))
+
+
 class _Body:
     """A body at a state: what functions are given, and what their results are."""
 
@@ -183,6 +191,10 @@ class _Body:
         for name, matrix in self.maps.items():
             if "pdot" not in name:
                 self.rates[name] = np.linalg.solve(matrix, twist if len(matrix) == 6 else spin)
+        self.spin, self.bends = spin, dict[str, Array]()
+        for name, order in (("xyz", 1), ("rpy", -1)):
+            self.rates[f"{name}bend"] = given = self.rates[f"{name}dot"] / np.sqrt(np.linalg.norm(spin) + 1)
+            self.bends[f"{name}bend"] = _bend((self.maps[f"{name}dot"] * given).T[::order])
 
     def given(self, name: str) -> Any:
         if name[0] in "'-0123456789":
@@ -198,6 +210,10 @@ class _Body:
                 return {"frame_angular_velocity": angular}
             by = "_by_tangent_operator"
             return {f"body_velocity{by}": linear[0], f"frame_angular_velocity{by}": angular}
+        if form.removesuffix("w") in self.bends:
+            turned = value @ self.Q.R if form.endswith("w") else value
+            spin = self.spin + turned - self.bends[form.removesuffix("w")]
+            return {"frame_angular_velocity": self.Q.R @ spin}
         pose, _, form = form.rpartition(".")
         found, above = {}, self.pose * self.poses[pose].inverse() if pose else None
         if (turn := self._attitude(form, value)) is not None:
@@ -212,6 +228,10 @@ class _Body:
             turns = [_about(axis, angle) for axis, angle in enumerate(self.pose.forms["xyz"])]
             turns["xyz".index(name[1])] = value[:3, :3].T if name != form else value[:3, :3]
             return np.asarray(turns[0] @ turns[1] @ turns[2])
+        if name in ("x", "y", "z"):
+            return self._attitude(f"R{name}", _about("xyz".index(name), float(value)))
+        if name == "axis":
+            return _turn(value * self.pose.forms["angle"])
         return ATTITUDES[name](value) if name in ATTITUDES else None
 
     def _place(self, form: str, value: Array) -> Array | None:

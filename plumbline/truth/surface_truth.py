@@ -249,6 +249,12 @@ def _total_mass(m: Motion) -> Rounded:
     return Rounded(np.full((1, 1), total), np.zeros(1), np.full(1, total))
 
 
+def _degrees_of_freedom(m: Motion) -> Rounded:
+    """The rates of ν, less what the directions of rods have too many."""
+    count = float(len(m.mass_matrix) - np.sum(m.model.rods))
+    return Rounded(np.full((1, 1), count), np.zeros(1), np.full(1, count))
+
+
 def _inverse_dynamics(m: Motion) -> Rounded:
     return m.generalized(_body_force(m), m.spin_momentum_rate())
 
@@ -341,6 +347,7 @@ _FORMULAS: Mapping[str, tuple[str, Callable[[Motion], Rounded]]] = {
     "centre_of_mass_velocity": ("m/s", lambda m: m.centre(m.v)),
     "centre_of_mass_acceleration": ("m/s²", lambda m: m.centre(m.a)),
     "total_mass": ("kg", _total_mass),
+    "degrees_of_freedom": ("1", _degrees_of_freedom),
     "momentum": ("kg m/s", lambda m: _momenta(m).summed(_weights(m))),
     "momentum_rate": ("N", lambda m: m.a.times(m.mass).summed(_weights(m))),
     "centroidal_angular_momentum": (
@@ -401,7 +408,7 @@ SURFACE_QUANTITIES: Mapping[str, tuple[str, Callable[[Motion], Rounded]]] = {
 # Of mechanisms without loops: their joints' wrenches, and what is on their rates.
 OF_TREES = (
     "joint_force_local", "joint_moment_local", "generalized_momentum", "momentum_through_inverse",
-    "generalized_gravity", "inverse_dynamics", "kinetic_energy", "mechanical_energy",
+    "generalized_gravity", "inverse_dynamics", "kinetic_energy", "mechanical_energy", "degrees_of_freedom",
 )  # fmt: skip
 
 

@@ -1,0 +1,577 @@
+"""Settings, parts and functions of Exudyn's solvers, by mass points that are pushed to the bodies' positions.
+
+A point of mass m starts at rest in the origin.  The force m u (1 + t) pushes it, u being the direction of a
+body's position and t the time [s]; in a step of 1 s every method makes of it numbers times u, which follow
+from the method's formula.  The equations are linear or have the known root u, so that iterations end in
+rounding; masses and sizes are the same for all mechanisms, since all points share one tolerance.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from copy import copy
+from functools import partial
+from typing import Any
+
+import exudyn
+import numpy as np
+
+from adapters.exudyn_common import (
+    Output,
+    items,
+    make_rigid_body,
+    make_settings,
+    make_system,
+    set_linear_solver,
+)
+from adapters.exudyn_variants import INITIALISATION
+from adapters.surface_record import SurfaceRecord
+from plumbline.engines.missing_names import add_parts
+from plumbline.model.datatypes import Array, EngineFailure, Float, State
+from plumbline.model.kinematics import (
+    quaternion_exponential,
+    quaternion_product,
+    rotation_matrix,
+    rotation_vector,
+)
+from plumbline.model.probe_frames import PROBE_ATTITUDE
+
+AXES = np.eye(3)
+IMPLICIT, EXPLICIT = "MainSolverImplicitSecondOrder", "MainSolverExplicit"
+STIFFNESS = 2.0  # N/m
+PULL = 1.0  # 1/s², of the force −m x of points that are pulled back
+TURN = np.array([0.3, -0.2, 0.5])  # rad, of bodies that turn for a second
+TIGHT = 4e-15  # of Newton's residual, relative: a root has rounding then, and the residual's rounding is less
+Factors = tuple[float, float]  # of r in places and velocities after the step
+
+
+def _factors(gamma: float, beta: float, first: float = 1.0, forces: Factors = (1.0, 2.0)) -> Factors:
+    """Return Newmark's: of accelerations of which the first is given and the second is the force's."""
+    last = forces[1]
+    return (0.5 - beta) * first + beta * last, (1 - gamma) * first + gamma * last
+
+
+def _pulled(gamma: float, beta: float) -> Factors:
+    """The same where a force −m x pulls besides."""
+    last = (2.0 - PULL * (0.5 - beta)) / (1 + PULL * beta)
+    return (0.5 - beta) + beta * last, (1 - gamma) + gamma * last
+
+
+NEWMARK = {"generalizedAlpha.useNewmark": True}
+LINEAR = NEWMARK | {"generalizedAlpha.newmarkBeta": 1 / 6}  # exact where the acceleration is linear in t
+BY_NEWMARK, EXACT = _factors(0.5, 0.25), (2 / 3, 1.5)
+RUNGE_KUTTA = {"solverType": "RK44"}
+LIE = "generalizedAlpha.lieGroup"
+
+
+def _names(owner: str, text: str) -> tuple[str, ...]:
+    return tuple(f"{owner}.{name}" for name in text.split())
+
+
+Step = tuple[tuple[str, ...], Mapping[str, Any], Factors]
+# By names of settings their values, relative to those of time integration, and what the step makes of r.
+STEPS: Sequence[Step] = (
+    (_names("GeneralizedAlphaSettings", "newmarkBeta newmarkGamma"),
+     NEWMARK | {"generalizedAlpha.newmarkBeta": 0.3, "generalizedAlpha.newmarkGamma": 0.6},
+     _factors(0.6, 0.3)),
+    (_names("GeneralizedAlphaSettings", "resetAccelerations"),
+     NEWMARK | {"generalizedAlpha.computeInitialAccelerations": False,
+                "generalizedAlpha.resetAccelerations": True}, _factors(0.5, 0.25, first=0.0)),
+    (_names("TimeIntegrationSettings", "startTime"), NEWMARK | {"startTime": 0.5, "endTime": 1.5},
+     _factors(0.5, 0.25, 1.5, (1.5, 2.5))),
+    (_names("TimeIntegrationSettings", "reuseConstantMassMatrix"),
+     NEWMARK | {"reuseConstantMassMatrix": False}, BY_NEWMARK),
+    (_names("TimeIntegrationSettings", "computeLoadsJacobian"), NEWMARK | {"computeLoadsJacobian": 1},
+     _pulled(0.5, 0.25)),
+    (_names("NewtonSettings", "active"), NEWMARK | {"newton.active": False, "newton.maxIterations": 1},
+     BY_NEWMARK),
+    (_names("NewtonSettings", "useNewtonSolver"),
+     NEWMARK | {"newton.useNewtonSolver": False, "newton.maxIterations": 1}, BY_NEWMARK),
+    (_names("ExplicitIntegrationSettings", "computeMassMatrixInversePerBody"),
+     RUNGE_KUTTA | {"explicit.computeMassMatrixInversePerBody": True}, EXACT),
+    (_names("ExplicitIntegrationSettings", "useLieGroupIntegration"),
+     RUNGE_KUTTA | {"explicit.useLieGroupIntegration": False}, EXACT),
+    (_names("TimeIntegrationSettings", "explicitIntegration"),
+     {"explicitIntegration.dynamicSolverType": "RK44",
+      "explicitIntegration.computeMassMatrixInversePerBody": True}, EXACT),
+    *(((f"LinearSolverType.{name}",), {"linear solver": name} | RUNGE_KUTTA, EXACT)
+      for name in ("EigenDense", "EXUdense")),
+)  # fmt: skip
+# By names of Newton's settings their values, at the search for the root of a cubic equation.
+ROOTS: Sequence[tuple[tuple[str, ...], Mapping[str, Any]]] = (
+    (("SolveStatic", "MainSystem.SolveStatic", "StaticSolverSettings"), {}),
+    (_names("NewtonSettings", "adaptInitialResidual"), {"adaptInitialResidual": True}),
+    (_names("NewtonSettings", "maximumSolutionNorm"), {"maximumSolutionNorm": 1e60}),
+    (_names("NewtonSettings", "weightTolerancePerCoordinate"), {"weightTolerancePerCoordinate": True}),
+    (_names("NewtonSettings", "residualMode"), {"residualMode": 1}),
+    (_names("NewtonSettings", "newtonResidualMode"), {"newtonResidualMode": 1}),
+    (("NewtonSettings.numericalDifferentiation", "NumericalDifferentiationSettings"),
+     {"numericalDifferentiation.relativeEpsilon": 1e-6, "numericalDifferentiation.minimumCoordinateSize": 0.1,
+      "numericalDifferentiation.doSystemWideDifferentiation": True}),
+    (_names("NewtonSettings", "modifiedNewtonContractivity maxModifiedNewtonIterations"),
+     {"useModifiedNewton": True, "modifiedNewtonContractivity": 0.1, "maxModifiedNewtonIterations": 3}),
+    (_names("NewtonSettings", "maxModifiedNewtonRestartIterations"),
+     {"useModifiedNewton": True, "maxModifiedNewtonRestartIterations": 2}),
+    (_names("NewtonSettings", "modifiedNewtonJacUpdatePerStep"),
+     {"useModifiedNewton": True, "modifiedNewtonJacUpdatePerStep": True}),
+)  # fmt: skip
+
+
+class _Points:
+    """What is pushed, and what a step made of it; ``places``: directions, of ``lengths`` [m]."""
+
+    def __init__(self, record: SurfaceRecord, places: Float[Array, "bodies 3"]) -> None:
+        self.record = record
+        self.lengths = np.linalg.norm(places, axis=1, keepdims=True)
+        self.places = np.where(self.lengths > 0, places, AXES[0]) / np.where(
+            self.lengths > 0, self.lengths, 1
+        )
+        self.count = len(places)
+        self.mass = 1.0 + np.arange(self.count) / self.count
+
+    def system(
+        self, is_lawful: Callable[[], bool] = lambda: True, pull: float = 0.0, spring: Any = None
+    ) -> tuple[Any, Any]:
+        """Assemble the points; where the law of the forces fails they are no numbers after the start.
+
+        Args:
+            pull: of a force −m x that is the loads', 1/s².
+            spring: adds a spring between a ground and a point, in place of the growth of the force.
+
+        """
+        mbs, container = make_system()
+        ground = mbs.AddMarker(items.MarkerBodyPosition(bodyNumber=mbs.AddObject(items.ObjectGround())))
+
+        def law(k: int, mbs: Any, t: float, load: Any) -> list[float]:
+            push = self.places[k] * (1 + t if is_lawful() or t == 0 else np.nan)
+            if pull:
+                push = push - pull * np.array(mbs.systemData.GetODE2Coordinates()[3 * k : 3 * k + 3])
+            return [float(x) for x in self.mass[k] * push]
+
+        for k, mass in enumerate(self.mass):
+            node = mbs.AddNode(items.NodePoint())
+            mbs.AddObject(items.ObjectMassPoint(nodeNumber=node, mass=float(mass)))
+            marker = mbs.AddMarker(items.MarkerNodePosition(nodeNumber=node))
+            push = (self.mass[k] * self.places[k]).tolist()
+            if spring is not None:
+                spring(mbs, [ground, marker], k)
+                mbs.AddLoad(items.LoadForceVector(markerNumber=marker, loadVector=push))
+            else:
+                by = {"loadVectorUserFunction": partial(law, k)}
+                mbs.AddLoad(items.LoadForceVector(markerNumber=marker, loadVector=push, **by))
+        mbs.Assemble()
+        return mbs, container
+
+    def read(self, mbs: Any) -> tuple[Array, Array]:
+        """Return places and velocities."""
+        data = mbs.systemData
+        x, v = (np.reshape(x, (-1, 3)) for x in (data.GetODE2Coordinates(), data.GetODE2Coordinates_t()))
+        return x, v
+
+    def add(self, names: Sequence[str], directions: Any) -> None:
+        """Add positions of bodies, by their directions in a row."""
+        self.record.add("body_position", tuple(names), np.reshape(directions, (-1, 3)) * self.lengths)
+
+    def add_results(self, names: Sequence[str], results: tuple[Array, Array], factors: Factors) -> None:
+        """Add the mean of what places and velocities give."""
+        x, v = (value / factor for value, factor in zip(results, factors, strict=True))
+        self.add(names, (x + v) / 2)
+
+
+def _settings(options: Mapping[str, Any]) -> Any:
+    """Make settings of one step of 1 s; deprecated names of options are options, too."""
+    settings = make_settings()
+    settings.timeIntegration.numberOfSteps, settings.timeIntegration.endTime = 1, 1.0
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        for path, value in options.items():
+            if path == "linear solver":
+                set_linear_solver(settings, value)
+                continue
+            owner, (*rest, last) = settings.timeIntegration, path.split(".")
+            for name in rest:
+                owner = getattr(owner, name)
+            kind = last.endswith("olverType")
+            setattr(owner, last, getattr(exudyn.DynamicSolverType, value) if kind else value)
+    return settings
+
+
+def _solve(solver: Any, mbs: Any, settings: Any) -> None:
+    if not solver.SolveSystem(mbs, settings):
+        raise EngineFailure(f"Exudyn's solver failed: {solver.GetErrorString()}")
+
+
+def add_point_answers(record: SurfaceRecord, state: State) -> None:
+    """Push points to where the bodies of a state are, in all ways, and add where they come."""
+    points = _Points(record, state.r)
+    add_parts(
+        record.found,
+        *(partial(_add_step, points, *one) for one in STEPS),
+        *(partial(_add_root, points, *one) for one in ROOTS),
+        *(partial(part, points) for part in PARTS),
+        partial(_add_turns, record, state),
+    )
+
+
+def _add_step(points: _Points, names: Any, options: Any, factors: Factors) -> None:
+    pull = PULL * ("computeLoadsJacobian" in options)
+    mbs, _container = points.system(pull=pull)
+    settings = _settings(options)
+    is_implicit = "generalizedAlpha.useNewmark" in options
+    _solve(
+        exudyn.MainSolverImplicitSecondOrder() if is_implicit else exudyn.MainSolverExplicit(), mbs, settings
+    )
+    points.add_results(names, points.read(mbs), factors)
+
+
+def _add_root(points: _Points, names: Any, options: Mapping[str, Any]) -> None:
+    """Find the displacement x at which m (1 + |x|²) x / 2 is the load m u: it is u."""
+
+    def spring(mbs: Any, markers: Any, k: int) -> None:
+        stiffness = float(points.mass[k]) / 2
+
+        def law(mbs: Any, t: float, item: int, x: Any, *rest: Any) -> list[float]:
+            strength = stiffness * (1 + x[0] ** 2 + x[1] ** 2 + x[2] ** 2)
+            return [float(strength * one) for one in x]
+
+        mbs.AddObject(
+            items.ObjectConnectorCartesianSpringDamper(markerNumbers=markers, springForceUserFunction=law)
+        )
+
+    mbs, _container = points.system(spring=spring)
+    settings = _settings({})
+    newton = settings.staticSolver.newton
+    newton.relativeTolerance, newton.absoluteTolerance, newton.maxIterations = TIGHT, 1e-300, 100
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        for path, value in options.items():
+            *owner, last = path.split(".")
+            setattr(getattr(newton, owner[0]) if owner else newton, last, value)
+    settings.staticSolver.verboseMode = 0
+    mbs.SolveStatic(settings)
+    points.add(names, points.read(mbs)[0])
+
+
+def _add_adaptive_steps(points: _Points) -> None:
+    """Let the force fail at first, so that steps are reduced, and later increased again."""
+    adaptive = LINEAR | {"adaptiveStep": True, "adaptiveStepRecoverySteps": 1}
+    settings = (
+        "adaptiveStepDecrease adaptiveStepIncrease adaptiveStepRecoverySteps adaptiveStepRecoveryIterations"
+    )
+    for names, options, failures, step, time in (
+        (settings, {"adaptiveStepDecrease": 0.3, "adaptiveStepIncrease": 1.5,
+                    "adaptiveStepRecoveryIterations": 50}, 1, 2, 0.3 * 2.5),
+        ("minimumStepSize", {"adaptiveStepDecrease": 0.1, "minimumStepSize": 0.05}, 2, 1, 0.05),
+    ):  # fmt: skip
+        solver, trials = exudyn.MainSolverImplicitSecondOrder(), list[float]()
+
+        def count(mbs: Any, t: float, trials: list[float] = trials) -> bool:
+            trials.append(t)
+            return True
+
+        mbs, _container = points.system(is_lawful=lambda: len(trials) > failures)  # noqa: B023
+        mbs.SetPreStepUserFunction(count)
+        found = _after_step(points, solver, mbs, _settings(adaptive | options), step)
+        points.add_results(_names("TimeIntegrationSettings", names), found, _exact(time))
+
+
+def _exact(t: float) -> Factors:
+    """What the force makes of r in a time."""
+    return t**2 / 2 + t**3 / 6, t + t**2 / 2
+
+
+def _after_step(points: _Points, solver: Any, mbs: Any, settings: Any, step: int) -> tuple[Array, Array]:
+    """Solve, and return places and velocities after so many steps."""
+    found = list[tuple[Array, Array]]()
+
+    def read(mbs: Any, t: float) -> bool:
+        found.append(points.read(mbs))
+        return True
+
+    mbs.SetPostStepUserFunction(read)
+    _solve(solver, mbs, settings)
+    mbs.SetPostStepUserFunction(0)
+    return found[step]  # the first is before the first step
+
+
+def _add_automatic_steps(points: _Points) -> None:
+    """Add the second step, as it follows from the error of the first by the formula of Hairer and Wanner.
+
+    The two methods of ODE23 give one velocity and the displacements u (h² / 2 + h³ / 6) and
+    u (h² / 2 + 3 h³ / 16) in the first step h.  Signs are put back afterwards, since steps depend on them
+    (docs/surface/exudyn_step_control.py).
+    """
+    h, safety, growth, tolerance = 0.375, 0.3, 1.5, 0.25
+    own = copy(points)
+    own.places = np.abs(points.places)
+    options = {"automaticStepSize": True, "initialStepSize": h, "stepSizeSafety": safety}
+    error = h / 48 / (tolerance * (0.5 + 3 * h / 16)) * np.sqrt(np.mean(own.places > 0) / 2)
+    by_error = h * safety * error ** (-1 / 3) if error else 0.0
+    for names, second, more in (
+        ("initialStepSize stepSizeMaxIncrease", growth * h,
+         {"stepSizeMaxIncrease": growth, "absoluteTolerance": 1e30}),
+        ("stepSizeSafety relativeTolerance", by_error,
+         {"stepSizeMaxIncrease": 1e3, "absoluteTolerance": 1e-300, "relativeTolerance": tolerance}),
+    ):  # fmt: skip
+        mbs, _container = own.system()
+        settings = _settings({"solverType": "ODE23"} | options | more)
+        x, v = _after_step(own, exudyn.MainSolverExplicit(), mbs, settings, 2)
+        signs, call = np.sign(points.places), _names("TimeIntegrationSettings", names)
+        points.add_results(call, (signs * x, signs * v), _exact(h + second))
+
+
+def _initialized(
+    points: _Points, options: Mapping[str, Any], kind: str = IMPLICIT, pull: float = 0.0
+) -> tuple[Any, Any, Any, Any]:
+    """Initialise a solver for one step of 1 s."""
+    (mbs, container), settings, solver = points.system(pull=pull), _settings(options), getattr(exudyn, kind)()
+    if not solver.InitializeSolver(mbs, settings):
+        raise EngineFailure(f"Exudyn could not initialise its solver: {solver.GetErrorString()}")
+    solver.it.currentStepSize, solver.it.currentStepIndex = 1.0, 1
+    return solver, mbs, settings, container
+
+
+def _add_parts_of_a_step(points: _Points) -> None:
+    """Take a step of generalised-α by its parts, with the parameters that the solver says."""
+    solver, mbs, settings, _container = _initialized(points, {"generalizedAlpha.spectralRadius": 0.7})
+    solver.UpdateCurrentTime(mbs, settings)
+    solver.InitializeStep(mbs, settings)
+    solver.ComputeNewtonUpdate(mbs, settings, True)
+    x, v = points.read(mbs)
+    solver.ComputeNewtonResidual(mbs, settings)
+    solver.ComputeNewtonJacobian(mbs, settings)
+    change = np.linalg.solve(solver.GetSystemJacobian(), solver.GetSystemResidual()).reshape(x.shape)
+    by = "UpdateCurrentTime InitializeStep ComputeNewtonUpdate ComputeNewtonResidual ComputeNewtonJacobian"
+    own = "alphaF alphaM factJacAlgorithmic newmarkBeta newmarkGamma spectralRadius"
+    beta, gamma, radius = solver.newmarkBeta, solver.newmarkGamma, solver.spectralRadius
+    forward = (solver.alphaF - solver.alphaM) / (1 - radius / (radius + 1) + (1 - radius) / (radius + 1))
+    factors = _factors(gamma, beta, forces=(1.0, 2 * solver.factJacAlgorithmic + forward))
+    points.add_results(_names(IMPLICIT, f"{by} {own}"), (x - change, v - gamma / beta * change), factors)
+    solver.FinalizeSolver(mbs, settings)
+
+
+def _add_whole_steps(points: _Points) -> None:
+    """Take a step by the solver's function, and read what Newton's method and generalised-α keep."""
+    solver, mbs, settings, _container = _initialized(points, {"generalizedAlpha.spectralRadius": 0.7})
+    settings.timeIntegration.generalizedAlpha.computeInitialAccelerations = True
+    kept = list[Array]()
+
+    def after(mbs: Any, t: float) -> bool:
+        kept.append(np.array(solver.GetStartOfStepStateAAlgorithmic()))
+        return True
+
+    mbs.SetPostStepUserFunction(after)
+    solver.SolveSteps(mbs, settings)
+    mbs.SetPostStepUserFunction(0)
+    af, am = 0.7 / 1.7, 0.4 / 1.7
+    last = (2 * (1 - af) + af - am) / (1 - am)
+    gamma = 0.5 + af - am
+    beta = (gamma + 0.5) ** 2 / 4
+    points.add_results(
+        _names(IMPLICIT, "SolveSteps"), points.read(mbs), _factors(gamma, beta, forces=(1.0, last))
+    )
+    for name, value in (
+        ("GetStartOfStepStateAAlgorithmic", kept[-1]),
+        ("GetAAlgorithmic", np.array(solver.GetAAlgorithmic()) / last),
+        ("GetNewtonSolution", -np.array(solver.GetNewtonSolution()) / (2 * beta * (1 - af) / (1 - am))),
+    ):
+        points.add(_names(IMPLICIT, name), value.reshape(-1, 3))
+    solver.FinalizeSolver(mbs, settings)
+
+
+def _add_changed_newton(points: _Points) -> None:
+    """Let Newton's method end after one iteration, by what the solver keeps of its settings."""
+    solver, mbs, settings, _container = _initialized(points, NEWMARK, pull=PULL)
+    newton = solver.newton
+    newton.active = False
+    solver.newton = newton
+    solver.SolveSteps(mbs, settings)
+    solver.FinalizeSolver(mbs, settings)
+    last = 2.0 - PULL * (0.5 - 0.25)  # where the place was not changed by the last acceleration yet
+    factors = _factors(0.5, 0.25, forces=(1.0, last))
+    points.add_results(_names(IMPLICIT, "newton"), points.read(mbs), factors)
+
+
+def _add_changed_steps(points: _Points) -> None:
+    """Take a step of another size, and give the solver a mass matrix."""
+    for kind, options, by, reduced in (
+        (IMPLICIT, LINEAR, "InitializeStep Newton FinishStep", 0.5), (EXPLICIT, RUNGE_KUTTA, "", 1.0),
+    ):  # fmt: skip
+        for name, start, end, arguments in (
+            ("ReduceStepSize", 1.0, reduced, (1,)), ("IncreaseStepSize", 0.25, 0.5, ()),
+        ):  # fmt: skip
+            solver, mbs, settings, _container = _initialized(points, options, kind)
+            solver.it.currentStepSize = start
+            getattr(solver, name)(mbs, settings, *arguments)
+            solver.UpdateCurrentTime(mbs, settings)
+            solver.InitializeStep(mbs, settings)
+            solver.Newton(mbs, settings)
+            solver.FinishStep(mbs, settings)
+            points.add_results(_names(kind, f"{name} {by}"), points.read(mbs), _exact(end))
+            solver.FinalizeSolver(mbs, settings)
+        solver, mbs, settings, _container = _initialized(points, options, kind)
+        solver.SetSystemMassMatrix(np.diag(points.places.ravel()))
+        places = np.diag(solver.GetSystemMassMatrix()).reshape(-1, 3)
+        points.add(_names(kind, "SetSystemMassMatrix"), places)
+        solver.FinalizeSolver(mbs, settings)
+
+
+def _add_own_functions(points: _Points) -> None:
+    """Take a step of which functions in Python are parts."""
+    at_end = list[tuple[Array, Array]]()
+    masses = np.repeat(points.mass, 3)
+
+    def add(**functions: Callable[..., Any]) -> None:
+        solver, mbs, settings, _container = _initialized(points, LINEAR)
+        for name, function in functions.items():
+            getattr(solver, f"SetUserFunction{name}")(mbs, function)
+        solver.SolveSteps(mbs, settings)
+        solver.FinalizeSolver(mbs, settings)
+        found = at_end[-1] if "FinishStep" in functions else points.read(mbs)
+        points.add_results(
+            _names(IMPLICIT, " ".join(f"SetUserFunction{x}" for x in functions if x != "PostNewton")),
+            found,
+            EXACT,
+        )
+
+    def set_time(solver: Any, mbs: Any, settings: Any) -> bool:
+        solver.it.currentTime = solver.it.currentStepIndex * solver.it.currentStepSize
+        return True
+
+    def begin(solver: Any, mbs: Any, settings: Any) -> bool:
+        solver.UpdateCurrentTime(mbs, settings)
+        mbs.systemData.SetTime(solver.it.currentTime)
+        return True
+
+    def finish(solver: Any, mbs: Any, settings: Any) -> bool:
+        at_end.append(points.read(mbs))
+        return True
+
+    def newton(solver: Any, mbs: Any, settings: Any) -> bool:
+        data = mbs.systemData
+        before = np.array(data.GetODE2Coordinates_tt())
+        solver.ComputeODE2RHS(mbs)
+        after = np.array(solver.GetSystemResidual()) / masses
+        data.SetODE2Coordinates(before / 3 + after / 6)
+        data.SetODE2Coordinates_t(before / 2 + after / 2)
+        return True
+
+    def update(solver: Any, mbs: Any, settings: Any, initial: bool) -> bool:
+        data, beta, gamma = mbs.systemData, solver.newmarkBeta, solver.newmarkGamma
+        q, v, a = (np.array(getattr(data, f"GetODE2Coordinates{x}")()) for x in ("", "_t", "_tt"))
+        change = np.array(solver.GetNewtonSolution())
+        q, v, a = (
+            (v + (0.5 - beta) * a, v + (1 - gamma) * a, 0 * a) if initial
+            else (q - change, v - gamma / beta * change, a - change / beta)
+        )  # fmt: skip
+        for end, value in (("", q), ("_t", v), ("_tt", a)):
+            getattr(data, f"SetODE2Coordinates{end}")(value)
+        return True
+
+    def residual(solver: Any, mbs: Any, settings: Any) -> float:
+        solver.ComputeODE2RHS(mbs)  # which writes the force, of the other sign
+        return 0.0 if np.any(mbs.systemData.GetODE2Coordinates_tt()) else 1.0
+
+    def jacobian(solver: Any, mbs: Any, settings: Any) -> bool:
+        solver.SetSystemJacobian(np.diag(-masses / solver.newmarkBeta))
+        return True
+
+    def post(solver: Any, mbs: Any, settings: Any) -> float:
+        return 0.0  # without it ComputeNewtonResidual fails: docs/surface/exudyn_post_newton_function.py
+
+    add(UpdateCurrentTime=set_time)
+    add(InitializeStep=begin)
+    add(FinishStep=finish)
+    add(Newton=newton)
+    add(ComputeNewtonUpdate=update)
+    add(ComputeNewtonResidual=residual, ComputeNewtonJacobian=jacobian, PostNewton=post)
+
+
+def _add_initialisation(points: _Points) -> None:
+    """Initialise an explicit solver, and call the parts of it again."""
+    solver, mbs, settings, _container = _initialized(points, RUNGE_KUTTA, EXPLICIT)
+    solver.InitializeSolverPreChecks(mbs, settings)
+    for part in (one for one in INITIALISATION if one != "InitializeSolverOutput"):
+        getattr(solver, part)(mbs, settings)
+    solver.SolveSteps(mbs, settings)
+    solver.FinalizeSolver(mbs, settings)
+    names = "InitializeSolverPreChecks", *INITIALISATION
+    own = " ".join(name for name in names if name != "InitializeSolverOutput")
+    points.add_results(_names(EXPLICIT, own), points.read(mbs), EXACT)
+
+
+def _add_stored(points: _Points) -> None:
+    """Read the velocities after a step from what sensors stored."""
+    mbs, _container = points.system()
+    velocity = {"outputVariableType": Output.Velocity, "writeToFile": False, "storeInternal": True}
+    nodes = range(points.count)
+    sensors = [mbs.AddSensor(items.SensorNode(nodeNumber=node, **velocity)) for node in nodes]
+    mbs.Assemble()
+    settings = _settings(LINEAR)
+    settings.solution.sensors.active = True
+    _solve(exudyn.MainSolverImplicitSecondOrder(), mbs, settings)
+    stored = np.array([mbs.GetSensorStoredData(sensor)[-1] for sensor in sensors])  # time and values
+    points.add(("MainSystem.GetSensorStoredData",), stored[:, 1:] / EXACT[1])
+
+
+def _add_held(points: _Points) -> None:
+    """Hold a point beside each, which is pushed as much, by the constraint of its coordinates."""
+    mbs, _container = make_system()
+    ground = mbs.AddNode(items.NodePointGround())
+    fixed = mbs.AddMarker(items.MarkerNodeCoordinate(nodeNumber=ground, coordinate=0))
+    for is_held in (False, True):
+        for place, mass in zip(points.places, points.mass, strict=True):
+            node = mbs.AddNode(items.NodePoint())
+            mbs.AddObject(items.ObjectMassPoint(nodeNumber=node, mass=float(mass)))
+            push = {"loadVector": (mass * place).tolist()}
+            marker = mbs.AddMarker(items.MarkerNodePosition(nodeNumber=node))
+            mbs.AddLoad(items.LoadForceVector(markerNumber=marker, **push))
+            for i in range(3 * is_held):
+                own = mbs.AddMarker(items.MarkerNodeCoordinate(nodeNumber=node, coordinate=i))
+                mbs.AddObject(items.CoordinateConstraint(markerNumbers=[fixed, own]))
+    mbs.Assemble()
+    settings = _settings({})
+    solver: Any = exudyn.MainSolverImplicitSecondOrder()
+    settings.timeIntegration.generalizedAlpha.storeInitialAlgebraicCoordinates = True
+    solver.InitializeSolver(mbs, settings)
+    force = np.array(mbs.systemData.GetAECoordinates()).reshape(-1, 3)
+    call = ("GeneralizedAlphaSettings.storeInitialAlgebraicCoordinates", "itemInterface.CoordinateConstraint")
+    points.add(call, force / points.mass[:, None])
+    solver.FinalizeSolver(mbs, settings)
+    _solve(exudyn.MainSolverExplicit(), mbs, _settings(RUNGE_KUTTA | {"explicit.eliminateConstraints": True}))
+    velocities = np.array(mbs.systemData.GetODE2Coordinates_t()).reshape(2, -1, 3)
+    call = "ExplicitIntegrationSettings.eliminateConstraints", "itemInterface.CoordinateConstraint"
+    points.add(call, np.sum(velocities, axis=0))
+
+
+PARTS: Sequence[Callable[[_Points], None]] = (
+    _add_adaptive_steps, _add_automatic_steps, _add_parts_of_a_step, _add_whole_steps, _add_changed_newton,
+    _add_changed_steps, _add_own_functions, _add_initialisation, _add_stored, _add_held,
+)  # fmt: skip
+
+
+def _add_turns(record: SurfaceRecord, state: State) -> None:
+    """Turn spheres by a second, from where they come to the attitudes of the bodies, by Lie group nodes."""
+    before = [quaternion_product(p, quaternion_exponential(-TURN / 2)) for p in state.p]
+    simplified = "GeneralizedAlphaSettings.lieGroupSimplifiedKinematicRelations"
+    for names, options in (
+        ((simplified, "GeneralizedAlphaSettings.lieGroupAddTangentOperator"),
+         {f"{LIE}SimplifiedKinematicRelations": True, f"{LIE}AddTangentOperator": True,
+          "linear solver": "EXUdense"}),
+        ((simplified,), {f"{LIE}SimplifiedKinematicRelations": False}),
+        (("ExplicitIntegrationSettings.useLieGroupIntegration",),
+         RUNGE_KUTTA | {"explicit.useLieGroupIntegration": True}),
+    ):  # fmt: skip
+        mbs, _container = make_system()
+        bodies = []
+        for p in before:
+            given = {"referenceCoordinates": [0.0, 0, 0, *rotation_vector(p)]}
+            node = mbs.AddNode(items.NodeRigidBodyRotVecLG(initialVelocities=[0.0, 0, 0, *TURN], **given))
+            bodies.append(mbs.AddObject(make_rigid_body(node, 1.0, np.eye(3))))
+        mbs.Assemble()
+        is_explicit = "solverType" in options
+        kind = exudyn.MainSolverExplicit if is_explicit else exudyn.MainSolverImplicitSecondOrder
+        _solve(kind(), mbs, _settings(options))
+        turns = [mbs.GetObjectOutputBody(body, Output.RotationMatrix, [0.0, 0, 0]) for body in bodies]
+        record.add_axes(names, np.array(turns).reshape(-1, 3, 3) @ rotation_matrix(PROBE_ATTITUDE))
