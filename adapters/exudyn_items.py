@@ -231,9 +231,9 @@ def _turn_about(values: Any) -> list[Array]:
     return list(rotation_matrix(np.concatenate([np.cos(half), np.sin(half) * AXES], axis=1)))
 
 
-def _axes_of_turns(s: _Items, call: Call, turns: Any) -> None:
-    """Add the axes of probe frames of bodies whose turns about x, y and z are given."""
-    s.add_axes(call, [x @ y @ z @ rotation_matrix(PROBE_ATTITUDE) for x, y, z in turns])
+def _probe_axes(turns: Any) -> list[Array]:
+    """The attitudes of probe frames of bodies whose turns about x, y and z are given."""
+    return [x @ y @ z @ rotation_matrix(PROBE_ATTITUDE) for x, y, z in turns]
 
 
 def _angles(one: Body) -> Array:
@@ -256,7 +256,7 @@ def _add_rotors(body_kind: str) -> Callable[..., None]:
         turns = [s.of_body(rotor, "RotationMatrix").reshape(3, 3) for rotor in rotors]
         own = np.reshape([turn @ frame.T for turn, frame in zip(turns, frames * len(bodies), strict=True)],
                          (-1, 3, 3, 3))  # fmt: skip
-        _axes_of_turns(s, call, own)
+        s.add_axes(call, _probe_axes(own))
         spins = np.reshape([s.of_body(rotor, "AngularVelocity") for rotor in rotors], (-1, 3, 3))
         s.add("frame_angular_velocity", call, np.sum(spins, axis=1))
         momenta = np.reshape(_momenta(s, rotors), (-1, 3))
@@ -307,7 +307,7 @@ def _add_plane_bodies(node_kind: str, body_kind: str, turning: str, sliding: str
             momenta[k, plane] += momentum[:2] / bodies[k].mass
             spun[k, axis] = momentum[2] / inertia
         call, by = _call(node_kind, body_kind), "MainSystem.ComputeItem"
-        _axes_of_turns(s, call, turns)
+        s.add_axes(call, _probe_axes(turns))
         s.add("frame_position", call, place)
         s.add("frame_velocity", call, velocity)
         s.add("frame_angular_velocity", call, spins)
@@ -444,7 +444,8 @@ def _add_relative_markers(s: _Items, bodies: Sequence[Body], anchor: Array) -> N
         )
         s.add(turned, call, rate)
         if moved == "axes":
-            _axes_of_turns(s, call, [_turn_about(angles) for angles in place])
+            turns = _probe_axes([_turn_about(angles) for angles in place])
+            s.add("frame_axes_by_angles", call, np.reshape(np.array(turns).mT, (-1, 3)))
         elif moved:
             s.add(moved, (*call, "OutputVariableType.Displacement"), place)
 

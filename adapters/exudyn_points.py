@@ -418,74 +418,79 @@ def _add_changed_steps(points: _Points) -> None:
 
 
 def _add_own_functions(points: _Points) -> None:
-    """Take a step of which functions in Python are parts."""
-    at_end = list[tuple[Array, Array]]()
-    masses = np.repeat(points.mass, 3)
+    """Take steps of which functions in Python are parts."""
+    ends, masses = list[tuple[Array, Array]](), np.repeat(points.mass, 3)
 
-    def add(**functions: Callable[..., Any]) -> None:
+    def finish(solver: Any, mbs: Any, settings: Any) -> bool:
+        ends.append(points.read(mbs))
+        return True
+
+    def accept(*_: Any) -> float:
+        return 0.0
+
+    equation = {
+        "ComputeNewtonResidual": _own_residual,
+        "ComputeNewtonJacobian": partial(_own_jacobian, masses),
+    }
+    for functions in (
+        {"UpdateCurrentTime": _own_time}, {"InitializeStep": _own_begin}, {"FinishStep": finish},
+        {"Newton": partial(_own_newton, masses)}, {"ComputeNewtonUpdate": _own_update},
+        # without PostNewton the residual fails: docs/surface/exudyn_post_newton_function.py
+        {**equation, "PostNewton": accept},
+    ):  # fmt: skip
         solver, mbs, settings, _container = _initialized(points, LINEAR)
         for name, function in functions.items():
             getattr(solver, f"SetUserFunction{name}")(mbs, function)
         solver.SolveSteps(mbs, settings)
         solver.FinalizeSolver(mbs, settings)
-        found = at_end[-1] if "FinishStep" in functions else points.read(mbs)
-        points.add_results(
-            _names(IMPLICIT, " ".join(f"SetUserFunction{x}" for x in functions if x != "PostNewton")),
-            found,
-            EXACT,
-        )
+        found = ends[-1] if "FinishStep" in functions else points.read(mbs)
+        names = " ".join(f"SetUserFunction{name}" for name in functions if name != "PostNewton")
+        points.add_results(_names(IMPLICIT, names), found, EXACT)
 
-    def set_time(solver: Any, mbs: Any, settings: Any) -> bool:
-        solver.it.currentTime = solver.it.currentStepIndex * solver.it.currentStepSize
-        return True
 
-    def begin(solver: Any, mbs: Any, settings: Any) -> bool:
-        solver.UpdateCurrentTime(mbs, settings)
-        mbs.systemData.SetTime(solver.it.currentTime)
-        return True
+def _own_time(solver: Any, mbs: Any, settings: Any) -> bool:
+    solver.it.currentTime = solver.it.currentStepIndex * solver.it.currentStepSize
+    return True
 
-    def finish(solver: Any, mbs: Any, settings: Any) -> bool:
-        at_end.append(points.read(mbs))
-        return True
 
-    def newton(solver: Any, mbs: Any, settings: Any) -> bool:
-        data = mbs.systemData
-        before = np.array(data.GetODE2Coordinates_tt())
-        solver.ComputeODE2RHS(mbs)
-        after = np.array(solver.GetSystemResidual()) / masses
-        data.SetODE2Coordinates(before / 3 + after / 6)
-        data.SetODE2Coordinates_t(before / 2 + after / 2)
-        return True
+def _own_begin(solver: Any, mbs: Any, settings: Any) -> bool:
+    solver.UpdateCurrentTime(mbs, settings)
+    mbs.systemData.SetTime(solver.it.currentTime)
+    return True
 
-    def update(solver: Any, mbs: Any, settings: Any, initial: bool) -> bool:
-        data, beta, gamma = mbs.systemData, solver.newmarkBeta, solver.newmarkGamma
-        q, v, a = (np.array(getattr(data, f"GetODE2Coordinates{x}")()) for x in ("", "_t", "_tt"))
-        change = np.array(solver.GetNewtonSolution())
-        q, v, a = (
-            (v + (0.5 - beta) * a, v + (1 - gamma) * a, 0 * a) if initial
-            else (q - change, v - gamma / beta * change, a - change / beta)
-        )  # fmt: skip
-        for end, value in (("", q), ("_t", v), ("_tt", a)):
-            getattr(data, f"SetODE2Coordinates{end}")(value)
-        return True
 
-    def residual(solver: Any, mbs: Any, settings: Any) -> float:
-        solver.ComputeODE2RHS(mbs)  # which writes the force, of the other sign
-        return 0.0 if np.any(mbs.systemData.GetODE2Coordinates_tt()) else 1.0
+def _own_newton(masses: Array, solver: Any, mbs: Any, settings: Any) -> bool:
+    data = mbs.systemData
+    before = np.array(data.GetODE2Coordinates_tt())
+    solver.ComputeODE2RHS(mbs)
+    after = np.array(solver.GetSystemResidual()) / masses
+    data.SetODE2Coordinates(before / 3 + after / 6)
+    data.SetODE2Coordinates_t(before / 2 + after / 2)
+    return True
 
-    def jacobian(solver: Any, mbs: Any, settings: Any) -> bool:
-        solver.SetSystemJacobian(np.diag(-masses / solver.newmarkBeta))
-        return True
 
-    def post(solver: Any, mbs: Any, settings: Any) -> float:
-        return 0.0  # without it ComputeNewtonResidual fails: docs/surface/exudyn_post_newton_function.py
+def _own_update(solver: Any, mbs: Any, settings: Any, initial: bool) -> bool:
+    data, beta, gamma = mbs.systemData, solver.newmarkBeta, solver.newmarkGamma
+    q, v, a = (np.array(getattr(data, f"GetODE2Coordinates{x}")()) for x in ("", "_t", "_tt"))
+    change = np.array(solver.GetNewtonSolution())
+    ends = (
+        (v + (0.5 - beta) * a, v + (1 - gamma) * a, 0 * a)
+        if initial
+        else (q - change, v - gamma / beta * change, a - change / beta)
+    )
+    for name, value in zip(("", "_t", "_tt"), ends, strict=True):
+        getattr(data, f"SetODE2Coordinates{name}")(value)
+    return True
 
-    add(UpdateCurrentTime=set_time)
-    add(InitializeStep=begin)
-    add(FinishStep=finish)
-    add(Newton=newton)
-    add(ComputeNewtonUpdate=update)
-    add(ComputeNewtonResidual=residual, ComputeNewtonJacobian=jacobian, PostNewton=post)
+
+def _own_residual(solver: Any, mbs: Any, settings: Any) -> float:
+    solver.ComputeODE2RHS(mbs)  # which writes the force, of the other sign
+    return 0.0 if np.any(mbs.systemData.GetODE2Coordinates_tt()) else 1.0
+
+
+def _own_jacobian(masses: Array, solver: Any, mbs: Any, settings: Any) -> bool:
+    solver.SetSystemJacobian(np.diag(-masses / solver.newmarkBeta))
+    return True
 
 
 def _add_initialisation(points: _Points) -> None:

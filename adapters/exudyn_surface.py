@@ -128,7 +128,7 @@ OUTPUTS = [
     for name, output in (
         ("Position", _Output("frame_position", "body_position", True)),
         ("RotationMatrix", _Output("frame_axes", "frame_axes", True, _axes)),
-        ("Rotation", _Output("frame_axes", "frame_axes", True, _axes_of_angles)),
+        ("Rotation", _Output("frame_axes_by_angles", "frame_axes_by_angles", True, _axes_of_angles)),
         ("Velocity", _Output("frame_velocity", "body_velocity", True)),
         ("VelocityLocal", _Output("frame_velocity_local", read=_in_probe_axes)),
         ("AngularVelocity", _Output("frame_angular_velocity", "frame_angular_velocity", True)),

@@ -3,7 +3,7 @@
     python -m plumbline.studies.exercised_names [ENGINE ...] > adapters/surface/exercised.json
 
 computes it for all engines with a surface, on `MECHANISMS`; the file's entries of other engines stay.
-docs/surface.md is made from it.  All columns of an engine are asked, by single steps too.
+The pages docs/surface/ENGINE.md are made from it.  All columns of an engine are asked, by single steps too.
 """
 
 from __future__ import annotations

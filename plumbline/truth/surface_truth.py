@@ -191,6 +191,13 @@ def _frame_axes(motion: Motion) -> Rounded:
     return Rounded(columns, np.repeat(motion.of_turn, 3), ones)
 
 
+def _frame_axes_by_angles(motion: Motion) -> Rounded:
+    """By angles about x, y and z of the bodies; the outer two lose digits where the middle is near ±90°."""
+    lost = np.repeat(1 / np.sqrt(np.maximum(1 - motion.attitude[:, 0, 2] ** 2, EPS)), 3)
+    axes = _frame_axes(motion)
+    return Rounded(axes.value, lost * axes.error, lost * axes.size)
+
+
 def _from_anchor(motion: Motion) -> Rounded:
     place = np.broadcast_to(anchor_point(motion.model), (motion.model.n, 3))
     return motion.point.minus(Rounded(place, motion.exact, np.linalg.norm(place, axis=-1)))
@@ -320,6 +327,7 @@ _FORMULAS: Mapping[str, tuple[str, Callable[[Motion], Rounded]]] = {
     "body_acceleration": ("m/s²", lambda m: m.a),
     "frame_position": ("m", lambda m: m.point),
     "frame_axes": ("1", _frame_axes),
+    "frame_axes_by_angles": ("1", _frame_axes_by_angles),
     "frame_velocity": ("m/s", lambda m: m.point_velocity),
     "frame_velocity_local": ("m/s", lambda m: m.local(m.point_velocity)),
     "frame_velocity_at_origin": ("m/s", lambda m: _at_origin(m, m.point_velocity, m.w)),

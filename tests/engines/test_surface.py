@@ -14,7 +14,7 @@ from plumbline.engines.surface import (
     exercised_rows,
     installed_names,
 )
-from plumbline.engines.surface_page import surface_page
+from plumbline.engines.surface_page import surface_pages
 from plumbline.execution.runner import compare_surfaces
 from plumbline.model.datatypes import EngineFailure
 from plumbline.processes.worker_pool import WorkerPool
@@ -71,6 +71,23 @@ def test_a_wrong_declaration_is_refused(places, message, tmp_path, monkeypatch):
         declared_surface.__wrapped__("m")
 
 
-def test_the_page_is_up_to_date():
-    written = (ROOT / "docs" / "surface.md").read_text(encoding="utf-8")
-    assert written == surface_page(), "run: python -m plumbline.engines.surface_page > docs/surface.md"
+@pytest.mark.parametrize("path", sorted(surface_pages()))
+def test_the_pages_are_up_to_date(path):
+    written = (ROOT / "docs" / path).read_text(encoding="utf-8")
+    assert written == surface_pages()[path], "run: python -m plumbline.engines.surface_page"
+
+
+@pytest.mark.parametrize("engine", SURFACES)
+def test_an_engine_s_page_has_each_name_once_under_its_place(engine):
+    page, surface = surface_pages()[f"surface/{engine}.md"], declared_surface(engine)
+    sections = dict(part.partition("\n")[::2] for part in page.split("\n## ")[1:])
+    for one in surface.names:
+        words = f"`{one.name.rpartition('.')[2]}`"
+        expected = int(one.status != "not about motion")
+        assert sections[one.place].count(words) == expected, f"{one.place}: {words}"
+
+
+def test_each_engine_exercises_most_of_what_is_not_outside():
+    for engine in SURFACES:
+        counts = declared_surface(engine).counts()
+        assert len(exercised_rows(engine)) >= 0.9 * (counts["compared"] + counts["not yet"]), engine

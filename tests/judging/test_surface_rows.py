@@ -18,7 +18,7 @@ from plumbline.judging.findings import find_findings
 from plumbline.judging.rows import RowContext, Verdict
 from plumbline.judging.state_level import judge_variants
 from plumbline.judging.surface_rows import judge_surface
-from plumbline.model.kinematics import quaternion_product, rotation_matrix
+from plumbline.model.kinematics import complete_state, quaternion_product, rotation_matrix
 from plumbline.model.random_mechanisms import random_tree
 from plumbline.model.sampling import compared_states, random_states
 from plumbline.scenario.loader import load_scenarios
@@ -53,9 +53,17 @@ def verdicts(truth, answers):
     return {row.quantity: row.verdict for row in rows}
 
 
-@pytest.mark.parametrize("engine", SURFACES)
-def test_every_call_agrees_and_a_relative_change_of_1e_6_is_seen(engine, tree):
-    model, states, truth = tree
+@pytest.fixture(scope="module")
+def few_bodies():
+    model, states = mechanism(("rod", "ball"), bodies=2)
+    return model, states, state_truth(model, states)
+
+
+@pytest.mark.parametrize(
+    ("engine", "given"), [*((name, "tree") for name in SURFACES), ("exudyn", "few_bodies")]
+)
+def test_every_call_agrees_and_a_relative_change_of_1e_6_is_seen(engine, given, request):
+    model, states, truth = request.getfixturevalue(given)
     answers = answers_of(engine, model, states)
     found = verdicts(truth, answers)
     wrong = {name for name, verdict in found.items() if verdict != Verdict.AGREES}
@@ -63,6 +71,24 @@ def test_every_call_agrees_and_a_relative_change_of_1e_6_is_seen(engine, tree):
     calls = {name for by_call in answers.values() for call in by_call for name in call}
     evaluation = Evaluation([], None, None, 0.0, surface=answers)
     assert set(exercised_names(truth, evaluation)) == calls
+
+
+def test_exudyns_solvers_and_items_are_compared_on_few_bodies(few_bodies):
+    model, states, truth = few_bodies
+    answers = answers_of("exudyn", model, states)
+    calls = {name for by_call in answers.values() for call in by_call for name in call}
+    assert {"NewtonSettings.residualMode", "SolveStatic", "itemInterface.RigidBody2D"} <= calls
+    assert "failed parts" not in answers and verdicts(truth, answers)["degrees_of_freedom"] == Verdict.AGREES
+    assert truth.surface["degrees_of_freedom"].value[0, 0, 0] == 3 * model.n + 2 * sum(model.rods)
+
+
+def test_angles_near_their_singularity_are_allowed_the_digits_that_they_lose():
+    model, states = mechanism(("ball",), bodies=1)
+    half = np.arcsin(1.0 - 1e-8) / 2  # the middle of three angles
+    state = replace(states[0], p=np.array([[np.cos(half), 0.0, np.sin(half), 0.0]]))
+    surface = state_truth(model, [complete_state(model, state)]).surface
+    lost = surface["frame_axes_by_angles"].tolerance / surface["frame_axes"].tolerance
+    assert np.all((lost > 5e3) & (lost < 1e4))
 
 
 @pytest.mark.parametrize("engine", ["pinocchio", "exudyn"])
