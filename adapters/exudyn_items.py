@@ -18,6 +18,7 @@ from adapters.exudyn_common import (
     Output,
     initialized_solver,
     items,
+    known_arguments,
     make_rigid_body,
     make_settings,
     make_system,
@@ -72,7 +73,8 @@ class _Items(SurfaceRecord):
         return self.mbs.AddNode(getattr(items, kind)(**given))
 
     def body(self, kind: str, node: Any, **given: Any) -> Any:
-        return self.mbs.AddObject(getattr(items, kind)(nodeNumber=node, **given))
+        sizes = sizes_of_body(**{name: given.pop(name) for name in ("mass", "inertia") if name in given})
+        return self.mbs.AddObject(getattr(items, kind)(nodeNumber=node, **sizes, **given))
 
     def object(self, kind: str, *markers: Any, **given: Any) -> Any:
         own = {"markerNumbers": list(markers)} if markers else {}
@@ -352,8 +354,12 @@ def _add_coordinate_constraints(s: _Items, bodies: Sequence[Body], anchor: Array
                 (f"{long}OffsetUserFunction_t", short, by_velocity),
             ):  # fmt: skip
                 made.setdefault(name, []).append(s.object(kind, fixed, marker, **given))
-            create = s.mbs.CreateCoordinateConstraint
-            joint = create(itemNumbers=[None, point], coordinates=[None, i], offset=place)
+            create, ends = exudyn.MainSystem.CreateCoordinateConstraint, [None, point]
+            names = known_arguments(
+                create, dict.fromkeys(("itemNumbers", "bodyOrNodeList", "bodyNumbers"), ends)
+            )
+            own = dict([*names.items()][:1])  # under the name of the version
+            joint = create(s.mbs, coordinates=[None, i], offset=place, **own)
             made.setdefault("created", []).append(joint)
     s.mbs.Assemble()
     what = "OutputVariableType.ConstraintEquation"
@@ -628,7 +634,8 @@ def _plucker_inertia(one: Body) -> Array:
 
 def _shapes(one: Body) -> dict[str, tuple[Any, Array]]:
     """Shapes about as large as a body, and their inertias by textbooks."""
-    m, a = one.mass, float(np.sqrt(np.trace(one.inertia) / (2 * one.mass)))
+    size = float(np.sqrt(np.trace(one.inertia) / (2 * one.mass)))
+    m, a = (one.mass, size) if size > 0 else (0.0, 1.0)  # points have shapes without mass
     make, inner, outer = utilities, 0.5 * a, 1.5 * a
     volume = 2 * a * np.pi * (outer**2 - inner**2)
     along, across = (outer**2 + inner**2) / 2, (outer**2 + inner**2) / 4 + a**2 / 3

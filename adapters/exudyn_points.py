@@ -23,7 +23,9 @@ from adapters.exudyn_common import (
     make_rigid_body,
     make_settings,
     make_system,
+    set_explicit_method,
     set_linear_solver,
+    sizes_of_body,
 )
 from adapters.exudyn_variants import INITIALISATION
 from adapters.surface_record import SurfaceRecord
@@ -151,7 +153,7 @@ class _Points:
 
         for k, mass in enumerate(self.mass):
             node = mbs.AddNode(items.NodePoint())
-            mbs.AddObject(items.ObjectMassPoint(nodeNumber=node, mass=float(mass)))
+            mbs.AddObject(items.ObjectMassPoint(nodeNumber=node, **sizes_of_body(mass=float(mass))))
             marker = mbs.AddMarker(items.MarkerNodePosition(nodeNumber=node))
             push = (self.mass[k] * self.places[k]).tolist()
             if spring is not None:
@@ -179,6 +181,25 @@ class _Points:
         self.add(names, (x + v) / 2)
 
 
+# Of options that versions name otherwise.
+SETTERS: Mapping[str, Callable[[Any, str], None]] = {
+    "linear solver": set_linear_solver, "solverType": set_explicit_method,
+    "explicitIntegration.dynamicSolverType": lambda settings, name: _set(
+        settings.timeIntegration, "explicitIntegration.dynamicSolverType",
+        getattr(exudyn.DynamicSolverType, name),
+    ),
+}  # fmt: skip
+
+
+def _set(owner: Any, path: str, value: Any) -> None:
+    """Set an attribute, by a path from an owner."""
+    *rest, last = path.split(".")
+    for name in rest:
+        owner = getattr(owner, name)
+    getattr(owner, last)  # a version that lacks it says so by its name
+    setattr(owner, last, value)
+
+
 def _settings(options: Mapping[str, Any]) -> Any:
     """Make settings of one step of 1 s; deprecated names of options are options, too."""
     settings = make_settings()
@@ -186,14 +207,10 @@ def _settings(options: Mapping[str, Any]) -> Any:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         for path, value in options.items():
-            if path == "linear solver":
-                set_linear_solver(settings, value)
-                continue
-            owner, (*rest, last) = settings.timeIntegration, path.split(".")
-            for name in rest:
-                owner = getattr(owner, name)
-            kind = last.endswith("olverType")
-            setattr(owner, last, getattr(exudyn.DynamicSolverType, value) if kind else value)
+            if path in SETTERS:
+                SETTERS[path](settings, value)
+            else:
+                _set(settings.timeIntegration, path, value)
     return settings
 
 
@@ -246,8 +263,7 @@ def _add_root(points: _Points, names: Any, options: Mapping[str, Any]) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         for path, value in options.items():
-            *owner, last = path.split(".")
-            setattr(getattr(newton, owner[0]) if owner else newton, last, value)
+            _set(newton, path, value)
     settings.staticSolver.verboseMode = 0
     mbs.SolveStatic(settings)
     points.add(names, points.read(mbs)[0])
@@ -384,7 +400,7 @@ def _add_changed_newton(points: _Points) -> None:
     """Let Newton's method end after one iteration, by what the solver keeps of its settings."""
     solver, mbs, settings, _container = _initialized(points, NEWMARK, pull=PULL)
     newton = solver.newton
-    newton.active = False
+    _set(newton, "active", False)
     solver.newton = newton
     solver.SolveSteps(mbs, settings)
     solver.FinalizeSolver(mbs, settings)
@@ -528,7 +544,7 @@ def _add_held(points: _Points) -> None:
     for is_held in (False, True):
         for place, mass in zip(points.places, points.mass, strict=True):
             node = mbs.AddNode(items.NodePoint())
-            mbs.AddObject(items.ObjectMassPoint(nodeNumber=node, mass=float(mass)))
+            mbs.AddObject(items.ObjectMassPoint(nodeNumber=node, **sizes_of_body(mass=float(mass))))
             push = {"loadVector": (mass * place).tolist()}
             marker = mbs.AddMarker(items.MarkerNodePosition(nodeNumber=node))
             mbs.AddLoad(items.LoadForceVector(markerNumber=marker, **push))
@@ -538,7 +554,7 @@ def _add_held(points: _Points) -> None:
     mbs.Assemble()
     settings = _settings({})
     solver: Any = exudyn.MainSolverImplicitSecondOrder()
-    settings.timeIntegration.generalizedAlpha.storeInitialAlgebraicCoordinates = True
+    _set(settings.timeIntegration, "generalizedAlpha.storeInitialAlgebraicCoordinates", True)
     solver.InitializeSolver(mbs, settings)
     force = np.array(mbs.systemData.GetAECoordinates()).reshape(-1, 3)
     call = ("GeneralizedAlphaSettings.storeInitialAlgebraicCoordinates", "itemInterface.CoordinateConstraint")
