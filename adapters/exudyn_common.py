@@ -182,7 +182,7 @@ class _StepRecorder(Generic[Sample]):
         self, sampled_steps: set[int], read_sample: Callable[[], Sample], check_step: Callable[[float], None]
     ) -> None:
         self.sampled_steps, self.read_sample, self.check_step = sampled_steps, read_sample, check_step
-        self.samples = [read_sample()]
+        self.samples, self.clock = [read_sample()], [0.0]
         self.taken = 0
         self.error: Exception | None = None
 
@@ -195,6 +195,7 @@ class _StepRecorder(Generic[Sample]):
             self.check_step(t)
             if self.taken in self.sampled_steps:
                 self.samples.append(self.read_sample())
+                self.clock.append(t)
         except Exception as error:  # Exudyn would wrap it in one of its own
             self.error = error
         return self.error is None
@@ -208,7 +209,7 @@ def run_solver(
     step: float,
     read_sample: Callable[[], Sample],
     check_step: Callable[[float], None] = lambda _: None,
-) -> list[Sample]:
+) -> tuple[list[Sample], Float[Array, "samples"]]:
     """Run a solver in fixed steps.
 
     Args:
@@ -220,7 +221,7 @@ def run_solver(
         check_step: called with the time after every step; may raise.
 
     Returns:
-        The samples at ``times``.
+        The samples at ``times``, and their times [s] by the engine's own clock.
 
     Raises:
         EngineFailure: a step failed, or the number of steps or the final time is not what was requested
@@ -230,7 +231,7 @@ def run_solver(
     steps = round(float(times[-1] / step))
     recorder = _StepRecorder(set(np.rint(times / step).astype(int).tolist()), read_sample, check_step)
     if steps == 0:
-        return recorder.samples
+        return recorder.samples, np.array(recorder.clock)
     mbs.SetPostStepUserFunction(recorder.after_step)
     settings.timeIntegration.numberOfSteps = steps
     settings.timeIntegration.endTime = float(times[-1])
@@ -249,7 +250,7 @@ def run_solver(
             f"Exudyn stopped at t = {end} s after {recorder.taken} steps, "
             f"asked for {steps} to {times[-1]} s: {message}"
         )
-    return recorder.samples
+    return recorder.samples, np.array(recorder.clock)
 
 
 # -- calls that differ between versions --------------------------------------------------------------

@@ -396,16 +396,16 @@ class Exudyn(ExudynAdapter):
     ) -> Trajectory:
         with silence_engine():
             chain = _chain_that_moves(model, state)
-            samples = self._run_samples(chain, times, integrator, resolution)
-        return _trajectory(model, state, times, samples, resolution)
+            samples, clock = self._run_samples(chain, times, integrator, resolution)
+        return _trajectory(model, state, clock, samples, resolution)
 
     def _step(self, model: Model, state: State, times: Array, integrator: Integrator, step: float) -> StepRun:
         with silence_engine():
             chain = _chain_that_moves(model, state)
-            samples = self._run_samples(chain, times, integrator, step, is_exact=True)
+            samples, clock = self._run_samples(chain, times, integrator, step, is_exact=True)
         shape = len(times), model.n, -1
         acceleration, multipliers = (np.array([x[i] for x in samples]).reshape(shape) for i in (2, 3))
-        return StepRun(_trajectory(model, state, times, samples, step), acceleration, multipliers)
+        return StepRun(_trajectory(model, state, clock, samples, step), acceleration, multipliers)
 
     def _simulate_round_trip(
         self, model: Model, state: State, end: float, integrator: Integrator, resolution: float
@@ -414,13 +414,15 @@ class Exudyn(ExudynAdapter):
         with silence_engine():
             chain = _chain_that_moves(model, state)
             data = chain.mbs.systemData
-            there = self._run_samples(chain, leg, integrator, resolution)
+            there, _ = self._run_samples(chain, leg, integrator, resolution)
             q, qdot, qddot, _ = there[-1]
             data.SetODE2Coordinates(q, initial)
             data.SetODE2Coordinates_t(-qdot, initial)
             data.SetODE2Coordinates_tt(qddot, initial)  # carried from step to step: a part of its state
             data.SetTime(0.0, initial)
-            back = self._run_samples(chain, leg, integrator, resolution, compute_initial_accelerations=False)
+            back, _ = self._run_samples(
+                chain, leg, integrator, resolution, compute_initial_accelerations=False
+            )
         return _trajectory(model, state, np.array([0.0, end, 2 * end]), [*there, back[-1]], resolution)
 
     def _run_samples(
@@ -431,8 +433,8 @@ class Exudyn(ExudynAdapter):
         step: float,
         compute_initial_accelerations: bool = True,
         is_exact: bool = False,
-    ) -> list[tuple[Array, ...]]:
-        """Return displacements, rates and accelerations (7N,) and multipliers at ``times``.
+    ) -> tuple[list[tuple[Array, ...]], Array]:
+        """Return displacements, rates and accelerations (7N,) and multipliers at ``times``; and the clock's.
 
         Args:
             is_exact: whether Newton's iterations are full ones to `STEP_SETTINGS`.
@@ -487,14 +489,14 @@ def _chain_that_moves(model: Model, state: State) -> ExudynChain:
 
 
 def _trajectory(
-    model: Model, state: State, times: Array, samples: list[tuple[Array, ...]], step: float
+    model: Model, state: State, clock: Array, samples: list[tuple[Array, ...]], step: float
 ) -> Trajectory:
     """Add the displacements of a run to its initial state."""
     start = np.concatenate([state.r, state.p], axis=1)
     q = start + np.array([sample[0] for sample in samples]).reshape(-1, model.n, 7)
     qdot = np.array([sample[1] for sample in samples]).reshape(-1, model.n, 7)
-    steps = round(float(times[-1] / step))
-    return Trajectory(times.copy(), q[..., :3], q[..., 3:], qdot[..., :3], qdot[..., 3:], steps)
+    steps = round(float(clock[-1] / step))
+    return Trajectory(clock, q[..., :3], q[..., 3:], qdot[..., :3], qdot[..., 3:], steps)
 
 
 def _evaluate_state(chain: ExudynChain) -> StateQuantities:

@@ -511,14 +511,14 @@ class ExudynTree(ExudynAdapter):
             settings = _settings(integrator.name)
             set_linear_solver(settings, self.option or self.usual_linear_solver)
             solver = exudyn.MainSolverExplicit()
-            samples = run_solver(
+            samples, clock = run_solver(
                 solver, tree.mbs, settings, times, resolution, tree.read_sample, tree.check_singularity
             )
         angles, rates, r, v, omega = (np.array(column) for column in zip(*samples, strict=True))
         p = tree.quaternions_at(angles)
         steps, own = round(float(times[-1] / resolution)), {"velocities": rates}
         own["coordinates"] = angles + tree.linkage.start
-        return Trajectory(times.copy(), r, p, v, quaternion_rate(p, omega), steps, **own)
+        return Trajectory(clock, r, p, v, quaternion_rate(p, omega), steps, **own)
 
     def _step(self, model: Model, state: State, times: Array, integrator: Integrator, step: float) -> StepRun:
         groups = _Linkage(model, state).revolute_groups

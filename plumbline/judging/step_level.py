@@ -25,6 +25,7 @@ from plumbline.truth.step_comparison import (
     StepDeviations,
     compare_parts,
     constrained_deviations,
+    constrained_samples,
     joined,
     step_counts,
 )
@@ -191,6 +192,7 @@ def _run_rows(
     if isinstance(method, ConstrainedMethod):
         parts = constrained_deviations(method, model, run, h)
         found = {f"run_{name}": joined(some) for name, some in parts.items()}
+        found["run_samples"] = constrained_samples(run, state, h)
     elif not keeps_dependent_rows(model, state):
         return one(Verdict.INFORMATION, OPEN_ROWS)
     elif run.trajectory.coordinates is None:

@@ -897,18 +897,10 @@ class RunSteps(StepsFromSamples):
 
     def _samples(self) -> StepDeviations:
         """Samples against the coordinates, the first against the given state, and the times."""
-        motion, given = self.motion, self.state
-        count = np.arange(len(motion.t))
-        off = _differences(self.here, motion, slice(None))
-        ratios = [np.linalg.norm(x, axis=-1) / self.of_samples[name] for name, x in off.items()]
-        for name, x in _differences(given, motion, 0).items():  # both are rounded
-            ratios.append(np.zeros_like(ratios[0]))
-            ratios[-1][0] = np.linalg.norm(x, axis=-1) / (2 * self.of_samples[name][0])
-        late = np.abs(motion.t - count * self.h)
-        clock = late / (CLOCK_ROUNDINGS * EPS * self.h * (1 + count) ** 2)
-        clock[-1] = np.inf if motion.steps != count[-1] else clock[-1]
-        worst = np.maximum(np.max(ratios, axis=0), clock[:, None])
-        return StepDeviations(worst, np.ones_like(worst), np.full_like(worst, np.inf))
+        off = _differences(self.here, self.motion, slice(None))
+        mapped = [np.linalg.norm(x, axis=-1) / self.of_samples[name] for name, x in off.items()]
+        of_start = {name: 2 * x[0] for name, x in self.of_samples.items()}  # both are rounded
+        return sample_deviations(self.motion, self.state, self.h, of_start, mapped)
 
     def differences_from(
         self, method: JointSpaceMethod, model: Model, run: StepRun, at: NDArray[np.intp]
@@ -934,6 +926,27 @@ class RunSteps(StepsFromSamples):
             for name, x in off.items()
         ]
         return np.array(padded)
+
+
+def sample_deviations(
+    motion: Trajectory, state: State, h: float, of_start: dict[str, Array], mapped: Sequence[Array] = ()
+) -> StepDeviations:
+    """Compare the first sample of a run with the given state, and the times and the number of steps.
+
+    Args:
+        state: that the engine was given.
+        h: step [s].
+        of_start: bounds (N,) of the first sample, by quantity of `STEP_QUANTITIES`.
+        mapped: how far samples (T, N) are off an engine's coordinates, in bounds.
+
+    """
+    count = np.arange(len(motion.t))
+    late = np.abs(motion.t - count * h) / (CLOCK_ROUNDINGS * EPS * h * (1 + count) ** 2)
+    late[-1] = np.inf if motion.steps != count[-1] else late[-1]
+    worst = np.max([np.broadcast_to(late[:, None], motion.r.shape[:2]), *mapped], axis=0)
+    for name, x in _differences(state, motion, 0).items():
+        worst[0] = np.maximum(worst[0], np.linalg.norm(x, axis=-1) / np.maximum(of_start[name], TINY))
+    return StepDeviations(worst, np.ones_like(worst), np.full_like(worst, np.inf))
 
 
 # -- constraints and an iterative solver -------------------------------------------------------------
@@ -1002,6 +1015,21 @@ def constrained_deviations(
     allowed = residual.factor * (allowed + STEP_ROUNDINGS * EPS * residual.size)
     columns = (x[:, None] for x in (residual.residual, allowed, residual.size))
     return found | {"equations": [StepDeviations(*columns)]}
+
+
+def constrained_samples(run: StepRun, state: State, h: float) -> StepDeviations:
+    """Compare a run's samples, times and number of steps with what was asked for, as `sample_deviations`.
+
+    The coordinates are those of the samples; the first ones are the state's own, and its rates are converted.
+    """
+    sizes = {
+        "step_position": np.linalg.norm(state.r, axis=-1),
+        "step_attitude": np.ones(len(state.r)),
+        "step_velocity": np.linalg.norm(state.v, axis=-1),
+        "step_rate": np.linalg.norm(state.omega, axis=-1),
+    }
+    of_start = {name: STEP_ROUNDINGS * EPS * size for name, size in sizes.items()}
+    return sample_deviations(run.trajectory, state, h, of_start)
 
 
 def quadrature_residuals(method: ConstrainedMethod, runs: Runs, has_loops: bool) -> Array:

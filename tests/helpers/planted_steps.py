@@ -210,8 +210,8 @@ def exudyn_defect(
                 setattr(options.timeIntegration.generalizedAlpha, attribute, value)
             if solver_type:
                 options.timeIntegration.solverType = getattr(exudyn.DynamicSolverType, solver_type)
-            samples = run_solver(solver, mbs, options, *more, **names)
-            return _requadrated(quadrature, samples, more[1]) if quadrature else samples
+            samples, clock = run_solver(solver, mbs, options, *more, **names)
+            return (_requadrated(quadrature, samples, more[1]) if quadrature else samples), clock
 
         return run
 

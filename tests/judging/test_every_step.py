@@ -112,17 +112,21 @@ def test_a_mistake_inside_a_run_is_named_with_its_condition(mistake):
     assert f"first in step {where.first_step} of a run" in found.text
 
 
-def test_the_given_state_the_times_and_the_number_of_steps_are_compared():
+@pytest.mark.parametrize(
+    ("engine", "name"), [("mujoco", "RK4"), ("exudyn", "generalized-alpha"), ("exudyn", "trapezoidal")]
+)
+def test_the_given_state_the_times_and_the_number_of_steps_are_compared(engine, name):
     model, states = subject("loaded-ball")
-    adapter = load_adapter("mujoco")
-    integrator = adapter.integrator("RK4")
-    right = type(adapter)._simulate
+    adapter = load_adapter(engine)
+    integrator = adapter.integrator(name)
+    right = type(adapter)._step
 
     def wrong(change):
-        def simulate(self, model, state, *arguments):
-            return change(right(self, model, state, *arguments))
+        def step(self, *arguments):
+            run = right(self, *arguments)
+            return replace(run, trajectory=change(run.trajectory))
 
-        return simulate
+        return step
 
     def late(run):
         return replace(run, t=run.t * (1 + 1e-11))
@@ -130,8 +134,16 @@ def test_the_given_state_the_times_and_the_number_of_steps_are_compared():
     def off_at_first(run):
         return replace(run, r=np.concatenate([run.r[:1] + 1e-13, run.r[1:]]))
 
-    for change in (late, off_at_first):
-        with patch.object(type(adapter), "_simulate", wrong(change)):
+    def faster(run):
+        return replace(run, v=np.concatenate([run.v[:1] * (1 + 1e-13), run.v[1:]]))
+
+    def one_less(run):
+        return replace(run, steps=run.steps - 1)
+
+    (honest,) = (r for r in rows_of(adapter, integrator, model, states) if r.quantity == "run_samples")
+    assert honest.verdict == Verdict.AGREES, honest.reason
+    for change in (late, off_at_first, faster, one_less):
+        with patch.object(type(adapter), "_step", wrong(change)):
             rows = rows_of(adapter, integrator, model, states)
         (row,) = [row for row in rows if row.quantity == "run_samples"]
         assert row.verdict == Verdict.DISAGREES, row.reason
