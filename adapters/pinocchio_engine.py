@@ -770,7 +770,12 @@ class Pinocchio(PinocchioAdapter):
             4,
             error_exponents=(4, 5, 6, 7, 8),
             note="Munthe-Kaas form of the classical Runge–Kutta method, on aba, integrate and dIntegrate",
-            method=classical_runge_kutta("joint rotations", ROD_AXIAL_INERTIA, "rigid motion", STABILISATION),
+            method=classical_runge_kutta(
+                "joint rotations",
+                ROD_AXIAL_INERTIA,
+                free_coordinates="rigid motion",
+                gap_correction=STABILISATION,
+            ),
         ),
         Integrator("dop853", "tolerance", 8, note="SciPy's DOP853 on (q, v) with crba and the tangent map"),
     )

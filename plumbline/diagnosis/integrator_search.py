@@ -345,17 +345,12 @@ def _with_weights(declared: JointSpaceMethod, i: int, j: int, x: float) -> Joint
 
 
 def _other_formulas(declared: JointSpaceMethod, model: Model) -> Iterator[tuple[str, JointSpaceMethod]]:
-    euler = JointSpaceMethod(
-        "semi-implicit Euler", declared.coordinates, declared.rod_axial_inertia,
-        free_coordinates=declared.free_coordinates, gap_correction=declared.gap_correction,
-        gap_form=declared.gap_form,
-    )  # fmt: skip
+    names_kept = ("rod_axial_inertia", "free_coordinates", "gap_correction", "gap_form", "holds_pitches")
+    kept = {name: getattr(declared, name) for name in names_kept}
+    euler = JointSpaceMethod("semi-implicit Euler", declared.coordinates, **kept)
     is_euler, turns = declared.formula == "semi-implicit Euler", declared.coordinates == "joint rotations"
     is_implicit, verlet = declared.implicit_forces != "none", replace(euler, formula="velocity Verlet")
-    classical = classical_runge_kutta(
-        declared.coordinates, declared.rod_axial_inertia, declared.free_coordinates,
-        declared.gap_correction, declared.gap_form,
-    )  # fmt: skip
+    classical = classical_runge_kutta(declared.coordinates, **kept)
     reused = "step, with the last acceleration of the step before in place of its first"
     names = [(f"rod {k + 1}",) * int(model.rods[k]) + (f"body {k + 1}",) for k in range(model.n)]
     moved = enumerate(itertools.chain.from_iterable(names) if is_euler else ())

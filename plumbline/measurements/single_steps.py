@@ -18,8 +18,9 @@ from plumbline.truth.step_formulas import fastest_rates, first_coordinate_accele
 
 STEP_SIZES = (0.01, 0.0237)  # s; large: a bound grows as h, the effect of a wrong formula faster
 MAX_STEP_RATE = 10.0  # rad/s; in faster motions the steps are smaller: explicit methods become unstable
-# rad/s, of loops: at the larger step gaps close by half as fast as h a = 1, where Euler's method rings
-LOOP_RATE = 2 * STABILISATION * MAX_STEP_RATE * STEP_SIZES[-1]
+# rad/s, of loops and held slides: at the larger step gaps close by half as fast as h a = 1, where Euler's
+# method rings
+GAP_RATE = 2 * STABILISATION * MAX_STEP_RATE * STEP_SIZES[-1]
 STEP_STATES = 5  # the initial state and random ones
 MAX_STEP_BODIES = 10  # of single steps
 RUN_STEP_SHARE = 0.79  # of the smaller one: the step of a run, no power of two
@@ -81,7 +82,7 @@ def step_sizes(has_constraints: bool, model: Model, states: Sequence[State]) -> 
 
     Returns:
         Steps [s] per state: `STEP_SIZES` × `MAX_STEP_RATE` over the fastest rate, where that is larger.  Of
-        loops it is `LOOP_RATE` at least: engines' corrections of gaps have to be stable.  Else it
+        loops and pitches it is `GAP_RATE` at least: engines' corrections of gaps have to be stable.  Else it
         is the largest of √(2 |p̈|) = (α² + ω⁴/4)^¼ of a body, of |u̇| of a rod, of the linearised equations'
         eigenvalues, and for methods with constraints of √(F |s| / J) of a joint's force, doubled: their
         Newton iteration leaves that stiffness out and diverges at large steps.
@@ -103,8 +104,8 @@ def step_sizes(has_constraints: bool, model: Model, states: Sequence[State]) -> 
             moment = np.where([kind.holds_no_turn for kind in model.kinds], 0.0, bound.scale["joint_moment"])
             squares.append(np.max(moment / least[near]))
             squares = [4 * np.max(squares)]
-        if model.has_loops:
-            squares.append(LOOP_RATE**2)
+        if model.has_loops or any(kind.has_pitch for kind in model.kinds):
+            squares.append(GAP_RATE**2)
         rate = float(np.sqrt(np.max(squares)))
         found.append([h * min(1.0, MAX_STEP_RATE / rate if rate > 0 else 1.0) for h in STEP_SIZES])
     return found

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 
 @dataclass(frozen=True)
@@ -48,6 +48,8 @@ class JointSpaceMethod:
     # x: the logarithm of the pose of one end in the other, followed as a twist; or the distance of their
     # points in the world, and the vector of the quaternion from the second end to the first
     gap_form: Literal["logarithm", "distance and quaternion"] = "logarithm"
+    # joints with a pitch are cylindrical ones, x too is how far the slide is off the pitch times the turn
+    holds_pitches: bool = False
     stages: tuple[tuple[float, ...], ...] = ()  # the tableau's rows below the diagonal
     weights: tuple[float, ...] = ()
     new_velocity_share: float = 1.0  # x in q₁ = q ⊕ h (x v₁ + (1−x) v): 0 is explicit Euler
@@ -87,29 +89,21 @@ StepMethod = JointSpaceMethod | ConstrainedMethod
 
 
 def classical_runge_kutta(
-    coordinates: Literal["joint rotations", "joint angles"],
-    rod_axial_inertia: float = 1.0,
-    free_coordinates: Literal["point and rotation", "rigid motion"] = "point and rotation",
-    gap_correction: float = 0.0,
-    gap_form: Literal["logarithm", "distance and quaternion"] = "logarithm",
+    coordinates: Literal["joint rotations", "joint angles"], rod_axial_inertia: float = 1.0, **fields: Any
 ) -> JointSpaceMethod:
     """Return the classical Runge-Kutta method of order 4.
 
     Args:
         coordinates: of `JointSpaceMethod`.
         rod_axial_inertia: of `JointSpaceMethod`; of no effect for joint angles.
-        free_coordinates: of `JointSpaceMethod`.
-        gap_correction: of `JointSpaceMethod`.
-        gap_form: of `JointSpaceMethod`.
+        fields: further ones of `JointSpaceMethod`.
 
     """
     return JointSpaceMethod(
         "Runge-Kutta",
         coordinates,
         rod_axial_inertia,
-        free_coordinates=free_coordinates,
-        gap_correction=gap_correction,
-        gap_form=gap_form,
+        **fields,
         stages=((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)),
         weights=(1 / 6, 1 / 3, 1 / 3, 1 / 6),
     )

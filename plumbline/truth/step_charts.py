@@ -11,8 +11,9 @@ Cut open, the ends b and c of a loop are two parts of one body.  With the twists
     V̇_b − V̇_c = −(V_b − V_c) × V_c − 2 a (V_b − V_c) + a² log(b⁻¹ c)
 
 in the frame of b, with the correction of gaps a that the method declares, or ẍ = −2 a ẋ − a² x of the gaps x
-that it declares in place of the logarithm.  The forces λ of rows that depend
-on others are not unique, v̇ is: proximal iterations find it.
+that it declares in place of the logarithm.  So does the gap of a slide that is held at the pitch times the
+turn of its joint.  The forces λ of rows that depend on others are not unique, v̇ is: proximal iterations find
+it.
 
 Arrays have leading axes ``...`` for many states at once.
 """
@@ -42,6 +43,7 @@ from plumbline.model.kinematics import (
     turn_of_z,
 )
 from plumbline.model.loops import cut_open
+from plumbline.model.redescription import PITCHED_KINDS, joints_as_cylinders, state_of_cylinders
 from plumbline.model.step_methods import JointSpaceMethod
 
 Array = NDArray[Any]  # in this module of extended precision, where nothing else is stated
@@ -103,7 +105,16 @@ class StepCharts:
         self.cut = cut_open(model) if model.has_loops else None
         if self.cut:
             model, states = self.cut.model, [self.cut.state(state) for state in states]
+        # by joint which of the coordinates here are the mechanism's, and the pitches at which slides are held
+        self.given = [slice(None, len(kind.motions)) for kind in model.kinds]
+        self.held: dict[int, float] = {}
+        if method.holds_pitches:
+            self.held = {k: float(model.length[k]) for k, kind in enumerate(model.kinds) if kind.has_pitch}
+            tree, model = model, joints_as_cylinders(model, PITCHED_KINDS)
+            states = [state_of_cylinders(tree, model, state) for state in states]
+            self.given = [slice(1, 2) if k in self.held else own for k, own in enumerate(self.given)]
         self.model, self.method, self.ends = model, method, self.cut.ends if self.cut else ()
+        self.is_held = bool(self.ends or self.held)
         self.state = s = State(
             **{name: np.array([getattr(x, name) for x in states], LongDouble) for name in vars(states[0])}
         )
@@ -362,12 +373,12 @@ class StepCharts:
     def _solved(
         self, q: list[Array], v: Array, damped: Model | None = None
     ) -> tuple[Array, Solution, _MovingTree]:
-        """v̇ with the loops closed; ``damped`` has further rotors."""
-        tree = _MovingTree(self, q, v, None if self.ends else damped)
-        wrenches = tree.closing_wrenches(self.ends)
+        """v̇ with all rows held; ``damped`` has further rotors."""
+        tree = _MovingTree(self, q, v, None if self.is_held else damped)
+        wrenches = tree.holding_wrenches()
         found = tree.solve(wrenches)
-        if self.ends:
-            shares = tree.closing_shares(self.ends, found)
+        if self.is_held:
+            shares = tree.holding_shares(found)
             if damped is not None:
                 found = _MovingTree(self, q, v, damped).solve(wrenches)
             found = found.combined(lambda x: x @ shares)
@@ -486,8 +497,9 @@ class StepCharts:
         for k, (chart, name) in enumerate(zip(self.of_body, self.model.kind, strict=True)):
             if k in self.of_rod:
                 u[..., k, :], udot[..., k, :] = (part[..., 0] for part in tree.rod_direction(k))
-            if count := len(KINDS[name].motions):
-                x[..., k, :count], xdot[..., k, :count] = q[chart], v[..., self.own[chart]]
+            if KINDS[name].motions:
+                own, rates = q[chart][..., self.given[k]], v[..., self.own[chart]][..., self.given[k]]
+                x[..., k, : own.shape[-1]], xdot[..., k, : own.shape[-1]] = own, rates
         kinetic, potential, momentum = tree.totals()
         energy = np.broadcast_to((kinetic + potential)[..., 0, 0], lead)
         every = r, np.stack(tree.p, -2), velocity, omega_, u, udot, x, xdot
@@ -622,10 +634,10 @@ class _MovingTree(Tree):
         after = alpha[0] + bias + sum(a * rates[..., i, None, None] for i, a in enumerate(turned))
         return rates, after
 
-    def closing_wrenches(self, ends: Sequence[tuple[int, int]]) -> list[Mapping[int, tuple[Any, Any]]]:
-        """Wrenches on each end b, and against them on c, that belong to the rows of `closing_shares`."""
+    def holding_wrenches(self) -> list[Mapping[int, tuple[Any, Any]]]:
+        """Wrenches, and what is against them, that belong to the rows of `holding_shares`."""
         found: list[Mapping[int, tuple[Any, Any]]] = []
-        for b, c in ends:
+        for b, c in self.charts.ends:
             if self.charts.method.gap_form == "logarithm":  # about and along the axes of b, at its centre
                 turns = pushes = self.A[b]
                 lever = self.r[b] - self.r[c]
@@ -635,18 +647,28 @@ class _MovingTree(Tree):
                 pushes, lever = np.eye(3, dtype=LongDouble), None
             axes = [x[..., i : i + 1] for x in (turns, pushes) for i in range(3)]
             found += [self.end_wrench(b, c, e, i > 2, lever) for i, e in enumerate(axes)]
+        return found + [self._pitch_wrench(k, pitch) for k, pitch in self.charts.held.items()]
+
+    def _pitch_wrench(self, k: int, pitch: float) -> Mapping[int, tuple[Any, Any]]:
+        """A unit force along the slide of a cylindrical joint, and minus the pitch of moment."""
+        axis, far = self.blocks[k][0].axis, self.far[k]
+        turn = axis * LongDouble(pitch)
+        found = {k: (axis, self.num.cross(self.near[k], axis) - turn)}
+        if far >= 0:
+            lever = self.r[k] + self.near[k] - self.r[far]
+            found[far] = -axis, turn - self.num.cross(lever, axis)
         return found
 
     def _turn_between(self, b: int, c: int) -> Array:
         """The quaternion from the attitude of b to that of c."""
         return quaternion_product(quaternion_conjugate(self.p[b]), self.p[c])
 
-    def closing_shares(self, ends: Sequence[tuple[int, int]], found: Solution) -> Array:
-        """Compute 1 and the λ (..., 1 + 6 L, 1) of the wrenches that hold the loops closed."""
+    def holding_shares(self, found: Solution) -> Array:
+        """Compute 1 and the λ (..., 1 + rows, 1) of the wrenches that make gaps as the method declares."""
         lead = self.rates[0].shape[:-1]
         rows_of = {"logarithm": self._twist_rows, "distance and quaternion": self._distance_rows}
         answers = list[Array]()
-        for pair in ends:
+        for pair in self.charts.ends:
             motions = [
                 [
                     np.broadcast_to(x[k], (*lead, *x[k].shape[-2:]))
@@ -655,6 +677,9 @@ class _MovingTree(Tree):
                 for k in pair
             ]
             answers.append(rows_of[self.charts.method.gap_form](pair, *motions))
+        for k, pitch in self.charts.held.items():
+            row = self._pitch_row(k, LongDouble(pitch), found)
+            answers.append(np.broadcast_to(row, (*lead, *row.shape[-2:])))
         rows = np.concatenate(answers, -2)
         K, missing = rows[..., 1:], -rows[..., 0]
         size = np.einsum("...ii->...i", K)
@@ -709,6 +734,14 @@ class _MovingTree(Tree):
         moved = A - A_c
         moved[..., 0] += (2 * a * (v - v_c) + a * a * (at - at_c))[..., 0]
         return np.concatenate([turned, moved], -2)
+
+    def _pitch_row(self, k: int, pitch: Any, found: Solution) -> Array:
+        """What is missing of ẍ, x the slide of joint k less the pitch times its turn."""
+        a, (slide, turn) = LongDouble(self.charts.method.gap_correction), found.rates[k]
+        (x, rate), (angle, turning) = (self.coordinate(k, i) for i in range(2))
+        row = slide - pitch * turn
+        row[..., :1] += 2 * a * (rate - pitch * turning) + a * a * (x - pitch * angle)
+        return np.asarray(row)
 
 
 # Bₖ/k! of even k from 2 on: 1/12, −1/720, …

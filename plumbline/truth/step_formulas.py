@@ -128,7 +128,8 @@ def fastest_rates(model: Model, states: Sequence[State], iterations: int = 12) -
         # d/dt of a displacement in the moving frame: δθ̇ = δv − [v, θ]
         theta, rate = rate - system.bracket(v, theta), change
         growth.append(size(theta, rate) / tiny)
-    later = np.log(np.array(growth[iterations // 2 :], float))
+    with np.errstate(divide="ignore"):  # nothing grows where no force depends on the motion
+        later = np.log(np.array(growth[iterations // 2 :], float))
     return np.asarray(np.exp(np.mean(later, axis=0)).ravel())
 
 
