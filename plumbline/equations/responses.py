@@ -86,7 +86,7 @@ class Responses:
 
         forces = self.load + model.mass[..., None] * model.gravity[..., None, :]
         moments = self.torque - cross(self.omega, rotate_vectors(self._inertia, self.omega))
-        pushed = np.concatenate([forces, moments], -1)[..., None]
+        self._pushed = pushed = np.concatenate([forces, moments], -1)[..., None]
         self._coasting = np.concatenate([self._vectors(some) for some in tree.coasting()], -1)[..., None]
         gaps = self._velocity_terms_of_ends() - self._rows_of_ends(self._coasting)
         gaps = np.zeros_like(gaps) if end_rows == "without velocity terms" else gaps
@@ -113,6 +113,26 @@ class Responses:
         """Respond to unit accelerations of the ends against each other: (S, N, 4, 3, 6 L)."""
         units = np.eye(6 * len(self.ends))
         return self._respond(gaps=np.broadcast_to(units, (self._count, *units.shape)))
+
+    def to_factors(self) -> tuple[Array, Array]:
+        """Respond to errors of the equations H ν̇ − Gᵀλ = b and G ν̇ = γ, of each in a unit of its own.
+
+        Returns:
+            (S, N, 4, 3, ν + 6 L) as the solution; ν̇ and λ (S, ν + 6 L) in these units, the roots of the
+            diagonals of H and of G H⁻¹ Gᵀ.
+
+        """
+        S, rows = self._count, self._rows_of_ends(self._A.reshape(self._count, self.n, 6, -1))
+        free = rows @ np.linalg.pinv(self._H, hermitian=True)
+        unit = np.sqrt(np.maximum(np.einsum("sij,sij->si", free, rows), 0.0))
+        units = np.broadcast_to(np.eye(rows.shape[-1]), self._H.shape)
+        moved = self.solution[:, :, :2].reshape(S, -1, 1) - self._coasting.reshape(S, -1, 1)
+        rate = np.linalg.pinv(self._A) @ moved
+        pushed = (self._pushed - self._weigh(self._coasting)).reshape(S, -1, 1)
+        left = self._H @ rate - self._A.mT @ pushed - self._effort[..., None]
+        multipliers = (self._J_inverse.mT @ left)[..., 0] * unit
+        found = self._respond(effort=units), self.to_gaps() * unit[:, None, None, None]
+        return np.concatenate(found, -1), np.concatenate([rate[..., 0], multipliers], -1)
 
     def velocity_terms(self) -> Array:
         """Return the relative accelerations (S, N, 6) of the joints by velocities alone."""

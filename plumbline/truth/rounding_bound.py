@@ -18,7 +18,9 @@ Without tJ joint-space engines exceed the bound by 1e7, without tS maximal coord
 Loops are cut open (`plumbline.model.loops`).  The dependent coordinates of a state are known only to rounding
 over the smallest singular value σ of the rows that join the two parts of a body, which changes every term of
 the equations by as much: the answer to their roundings (tB, and that of the rows that join parts) counts
-1 + 1/σ times.
+1 + 1/σ times.  Steps start from an engine's own coordinates, dependent ones too, and the engine solves for
+their accelerations and the forces of the rows together: there σ plays no part, tS is what the factors of
+these equations round, and the rows have the roundings of the gaps x and of their rates, in a² x + 2 a ẋ.
 
 The torque of a joint's coordinate is e − k (x − x₀) − c ẋ − a ẍ.  Engines that hold positions find x and the
 lengths of springs as differences: k multiplies their roundings, of the positions' size.
@@ -52,6 +54,7 @@ from plumbline.model.kinematics import (
     stack_states,
 )
 from plumbline.model.loops import cut_open, regular_rank, wrench_length
+from plumbline.model.step_methods import JointSpaceMethod
 from plumbline.model.welding import BodyParts, part_offsets, undivided_bodies
 from plumbline.processes.worker_pool import Pickled
 
@@ -81,6 +84,7 @@ class RoundingBound:
     mass_matrix: float  # kg m², of each entry
     scale: dict[str, Array | float]
     kinematics: Array  # (4, N): of r [m], v [m/s], attitudes [rad] and ω [rad/s] that follow from coordinates
+    of_gaps: Array  # (2, N) m/s² and rad/s², the part of both by the roundings of gaps that steps correct
     rod_torque: Array  # (N,) N m, of the torques at both ends of the rod that body k hangs by; 0 for a ball
     joint_terms: float  # N m about the origin, of the terms of all joints
     joint_power: float  # W, of the same with the joints' rates
@@ -156,7 +160,10 @@ def state_rounding_bound(model: Model, state: State, parts: BodyParts | None = N
 
 
 def rounding_bounds(
-    model: Model, states: Sequence[State], parts: BodyParts | None = None
+    model: Model,
+    states: Sequence[State],
+    parts: BodyParts | None = None,
+    method: JointSpaceMethod | None = None,
 ) -> list[RoundingBound]:
     """Compute the rounding tolerances of every state quantity at many states.
 
@@ -167,6 +174,8 @@ def rounding_bounds(
             part then: for a part whose centre is c away, levers are longer by ‖c‖ and accelerations by
             ‖c‖(‖ω̇‖ + ‖ω‖W), mass and least inertia are those of the lightest part, and the weld carries the
             weight and inertia of a part with the lever c.
+        method: of steps, by an engine with joint coordinates of its own that corrects gaps: then those of
+            loops depend on no others, and nothing is eliminated onto the joints.
 
     Returns:
         The tolerances, in SI units, and their scales.
@@ -179,7 +188,10 @@ def rounding_bounds(
     found: list[RoundingBound] = []
     for first in range(0, len(states), size):
         some = states[first : first + size]
-        found += _of_loops(model, some) if model.has_loops else _of_tree(_Terms(model, some, parts))
+        if model.has_loops:
+            found += _of_loops(model, some, method)
+        else:
+            found += _of_tree(_Terms(model, some, parts, method=method))
     return found
 
 
@@ -191,15 +203,18 @@ def _of_tree(terms: _Terms) -> list[RoundingBound]:
     ]
 
 
-def _of_loops(model: Model, states: Sequence[State]) -> list[RoundingBound]:
+def _of_loops(model: Model, states: Sequence[State], method: JointSpaceMethod | None) -> list[RoundingBound]:
     """Bounds of a mechanism with loops, cut open."""
     cut, found = cut_open(model), list[RoundingBound]()
     there = cut.state(stack_states(states))
-    terms = _Terms(cut.model, there, None, cut.ends, cut.row_scale)
-    totals, scales, sums, _, joints, motion = terms.bounds()
-    of_welds, rank = terms.weld_errors(), regular_rank(model, states[0])
-    scaled = cut.jacobian(there) * cut.row_scale[:, None]
-    spreads = 1 + 1 / np.linalg.svd(scaled, compute_uv=False)[:, rank - 1]  # as `smallest_singular_value`
+    terms = _Terms(cut.model, there, None, cut.ends, cut.row_scale, method)
+    totals, scales, sums, _, joints, motion = terms.bounds(is_eliminated=method is None)
+    (of_welds, of_gaps), spreads = terms.weld_errors(), np.ones(len(states))
+    if method is None:
+        scaled, rank = cut.jacobian(there) * cut.row_scale[:, None], regular_rank(model, states[0])
+        spreads += 1 / np.linalg.svd(scaled, compute_uv=False)[:, rank - 1]  # as `smallest_singular_value`
+    else:
+        totals += terms.factor_errors() + of_gaps
     for s, spread in enumerate(spreads.tolist()):
         # what one body or joint has is found together with what all others of the loop have
         largest = {name: float(np.max(value)) for name, value in _at(scales, s).items()}
@@ -213,7 +228,7 @@ def _of_loops(model: Model, states: Sequence[State]) -> list[RoundingBound]:
         }
         spread_sums = {name: size * spread for name, size in _at(sums, s).items()}
         largest_motion = np.repeat(np.max(motion[:, s], axis=-1, keepdims=True), model.n, axis=-1)
-        of_joints = np.zeros(model.n), spread * joints[s], spread * largest_motion
+        of_joints = np.zeros(model.n), spread * joints[s], spread * largest_motion, of_gaps[s, cut.place]
         found.append(_bound(total[cut.place], scale, spread_sums, *of_joints))
     return found
 
@@ -223,10 +238,17 @@ def _at(values: dict[str, Array], s: int) -> dict[str, Array]:
 
 
 def _bound(
-    total: Array, scale: dict[str, Array], sums: dict[str, Array], rods: Array, joints: Array, motion: Array
+    total: Array,
+    scale: dict[str, Array],
+    sums: dict[str, Array],
+    rods: Array,
+    joints: Array,
+    motion: Array,
+    of_gaps: Array | None = None,
 ) -> RoundingBound:
     """Tolerances by the sums of all sizes: (J, 4) of joints, of which the first hold the bodies."""
     total, sizes = ROUNDING_FACTOR * EPS * total, {name: float(size) for name, size in sums.items()}
+    of_gaps = 0 * total if of_gaps is None else ROUNDING_FACTOR * EPS * of_gaps
     return RoundingBound(
         acceleration=total[: len(rods), 0],
         angular_acceleration=total[: len(rods), 1],
@@ -234,6 +256,7 @@ def _bound(
         joint_moment=total[:, 3],
         scale=scale | sizes,
         kinematics=ROUNDING_FACTOR * EPS * motion,
+        of_gaps=of_gaps[: len(rods), :2].T,
         rod_torque=ROUNDING_FACTOR * EPS * rods,
         joint_terms=float(ROUNDING_FACTOR * EPS * joints[0]),
         joint_power=float(ROUNDING_FACTOR * EPS * joints[1]),
@@ -255,7 +278,11 @@ class _Terms:
         parts: BodyParts | None = None,
         ends: Sequence[tuple[int, int]] = (),
         row_scale: Array | None = None,
+        method: JointSpaceMethod | None = None,
     ) -> None:
+        # 1/s, of the gaps of loops, and of slides that are held at a pitch
+        self.correction = method.gap_correction if method else 0.0
+        self.pitch_correction = self.correction if method and method.holds_pitches else 0.0
         self.responses = found = Responses(model, states, ends, row_scale)
         norm, self.model, self.state, self.n = np.linalg.norm, model, found.state, model.n
         state = found.state
@@ -325,11 +352,16 @@ class _Terms:
         )  # fmt: skip
         linear = (
             self.a, self.arm * self.alpha, self.arm * W**2, far_a, self.reach * far_alpha, self.reach * W**2,
-            W * self.slide_rate, self.place * self.alpha, self.place * W**2,
+            W * self.slide_rate, self.place * self.alpha, self.place * W**2, self._pitch_errors(),
         )  # fmt: skip
         sizes = (np.max(terms, 0) for terms in (forces, moments, linear, (self.alpha, far_alpha, W**2)))
         force, moment, push, turn = sizes
         return force, moment, push, turn
+
+    def _pitch_errors(self) -> Array:
+        """a² x + 2 a ẋ of the slides that equal pitches times turns."""
+        a, (x, rate) = self.pitch_correction, (np.sum(np.abs(y), -1) for y in (self.state.x, self.state.xdot))
+        return np.asarray(POSITION_SHARE * a * self.pitch * (a * x + 2 * rate))
 
     def _elimination_errors(self) -> tuple[Array, Array]:
         """Terms of C M⁻¹ f in the linear and angular rows of each joint; of a body with an M⁻¹."""
@@ -339,17 +371,40 @@ class _Terms:
         far_free, far_turn = self.of_far(free), self.of_far(turn)
         return free + self.arm * turn + far_free + self.reach * far_turn, turn + far_turn
 
-    def weld_errors(self) -> Array:
-        """First-order change (S, N, 4) of r̈, α, F, M by errors in the rows that join parts of a body."""
-        found, sizes = self.responses, list[Array]()
+    def factor_errors(self) -> Array:
+        """First-order change (S, N, 4) by the factors of the equations of all coordinates and rows together.
+
+        Factors without pivoting leave up to √(K_ii K_jj) in an entry K_ij, K_ii of the mass matrix M and of
+        J M⁻¹ Jᵀ (Higham, Accuracy and Stability of Numerical Algorithms, 2002, theorem 10.3).
+        """
+        responses, unknowns = self.responses.to_factors()
+        size = np.sum(np.linalg.norm(responses, axis=3), axis=-1)
+        return np.asarray(size * np.linalg.norm(unknowns, axis=-1)[:, None, None])
+
+    def weld_errors(self) -> tuple[Array, Array]:
+        """First-order change (S, N, 4) of r̈, α, F, M by errors in the rows that join parts of a body.
+
+        Returns:
+            By errors of their accelerations, and of a² x + 2 a ẋ of the gaps x, whose parts are rounded at
+            every joint around the loop.
+
+        """
+        found, sizes, gaps, a = self.responses, list[Array](), list[Array](), self.correction
+        place, speed = (np.linalg.norm(x, axis=-1) for x in (self.state.r, self.state.v))
         for pair in found.ends:
             around = np.any([self.below[:, k] for k in pair], axis=0)
             reach = np.sum((self.reach + self.arm)[:, around], -1)
             turning = np.max((self.W**2 + self.alpha)[:, around], -1)
             sizes += [np.max(self.a[:, around], -1) + reach * turning, turning]
+            rate = np.max(self.W[:, around], -1)
+            length = np.max((place + self.reach + self.arm)[:, around], -1)
+            share = POSITION_SHARE * np.count_nonzero(around) * a
+            moving = np.max(speed[:, around], -1) + rate * length
+            gaps += [share * (a * length + 2 * moving), share * (a + 2 * rate)]
         response = found.to_gaps()  # (S, N, 4, 3, 6 L)
         norms = np.sqrt(np.sum(response.reshape(*response.shape[:4], -1, 3) ** 2, axis=(3, 5)))
-        return np.asarray((norms @ np.stack(sizes, 1)[:, None, :, None])[..., 0])
+        of_rows, of_gaps = ((norms @ np.stack(x, 1)[:, None, :, None])[..., 0] for x in (sizes, gaps))
+        return of_rows, of_gaps
 
     def _norms_of_joints(self) -> Array:
         """Frobenius norms (S, N, 4, N, 2) of the responses to linear and angular accelerations of joints."""
@@ -364,8 +419,13 @@ class _Terms:
             first = last
         return np.asarray(np.sqrt(found))
 
-    def bounds(self) -> tuple[Array, dict[str, Array], dict[str, Array], Array, Array, Array]:
+    def bounds(
+        self, is_eliminated: bool = True
+    ) -> tuple[Array, dict[str, Array], dict[str, Array], Array, Array, Array]:
         """Sum the sizes of all roundings.
+
+        Args:
+            is_eliminated: whether tS is among them.
 
         Returns:
             tB + tS + tJ + d (S, N, 4) of r̈ [m/s²], α [rad/s²], F [N] and M [N m]; the scales of vectors; the
@@ -380,7 +440,9 @@ class _Terms:
         of_bodies = _errors(_norms(to_wrenches), np.stack([force, moment], -1))
         of_joints = self._norms_of_joints()
         self.of_rows = of_bodies + _errors(of_joints, np.stack(rows, -1))
-        total = self.of_rows + _errors(of_joints, np.stack(self._elimination_errors(), -1))
+        total = self.of_rows.copy()
+        if is_eliminated:
+            total += _errors(of_joints, np.stack(self._elimination_errors(), -1))
         total += np.einsum("sjnq,sj->snq", joints.responses(to_wrenches), joints.load)
         swing, turning = (
             (x.mT @ joints.acceleration[..., None])[..., 0] for x in (joints.lever, joints.turns)

@@ -12,9 +12,7 @@ elsewhere, the second term the roundings of quaternion products and of the way f
 bodies', c = h W Σ (b_α of the links before, and of rods about their own axes) what relative rates pass on.
 Ten steps: the sum over the steps, times the growth of perturbations, as one.
 
-Of loops b is larger by what the roundings of gaps and of their rates (32 ε (ℓ′, 1) and 32 ε (V + W ℓ′, W) in
-length and angle, ℓ′ the mechanism's size) leave in accelerations, a² and 2 a times their sum with the
-method's correction a, through the forces that close the loops, M⁻¹ Jᵀ (J M⁻¹ Jᵀ)⁻¹.
+Of loops b is that of an engine that solves at joint coordinates of its own (`rounding_bounds`).
 
 Engines that solve a step iteratively are compared in parts that need no iteration: the quadrature of their
 own accelerations, the residual of their equations, and their first accelerations.
@@ -35,12 +33,9 @@ from plumbline.model.datatypes import KINDS, Array, Model, State, StepRun, Traje
 from plumbline.model.kinematics import (
     angular_velocity,
     complete_state,
-    mass_matrix,
     stack_states,
     stretched_length,
-    velocity_jacobian,
 )
-from plumbline.model.loops import RANK_TOLERANCE, cut_open
 from plumbline.model.sampling import derive_seed
 from plumbline.model.step_methods import ConstrainedMethod, JointSpaceMethod, StepMethod
 from plumbline.truth.rounding_bound import (
@@ -308,13 +303,10 @@ def acceleration_bounds(
         The state level's, and what the correction of gaps adds, or on trees the formula's own errors.
 
     """
-    bounds, rate = rounding_bounds(model, states), method.gap_correction
-    if model.has_loops and not rate:
-        return bounds
+    bounds = rounding_bounds(model, states, method=method)
     if model.has_loops:
-        added = _correction_roundings(model, stack_states(states), rate)
-    else:
-        added = _formula_errors(model, states)
+        return bounds
+    added = _formula_errors(model, states)
     return [
         replace(b, acceleration=b.acceleration + a, angular_acceleration=b.angular_acceleration + alpha)
         for b, (a, alpha) in zip(bounds, added, strict=True)
@@ -353,7 +345,10 @@ def step_bound(
     turned = ANGLE_ROUNDINGS * EPS * (sizes.get("turned", np.zeros(model.n)) @ path.T)
     W, V = (np.max(np.where(path, x[..., None, :], 0.0), -1) for x in (rate, speed))
     arm = _arms(model, sizes)
-    links = [max(1, len(KINDS[kind].motions)) + KINDS[kind].holds_distance for kind in kinds]
+    links = [
+        max(1, len(kind.motions)) + kind.holds_distance + (method.holds_pitches and kind.has_pitch)
+        for kind in map(KINDS.__getitem__, kinds)
+    ]
     # Some engines normalise quaternions only beyond 1e-15; rotations have their lengths squared.
     stretched = np.minimum(sizes.get("stretched", np.zeros(model.n)), MAX_STRETCH)
     rounding = STEP_ROUNDINGS * EPS * (path @ np.array(links)) + 4 * (stretched @ path.T)
@@ -464,25 +459,6 @@ def _spread(values: Array, some: NDArray[np.intp]) -> Array:
     """Give each sample the larger of the two values around it, of those at some samples."""
     at = np.searchsorted(some, np.arange(some[-1] + 1))
     return np.maximum(values[at], values[np.maximum(at - 1, 0)])
-
-
-def _correction_roundings(model: Model, states: State, rate: float) -> Array:
-    """(S, 2, N) r̈ and ω̇′ by the roundings of gaps that a method corrects with a rate a [1/s]."""
-    cut = cut_open(model)
-    there, scale, norm = cut.state(states), cut.row_scale, np.linalg.norm
-    of_bodies = velocity_jacobian(cut.model, there)
-    J = cut.jacobian(there) * scale[:, None]
-    # a rod has no rate along itself, and M no inverse
-    pushed = np.linalg.pinv(mass_matrix(cut.model, there), hermitian=True) @ J.mT
-    response = pushed @ np.linalg.pinv(J @ pushed, rcond=RANK_TOLERANCE, hermitian=True) * scale
-    size = np.max(norm(states.r, axis=-1), -1) + np.max(norm(model.point, axis=2))
-    turning = np.max(norm(states.omega, axis=-1), -1)
-    moving = np.max(norm(states.v, axis=-1), -1) + turning * size
-    pairs = (size, moving), (np.ones_like(size), turning)
-    rows = [STEP_ROUNDINGS * EPS * (rate**2 * gap + 2 * rate * gap_rate) for gap, gap_rate in pairs]
-    each = np.tile(np.repeat(np.stack(rows, -1), 3, axis=-1), len(cut.ends))
-    found = (np.abs(of_bodies @ response) @ each[..., None]).reshape(len(size), -1, 2, 3)
-    return np.moveaxis(norm(found, axis=3)[:, cut.place[: model.n]], 2, 1)
 
 
 def _paths(far: NDArray[np.intp]) -> NDArray[np.bool_]:
@@ -879,6 +855,8 @@ class RunSteps(StepsFromSamples):
             every = np.full_like(none, np.inf)
             return StepDeviations(none, every, every, np.array(["no step has a bound"]))
         often = np.log(4 / MEAN_ALARM)
+        gaps = self.h * np.stack([b.of_gaps for b in self.bounds[:-1]], axis=1)
+        of_gaps = dict(zip(("velocity", "rate"), gaps, strict=True))
         for name, field_name in (("rate", "omega"), ("velocity", "v")):
             change = np.asarray(getattr(self.after, field_name) - getattr(before, field_name)[:-1], float)
             own = np.asarray(getattr(before, field_name)[:-1], float)
@@ -888,6 +866,8 @@ class RunSteps(StepsFromSamples):
             of_step = found[f"run_{name}"].bounds[kept]
             rounding = np.minimum(self.of_samples[f"step_{name}"][:-1][kept], of_step)
             constant = CONSTANT_ROUNDINGS * rounding + CONSTANT_FACTORS * (of_step - rounding)
+            # arms and axes make gaps that are the same in all steps, and so may be what a limit lacks
+            constant = np.minimum(constant + of_gaps[name][kept] + self.uncertainty[f"step_{name}"], of_step)
             chance = np.std(along, axis=0, ddof=1) * np.sqrt(2 * often / n)
             chance += 7 * 2 * np.max(np.abs(along), axis=0) * often / (3 * (n - 1))
             allowed = np.mean(constant, axis=0) + chance
