@@ -56,6 +56,7 @@ from typing import Any, ClassVar, Literal
 
 import mujoco
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from adapters.mujoco_common import (
@@ -131,6 +132,9 @@ RUN_ITERATIONS = 3  # of Newton's method on welds, a linear problem: the second 
 # Of steps, two: rounding of forces falls as 1/R, where both have it alike their difference is 0.41 of it, and
 # what three of a sequence leave of R is below rounding still.
 STEP_REGULARISATIONS = tuple(factor * LARGEST_REGULARISATIONS[0] for factor in (SEQUENCES[0], SEQUENCES[2]))
+NEARBY_STEPS = (
+    8  # before and after a step, whose differences are of one size: a singular pose is passed in fewer
+)
 NO_SAME_FRAME = 0  # mjSAMEFRAME_NONE; the first versions have no enumeration
 MAX_ORDER_ERROR = 0.1
 MIN_SOFTNESS = 1e-9  # a smaller relative effect of R is rounding
@@ -293,17 +297,22 @@ class Mujoco(MetamorphicHooks):
         spins = [kinematics.angular_velocity(x["p"], x["pdot"]) for x in (limit, before)]
         changes = [limit[name] - before[name] for name in ("r", "p", "v")] + [spins[0] - spins[1]]
         error = ERROR_UNITS * [_largest_norm(change) for change in changes]
-        return replace(runs[-1], **limit, limit_error=error)
+        return replace(runs[-1], **limit, limit_error=np.tile(error, (len(times), 1)))
 
     def _limit_of_steps(
         self, model: Model, state: State, times: Array, integrator: Integrator, step: float
     ) -> Trajectory:
         """Extrapolate every step to no regularisation, and take the next one from there.
 
-        The uncertainty of a step is three times the largest difference between the limits of two sequences.
+        The uncertainty of a step is three times the largest difference between the limits of two sequences in
+        the steps around it: in one step alone both may be off alike by chance.
         """
         softs = [soft for largest in STEP_REGULARISATIONS for soft in self._softened(model, largest)]
-        trees, start, errors = [soft.tree for soft in softs], softs[0].state(state), list[list[float]]()
+        trees, start, errors = (
+            [soft.tree for soft in softs],
+            softs[0].state(state),
+            [[0.0] * len(ERROR_UNITS)],
+        )
         first = trees[0]
         for tree in trees:
             tree.prepare(start, integrator, step)
@@ -322,7 +331,9 @@ class Mujoco(MetamorphicHooks):
             errors.append([_largest_norm(x - y) for x, y in zip(*samples, strict=True)])
 
         run = softs[0].cut.source_run(self._sampled_run(first, start, times, integrator, step, advance))
-        return replace(run, limit_error=3 * ERROR_UNITS * np.max(errors, axis=0))
+        around = np.pad(errors, ((NEARBY_STEPS, NEARBY_STEPS), (0, 0)), "edge")
+        largest = np.max(sliding_window_view(around, 2 * NEARBY_STEPS + 1, axis=0), axis=-1)
+        return replace(run, limit_error=3 * ERROR_UNITS * largest)
 
     def _sampled_run(
         self, chain: _MujocoChain, state: State, times: Array, integrator: Integrator, resolution: float,

@@ -39,7 +39,7 @@ FIELDS: Mapping[type, Mapping[str, tuple[str, bool]]] = {
         "v": ("A N 3", False),
         "pdot": ("A N 4", False),
         "steps": (COUNT, False),
-        "limit_error": ("4", True),
+        "limit_error": ("A 4", True),
         "coordinates": ("A Q", True),
         "velocities": ("A V", True),
     },

@@ -99,7 +99,8 @@ class RefinementAnalysis:
     @property
     def limit_error(self) -> dict[str, float]:
         """Of each name of `MOTION_UNITS`, in its unit: of the finest run, where it is itself a limit."""
-        found = np.zeros(len(MOTION_UNITS)) if self.finest.limit_error is None else self.finest.limit_error
+        errors = self.finest.limit_error
+        found = np.zeros(len(MOTION_UNITS)) if errors is None else np.max(errors, axis=0)
         return dict(zip(MOTION_UNITS, found.tolist(), strict=True))
 
     @property

@@ -145,8 +145,8 @@ class Trajectory:
     # rad or m: joint coordinates at t[0], angles unwrapped; None: angles are principal values there
     initial_x: Float[Array, "bodies coordinates"] | None = None
     # m, rad, m/s, rad/s: uncertainty of positions, attitudes, ṙ and ω′, where the run is the limit of
-    # softer ones
-    limit_error: Float[Array, "4"] | None = None
+    # softer ones; of consecutive steps that of each by itself
+    limit_error: Float[Array, "samples 4"] | None = None
     # the engine's own configuration and velocity, joint by joint as `JointSpaceMethod` orders them
     coordinates: Float[Array, "samples entries"] | None = None
     velocities: Float[Array, "samples rates"] | None = None

@@ -237,7 +237,8 @@ class FormulaSteps:
             place = Place(index, h, count)
             soft = _limit_errors(runs[i].trajectory)
             for quantity, error in _errors(self.true[i][count], runs[i], count).items():
-                allowed = limit[quantity] + count * self.growth[i, count] * soft[quantity]
+                lacking = count * float(np.max(soft[quantity][:count]))
+                allowed = limit[quantity] + self.growth[i, count] * lacking
                 found[quantity].add(error, allowed, scale[quantity], place)
         return found
 
@@ -519,10 +520,10 @@ def _body_differences(one: BodyStates | State, other: BodyStates | State) -> dic
     return {quantity: np.linalg.norm(np.asarray(x, float), axis=-1) for quantity, x in pairs.items()}
 
 
-def _limit_errors(run: Trajectory) -> dict[str, float]:
-    """By quantity what a step is uncertain by, where the run is the limit of softer ones."""
-    errors = np.zeros(len(_MOTION)) if run.limit_error is None else run.limit_error
-    return {f"step_{of}": float(error) for of, error in zip(_MOTION, errors, strict=True)}
+def _limit_errors(run: Trajectory) -> dict[str, Array]:
+    """By quantity what the steps (steps, 1) are uncertain by, where they are limits of softer ones."""
+    errors = np.zeros((len(run.t), len(_MOTION))) if run.limit_error is None else run.limit_error
+    return {f"step_{of}": error[1:, None] for of, error in zip(_MOTION, errors.T, strict=True)}
 
 
 def _errors(true: BodyStates, run: StepRun, count: int) -> dict[str, Array]:
@@ -586,7 +587,7 @@ class StepsFromSamples:
 
     def __init__(
         self, method: JointSpaceMethod, model: Model, charts: StepCharts, coordinates: Array,
-        velocities: Array, h: float, count: int, uncertainty: dict[str, float] | None = None,
+        velocities: Array, h: float, count: int, uncertainty: dict[str, Array] | None = None,
     ) -> None:  # fmt: skip
         """Take the steps.
 
@@ -596,7 +597,7 @@ class StepsFromSamples:
             velocities: (S, nv).
             h: step [s].
             count: steps start from so many of the samples; where there is one more, each ends at the next.
-            uncertainty: of a step's result besides rounding, by quantity of `STEP_QUANTITIES`.
+            uncertainty: (count, 1) of the steps' results besides rounding, by quantity of `STEP_QUANTITIES`.
 
         Raises:
             EngineFailure: there are other coordinates than the mechanism has.
@@ -619,7 +620,7 @@ class StepsFromSamples:
         converted = 1 / np.maximum(self.middle_cosine, TINY)[:, None]
         self.fastest = np.max(sizes["rate"], axis=-1)  # (S,) rad/s, W of all bodies
         of_samples = _sample_bound(method, model, sizes)
-        self.uncertainty = uncertainty or dict.fromkeys(STEP_QUANTITIES, 0.0)
+        self.uncertainty = uncertainty or dict.fromkeys(STEP_QUANTITIES, np.zeros((count, 1)))
         self.of_samples = {name: x * converted for name, x in of_samples.items()}
         between = {name: np.maximum(x[:count], x[-count:]) for name, x in sizes.items()}
         of_torques = np.maximum(converted[:count], converted[-count:]) ** 4
@@ -867,7 +868,8 @@ class RunSteps(StepsFromSamples):
             rounding = np.minimum(self.of_samples[f"step_{name}"][:-1][kept], of_step)
             constant = CONSTANT_ROUNDINGS * rounding + CONSTANT_FACTORS * (of_step - rounding)
             # arms and axes make gaps that are the same in all steps, and so may be what a limit lacks
-            constant = np.minimum(constant + of_gaps[name][kept] + self.uncertainty[f"step_{name}"], of_step)
+            constant += of_gaps[name][kept] + self.uncertainty[f"step_{name}"][kept]
+            constant = np.minimum(constant, of_step)
             chance = np.std(along, axis=0, ddof=1) * np.sqrt(2 * often / n)
             chance += 7 * 2 * np.max(np.abs(along), axis=0) * often / (3 * (n - 1))
             allowed = np.mean(constant, axis=0) + chance

@@ -55,8 +55,8 @@ def test_mujoco_states_how_far_its_soft_loops_are_from_rigid_ones():
     s, adapter = catalogue_scenarios()["four-bar"], load_adapter("mujoco")
     true = simulate_notes_form(s.model, s.state, TIMES, 1e-13)
     run = adapter.simulate(s.model, s.state, TIMES, "RK4", 2.0**-10)
-    assert run.limit_error.shape == (4,) and np.all(run.limit_error > 0) and np.all(run.limit_error < 1e-10)
-    error, softness = np.max(position_error(run.r, true.r)), run.limit_error[0]
+    assert np.all(run.limit_error > 0) and np.all(run.limit_error < 1e-10)
+    error, softness = np.max(position_error(run.r, true.r)), np.max(run.limit_error[:, 0])
     assert error < 1e-8 and softness < 1e-11
 
 
