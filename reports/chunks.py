@@ -118,6 +118,12 @@ class ChunkBuilder:
         self._arrays: list[tuple[str, int]] = []
         self._texts = {} if texts is None else texts
 
+    def continued(self) -> ChunkBuilder:
+        """Return another builder with the same arrays so far."""
+        other = ChunkBuilder(self._texts)
+        other._parts, other._arrays = [*self._parts], [*self._arrays]
+        return other
+
     def add(self, array: Shaped[AnyArray, "..."]) -> dict[str, int]:
         """Store an array.
 

@@ -74,10 +74,11 @@ def render(results: Results, history: History) -> str:
     if history.nights:
         chunks["history"] = report_data.history_chunk(shown, history)
 
+    of_scenarios = [report_data.scenario_chunk(name, shown, tables, texts) for name in shown.scenarios]
+
     @cache
     def page(points: int) -> str:
-        for k, name in enumerate(shown.scenarios):
-            chunks[f"scenario-{k}"] = report_data.scenario_chunk(name, shown, tables, points, texts)
+        chunks.update({f"scenario-{k}": chunk(points) for k, chunk in enumerate(of_scenarios)})
         chunks["texts"] = encode_texts(texts)
         return _render_template(results, shown, history, chunks, points)
 

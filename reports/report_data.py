@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -151,17 +151,17 @@ def index_chunk(results: Results, history: History, texts: dict[str, int]) -> st
 
 
 def scenario_chunk(
-    name: str, results: Results, tables: ScenarioTables, points: int, texts: dict[str, int]
-) -> str:
+    name: str, results: Results, tables: ScenarioTables, texts: dict[str, int]
+) -> Callable[[int], str]:
     """Encode everything that the cells of one scenario show.
 
     Args:
         tables: states, curves and trajectories by scenario.
-        points: largest number of values per curve; 0 for no curves and no motion.
         texts: places of the texts that all chunks share; new ones are added.
 
     Returns:
-        The chunk, see `reports.chunks`; its header is ``PackedScenario`` in report_data.d.ts.
+        What makes the chunk, see `reports.chunks`, of the largest number of values per curve, 0 for no curves
+        and no motion; its header is ``PackedScenario`` in report_data.d.ts.
 
     """
     packer = ChunkBuilder(texts)
@@ -188,12 +188,17 @@ def scenario_chunk(
         "commands": commands,
         "departures": _departures(name, results, tables),
         "states": packer.add_table(_state_errors(name, tables, packer)),
-        "curves": packer.add_table(_error_curves(name, tables, packer, points), ["crossing"])
-        if points
-        else None,
-        "motion": _motion_frames(name, scenario, tables, packer, points) if points else None,
     }
-    return packer.encode(header)
+
+    def chunk(points: int) -> str:
+        if not points:
+            return packer.encode(header | {"curves": None, "motion": None})
+        own = packer.continued()
+        curves = own.add_table(_error_curves(name, tables, own, points), ["crossing"])
+        motion = _motion_frames(name, scenario, tables, own, points)
+        return own.encode(header | {"curves": curves, "motion": motion})
+
+    return chunk
 
 
 def _state_errors(name: str, tables: ScenarioTables, packer: ChunkBuilder) -> list[Record]:
