@@ -221,6 +221,8 @@ class _Diagnosing:
         """The same of engines in maximal coordinates, or that take a state with loops in another way."""
         if not (view.are_bodies_kept or self.model.has_loops) or not set(VECTORS[:2]) & set(wrong):
             return ()
+        if not self.difference(view).is_predictable:
+            return ()
         return self._single(view) or self._single(view, are_sums_apart=True)
 
     def _named(self, found: Sequence[Explanation]) -> tuple[Cause, ...]:

@@ -35,7 +35,7 @@ from plumbline.truth.ground_truth import StateTruth
 MIN_DIAGNOSABLE_RATIO = 8.0  # in bounds: of hundreds of fitted causes, some explain less by chance
 ACCEPTED_RATIO = 4.0  # in bounds
 ACCEPTED_PART = 0.25  # of the difference, where it is small
-ACCEPTED_SHARE = 1e-6  # of the difference; evaluating in doubles leaves 1e-10 of it and less
+ACCEPTED_SHARE = 1e-9  # of the difference; evaluating in doubles leaves 1e-10 of it and less
 STEP = 1e-5  # of an edit's scale, in slopes
 MIN_SIMILARITY = 0.3  # cosine between the difference and an edit's slope, to be fitted at all
 MAX_CANDIDATES = 24
@@ -83,6 +83,14 @@ class Difference:
         self.values = self.off({q: values_of(given, q) for q in self.names})
         self.view, self.model = view, model
         self.predictor = Predictor(model, [truth.states[i] for i in places], view)
+
+    @property
+    def is_predictable(self) -> bool:
+        """Whether the prediction without a mistake is the truth: else it says nothing of mistakes.
+
+        An engine in maximal coordinates is predicted by the reference's rows, which may be what is wrong.
+        """
+        return bool(np.all(np.abs(self.off(self.predictor.right)) <= self.accepted(self.everything)))
 
     @property
     def everything(self) -> Mask:
