@@ -10,7 +10,7 @@ import os
 import pytest
 
 from plumbline.engines.registry import ENGINES
-from plumbline.execution.plan import Plan, TaskKind
+from plumbline.execution.plan import Plan
 from plumbline.execution.runner import describe_engines
 from plumbline.execution.scenario_verdicts import ScenarioRun
 from plumbline.judging import known_issues
@@ -71,7 +71,8 @@ def test_cell(name, engine, level, workers, engines, truths):
     if info.missing:
         pytest.skip(info.missing)
     plan = Plan([found], [engine], level, limits=Limits(600))
-    bench = ScenarioRun(plan, found, {engine: info})
+    excuses = known_issues.KnownIssues(known_issues.project_known_issues(), has_extra_refinements=False)
+    bench = ScenarioRun(plan, found, {engine: info}, known=excuses)
     known_truth = truths.get((name, level))
     tasks = [*(bench.on_outcome(known_truth) if known_truth else []), *bench.tasks()]
     while tasks:
@@ -80,10 +81,9 @@ def test_cell(name, engine, level, workers, engines, truths):
             if outcome.key.is_truth:
                 truths[name, level] = outcome
             follow += bench.on_outcome(outcome)
-        tasks = [task for task in follow if task.key.kind != TaskKind.DIAGNOSIS]
+        tasks = follow
     rows = bench.findings().rows
     assert rows, "no answer at all"
-    excuses = known_issues.KnownIssues(known_issues.project_known_issues(), has_extra_refinements=False)
     wrong = [
         f"{r.key} {r.verdict}: {r.reason}"
         for r in excuses.mark_known(rows, found.model.n, inertia_ratio(found.model), found.model.kind)
