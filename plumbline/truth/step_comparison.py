@@ -994,7 +994,7 @@ def constrained_deviations(
     else:
         return found
     allowed = np.maximum(method.solver_atol, method.solver_rtol * residual.size)
-    allowed = residual.factor * (allowed + STEP_ROUNDINGS * EPS * residual.size)
+    allowed = allowed + STEP_ROUNDINGS * EPS * residual.size
     columns = (x[:, None] for x in (residual.residual, allowed, residual.size))
     return found | {"equations": [StepDeviations(*columns)]}
 

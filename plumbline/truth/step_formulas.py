@@ -26,6 +26,7 @@ from plumbline.model.kinematics import (
     quaternion_conjugate,
     quaternion_product,
     rotate_vectors,
+    stretched_length,
     velocity_jacobian,
     with_joint_coordinates,
 )
@@ -251,9 +252,8 @@ def engine_coordinates(run: StepRun) -> tuple[Array, Array, Array]:
 class ConstrainedResidual:
     """How far Exudyn's answer is from its equations; sizes are of the terms, for rounding."""
 
-    residual: Array  # (T,) 2-norm of M q̈ + Cᵀ λ − f and of the constraints, N and m or m/s
+    residual: Array  # (T,) 2-norm of M q̈ + Cᵀ λ − f and of the constraints, N and m or m/s; at least
     size: Array  # (T,) norm of the largest terms, N and m or m/s
-    factor: Array  # (T,) of the engine's own residual, at most, in ours
 
 
 def has_written_rows(model: Model) -> bool:
@@ -290,7 +290,6 @@ def constrained_residual(model: Model, method: ConstrainedMethod, run: StepRun) 
     return ConstrainedResidual(
         residual=_norm(terms[0] + terms[1] + held, gaps),
         size=_norm(*terms, held, lengths),
-        factor=np.ones(len(q)),
     )
 
 
@@ -304,8 +303,9 @@ def projected_residual(model: Model, run: StepRun) -> ConstrainedResidual:
         run: T samples with accelerations.
 
     Returns:
-        The residuals Wᵀ (M q̈ − f) at each sample but the first, W from the rates of the joints to q̇, and how
-        far the bodies are from where the joints' coordinates put them.
+        At each sample but the first the larger of Wᵀ (M q̈ − f) over |W|, W from the rates of the joints to q̇,
+        and of how far the bodies are from where the joints' coordinates put them over what a gap of 1 in all
+        joints would move them: the engine's residual is not less.
 
     """
     q, qdot, qddot = (x[1:] for x in engine_coordinates(run))
@@ -318,13 +318,11 @@ def projected_residual(model: Model, run: StepRun) -> ConstrainedResidual:
     there = complete_state(model, bodies)
     sign = np.where(np.sum(bodies.p * there.p, -1, keepdims=True) < 0, -1.0, 1.0)
     gaps = np.concatenate([bodies.r - there.r, bodies.p - sign * there.p], -1).reshape(count, -1)
+    reach = model.n * (1 + float(np.sum(stretched_length(model))))
     turning = _body_rate_matrix(t.p[1:]).mT / 2 @ twists[..., 3:, :]
     rates = np.concatenate([twists[..., :3, :], turning], -2).reshape(count, 7 * model.n, -1)
-    return ConstrainedResidual(
-        residual=_norm(rotate_vectors(rates.mT, terms[0] + terms[1]), gaps),
-        size=_norm(*terms),
-        factor=np.linalg.norm(rates, axis=(1, 2)),
-    )
+    along = _norm(rotate_vectors(rates.mT, terms[0] + terms[1])) / np.linalg.norm(rates, axis=(1, 2))
+    return ConstrainedResidual(residual=np.maximum(along, _norm(gaps) / reach), size=_norm(*terms))
 
 
 def _inertial_and_applied(model: Model, q: Array, qdot: Array, qddot: Array) -> tuple[Array, Array]:
