@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -41,8 +42,11 @@ class Edit:
 
     @property
     def fits(self) -> bool:
-        """Whether the file has the text once."""
-        return (ROOT / self.file).read_text(encoding="utf-8").count(self.old) == 1
+        """Whether the file has the text once, and is a module with the other one too."""
+        source = (ROOT / self.file).read_text(encoding="utf-8")
+        with suppress(SyntaxError):
+            return source.count(self.old) == 1 and bool(ast.parse(source.replace(self.old, self.new)).body)
+        return False
 
 
 EDITS = [Edit(**entry) for entry in table(__file__)]
