@@ -138,7 +138,9 @@ class _Diagnosing:
     def search(self, view: View) -> Search:
         """The candidates of a view, screened once."""
         if view not in self.searches:
-            self.searches[view] = Search(self.difference(view))
+            difference = self.difference(view)
+            is_linear = view != View() and not difference.is_predictable
+            self.searches[view] = Search(difference, of_terms_alone=is_linear)
         return self.searches[view]
 
     def causes(self) -> tuple[Cause, ...]:
@@ -220,8 +222,6 @@ class _Diagnosing:
     def _single_of_another_kind(self, view: View, wrong: Sequence[str]) -> tuple[Cause, ...]:
         """The same of engines in maximal coordinates, or that take a state with loops in another way."""
         if not (view.are_bodies_kept or self.model.has_loops) or not set(VECTORS[:2]) & set(wrong):
-            return ()
-        if not self.difference(view).is_predictable:
             return ()
         return self._single(view) or self._single(view, are_sums_apart=True)
 

@@ -86,9 +86,10 @@ class Difference:
 
     @property
     def is_predictable(self) -> bool:
-        """Whether the prediction without a mistake is the truth: else it says nothing of mistakes.
+        """Whether the prediction without a mistake is the truth: else it says nothing of other numbers.
 
-        An engine in maximal coordinates is predicted by the reference's rows, which may be what is wrong.
+        An engine in maximal coordinates is predicted by the reference's rows, which may be what is wrong;
+        what a term of them would change it says all the same.
         """
         return bool(np.all(np.abs(self.off(self.predictor.right)) <= self.accepted(self.everything)))
 
