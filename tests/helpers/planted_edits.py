@@ -14,6 +14,7 @@ from types import ModuleType
 from plumbline.engines.registry import ENGINES, load_adapter
 from plumbline.execution.plan import Plan
 from plumbline.execution.scenario_verdicts import ScenarioRun
+from plumbline.judging.known_issues import KnownIssues, project_known_issues
 from plumbline.judging.rows import Row
 from plumbline.processes.worker_pool import run_task
 from plumbline.scenario.generator import RandomScenarios
@@ -24,6 +25,7 @@ ROOT = Path(__file__).parents[2]
 BETWEEN = {  # modules that hold parts of the edited one and are loaded between it and the adapter
     "reference_impl.elements": ("reference_impl.direct",),
     "reference_impl.joints": ("reference_impl.direct",),
+    "adapters.exudyn_common": ("adapters.exudyn_variants",),
 }
 
 
@@ -83,4 +85,5 @@ def rows_of_run(edit: Edit, scenario_name: str, level: str, states: int) -> list
         waiting = list(run.tasks())
         while waiting:
             waiting += run.on_outcome(run_task(waiting.pop(0)))
-    return run.findings().rows
+    known = KnownIssues(project_known_issues(), has_extra_refinements=False)
+    return run.judged_rows(run.findings(), known)
