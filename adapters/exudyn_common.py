@@ -319,7 +319,8 @@ def sizes_of_body(**sizes: Any) -> Mapping[str, Any]:
 
 def known_arguments(function: Callable[..., Any], given: Mapping[str, Any]) -> Mapping[str, Any]:
     """Leave out what older versions of a function have not."""
-    return {name: value for name, value in given.items() if name in _parameters(function)}
+    own = getattr(function, "__func__", function)  # of a method of a system, which would be kept alive
+    return {name: value for name, value in given.items() if name in _parameters(own)}
 
 
 @cache

@@ -132,9 +132,8 @@ RUN_ITERATIONS = 3  # of Newton's method on welds, a linear problem: the second 
 # Of steps, two: rounding of forces falls as 1/R, where both have it alike their difference is 0.41 of it, and
 # what three of a sequence leave of R is below rounding still.
 STEP_REGULARISATIONS = tuple(factor * LARGEST_REGULARISATIONS[0] for factor in (SEQUENCES[0], SEQUENCES[2]))
-NEARBY_STEPS = (
-    8  # before and after a step, whose differences are of one size: a singular pose is passed in fewer
-)
+# before and after a step, whose differences are of one size: a singular pose is passed in fewer
+NEARBY_STEPS = 8
 NO_SAME_FRAME = 0  # mjSAMEFRAME_NONE; the first versions have no enumeration
 MAX_ORDER_ERROR = 0.1
 MIN_SOFTNESS = 1e-9  # a smaller relative effect of R is rounding

@@ -53,8 +53,8 @@ _WRONG: Mapping[str, str] = {
 - Products of inertia of bodies whose axes are turned by 1e-6 rad or less are left out
   ([script](mujoco_small_products_of_inertia.py)).
 - Before 4.0 `cdof` and `cdof_dot` of joints by name or number are those of others
-  ([script](mujoco_named_joint_axes.py)), and before 3.14 moments of welds are doubled
-  ([script](mujoco_weld_moments.py)).
+  ([script](mujoco_named_joint_axes.py)), and before 3.14 the moments of joints count the
+  multipliers of welds for their moments ([script](mujoco_weld_moments.py)).
 """,
     "pinocchio": """\
 - Rates of Jacobians, Coriolis matrix, rate of the centroidal map and analytical derivatives where a

@@ -321,7 +321,8 @@ def projected_residual(model: Model, run: StepRun) -> ConstrainedResidual:
     reach = model.n * (1 + float(np.sum(stretched_length(model))))
     turning = _body_rate_matrix(t.p[1:]).mT / 2 @ twists[..., 3:, :]
     rates = np.concatenate([twists[..., :3, :], turning], -2).reshape(count, 7 * model.n, -1)
-    along = _norm(rotate_vectors(rates.mT, terms[0] + terms[1])) / np.linalg.norm(rates, axis=(1, 2))
+    size = np.maximum(np.linalg.norm(rates, axis=(1, 2)), np.finfo(float).tiny)  # 0 of what is welded
+    along = _norm(rotate_vectors(rates.mT, terms[0] + terms[1])) / size
     return ConstrainedResidual(residual=np.maximum(along, _norm(gaps) / reach), size=_norm(*terms))
 
 

@@ -27,10 +27,8 @@ def attention(name):
     """The rows of all runs of one edit that need attention and are not on record."""
     (edit,) = [edit for edit in EDITS if edit.name == name]
     found = [row for run in edit.runs for row in rows_of_run(edit, *run, STATES)]
-    return [
-        row for row in found
-        if row.verdict.needs_attention and row.verdict != Verdict.UNSUPPORTED and row.known_issue is None
-    ]  # fmt: skip
+    unrecorded = [row for row in found if row.known_issue is None and row.verdict.needs_attention]
+    return [row for row in unrecorded if row.verdict != Verdict.UNSUPPORTED]
 
 
 def test_every_edit_fits_its_file():

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from plumbline.model.datatypes import EngineFailure
+from plumbline.model.kinematics import stretched_length
 from plumbline.scenario.loader import find_scenario_file, load_scenario
 from plumbline.truth import TruthUnavailable, certificate_proof, import_truth_tool
 from plumbline.truth.certificate_file import Certificate, parse_certificate
@@ -24,7 +25,7 @@ from plumbline.truth.certificate_proof import (
 )
 from plumbline.truth.certified_state import certify_state
 from plumbline.truth.taylor import simulate_taylor
-from plumbline.truth.trajectory_truth import judge_claim
+from plumbline.truth.trajectory_truth import judge_claim, trajectory_truth
 from tests.helpers.catalogue import catalogue_scenarios
 from tests.helpers.nightly_tests import SLOW
 from tests.helpers.random_chains import random_chain
@@ -306,6 +307,15 @@ def check_present_truth(scenario, duration):
     _, enclosure = prove_motion(scenario.model, scenario.state, times)
     assert enclosure.radius("r") <= 1e-18
     assert judge_claim(scenario.model, scenario.state, times, enclosure, None) <= 1
+    truth = trajectory_truth(scenario.model, scenario.state, times)
+    arms = float(np.sum(stretched_length(scenario.model)))
+    for k, r in enumerate(enclosure.r):
+        error = [[abs(ball - arb(float(x))) for ball, x in zip(*pair, strict=True)]
+                 for pair in zip(r, truth.trajectory.r[k], strict=True)]  # fmt: skip
+        largest = max(float(np.linalg.norm([float(x.upper()) for x in row])) for row in error)
+        # of positions that arms, and slides, add up to
+        rounding = 2.0**-53 * max(arms, float(np.max(np.linalg.norm(truth.trajectory.r[k], axis=-1))))
+        assert largest <= truth.uncertainty["position"][k] + 2 * rounding + enclosure.radius("r")
 
 
 @pytest.mark.full
