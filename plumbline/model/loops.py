@@ -430,7 +430,8 @@ def motion_without_inertia(model: Model, state: State) -> int | None:
         state: a state of it, its loops closed.
 
     Returns:
-        The body without inertia about some axis that moves most; None where there is no such motion.
+        The first body without inertia about some axis that has about the largest part in such motions; None
+        where there is none.
 
     """
     if not model.lacks_inertia:
@@ -450,10 +451,13 @@ def motion_without_inertia(model: Model, state: State) -> int | None:
     values, vectors = np.linalg.eigh(own / size / size[:, None])
     if values[0] > MIN_MASS_RATIO:
         return None
-    rates = velocity_jacobian(tree, there).reshape(tree.n, 6, -1) @ (null @ (vectors[:, 0] / size))
+    free = null @ (vectors[:, values <= MIN_MASS_RATIO] / size[:, None])
+    turns = (velocity_jacobian(tree, there) @ free).reshape(tree.n, 6, -1)[place[: model.n], 3:]
     principal = np.linalg.eigvalsh(model.inertia)
     lacking = principal[:, 0] <= ZERO_INERTIA * principal[:, 2]
-    return int(np.argmax(np.where(lacking, np.linalg.norm(rates[place[: model.n], 3:], axis=1), -1.0)))
+    # Of several such motions any basis is as good: their norm is that of all, and equal ones are the first's.
+    parts = np.where(lacking, np.linalg.norm(turns, axis=(1, 2)), -1.0)
+    return int(np.argmax(parts > np.max(parts) / 2))
 
 
 def loop_gaps(model: Model, state: State) -> tuple[Float[Array, "loops"], Float[Array, "loops"]]:

@@ -20,14 +20,14 @@ from typing import Any, NoReturn
 from plumbline.processes.exceptions import PlumblineError, one_line
 from plumbline.processes.isolation import die_with_parent, kill_tree
 from plumbline.processes.remote_python import describe_exit
-from plumbline.processes.worker_environment import SINGLE_THREAD, TEMPORARY_FOLDER
+from plumbline.processes.worker_environment import KERNELS, SINGLE_THREAD, TEMPORARY_FOLDER
 
 COMMAND_PREFIX = "cmd:"
 _VARIABLE = re.compile(r"[A-Za-z_]\w*=.*", re.DOTALL)
 MAX_LINE = 2**26  # bytes of an answer
 MAX_SHOWN = 200  # characters of a line or of the last words, in messages
 SECONDS_TO_END = 2.0  # after its input was closed, or its output
-INHERITED = ("PATH", "HOME", "LANG", "LC_ALL", "SYSTEMROOT", *TEMPORARY_FOLDER, *SINGLE_THREAD)
+INHERITED = ("PATH", "HOME", "LANG", "LC_ALL", "SYSTEMROOT", *TEMPORARY_FOLDER, *SINGLE_THREAD, *KERNELS)
 
 
 class BadSpecification(PlumblineError):

@@ -12,6 +12,11 @@ from fnmatch import fnmatchcase
 SINGLE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
 )
+# Which kernels numerical libraries use: some processors need it said, and other kernels round otherwise.
+KERNELS = (
+    "OPENBLAS_CORETYPE", "OPENBLAS_L2_SIZE", "NPY_DISABLE_CPU_FEATURES", "MKL_CBWR",
+    "MKL_ENABLE_INSTRUCTIONS", "BLIS_ARCH_TYPE", "NVPL_BLAS_DEBUG_CPU_TYPE",
+)  # fmt: skip
 # Variables that name a terminal, a login, a job or a test, and settings of tools that workers do not run.
 SESSION_VARIABLES = (
     "_", "PWD", "OLDPWD", "SHLVL", "HOSTNAME", "PS[1-4]", "PROMPT*", "HIST*", "MAIL", "PAGER", "LESS*",

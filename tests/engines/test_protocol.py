@@ -12,7 +12,7 @@ import pytest
 from plumbline.engines import protocol
 from plumbline.engines.engine_calls import describe_engine, evaluate_states
 from plumbline.engines.registry import load_adapter
-from plumbline.model.datatypes import EngineFailure, Unsupported
+from plumbline.model.datatypes import EngineFailure, Model, State, Unsupported
 from plumbline.model.kinematics import angular_velocity
 from plumbline.processes.line_process import LineProcess
 from plumbline.processes.worker_pool import Limits, Task, WorkerPool
@@ -157,6 +157,11 @@ def test_a_stored_transcript_is_what_is_asked_and_answered_today(transcript):
     """Servers that were written for a version of the protocol are asked in the same words."""
     lines = [json.loads(line) for line in transcript.read_text(encoding="utf-8").splitlines()]
     asked, answers = lines[::2], lines[1::2]
+    questions = {question["ask"]: question for question in asked}  # their numbers, on every processor
+    model = Model.from_fields({name: x for name, x in questions["model"]["model"].items() if x != []})
+    states = [
+        State(**{name: np.array(x) for name, x in one.items()}) for one in questions["evaluate"]["states"]
+    ]
 
     class Replay:
         has_ended = False
@@ -173,8 +178,8 @@ def test_a_stored_transcript_is_what_is_asked_and_answered_today(transcript):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(protocol, "LineProcess", lambda command, variables: Replay())
         adapter = protocol.served_engine(["transcript"], {})
-        adapter.evaluate(MODEL, STATES)
-        adapter.simulate(MODEL, STATES[0], TIMES, "still", 0.1)
+        adapter.evaluate(model, states)
+        adapter.simulate(model, states[0], TIMES, "still", 0.1)
     assert seen == asked
 
 
