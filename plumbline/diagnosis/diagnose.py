@@ -328,7 +328,7 @@ class _Diagnosing:
     def _altered(self, search: Search, found: Explanation) -> tuple[Case, Answers]:
         """The mechanism with a cause, and the quantities that follow."""
         difference = search.difference
-        effect = difference.evaluate([(found.combination, found.amounts)])[0] * difference.weight
+        (effect,) = difference.effects([(found.combination, found.amounts)])
         right = {q: x + effect[difference.quantity == q].reshape(x.shape) for q, x in difference.true.items()}
         case = changed(difference.predictor.case, found.combination, found.amounts)
         fields = vars(self.model).items()

@@ -35,7 +35,8 @@ UNITS = {"mass": " kg", "inertia": " kg m²", "force": " N", "moment": " N m", "
 class Edit:
     """A change of what an engine evaluates, by the numbers x, of which ``nominal`` are right; or by none.
 
-    Of a term that is linear it has the effect (m,) per unit of its amount in place of the change.
+    Of a term that is linear it has the effect (m,) on the quantities, in their units, per unit of its amount
+    in place of the change.
     """
 
     cause: Cause

@@ -119,7 +119,7 @@ class Difference:
     def flat_vectors(self, answers: Answers) -> Array:
         """Return changes of vectors (S, …) as an effect (m,); the sums do not change."""
         zeros = {name: 0 * x for name, x in self.predictor.right.items()}
-        return np.asarray(self._flat(zeros | answers) / self.weight)
+        return self._flat(zeros | answers)
 
     @cached_property
     def terms(self) -> list[Edit]:
@@ -132,7 +132,11 @@ class Difference:
         return [Edit(cause, effect=self.flat_vectors(change)) for cause, change in changes]
 
     def evaluate(self, lanes: Sequence[Lane]) -> Array:
-        """Return the effects of combinations of candidates with their amounts, (lanes, m)."""
+        """Return the effects of combinations of candidates with their amounts, (lanes, m) in bounds."""
+        return self.effects(lanes) / self.weight
+
+    def effects(self, lanes: Sequence[Lane]) -> Array:
+        """Return the same in the units of the quantities, also of those whose bound is 0."""
         linear = np.zeros((len(lanes), len(self.values)))
         with np.errstate(all="ignore"):
             cases = [changed(self.predictor.case, *lane) for lane in lanes]
@@ -143,7 +147,7 @@ class Difference:
         others = [i for i, case in enumerate(cases) if case is not self.predictor.case]
         if others:
             answers = self.predictor.predict([cases[i] for i in others])
-            linear[others] += (self._flat(answers, 1) - self._flat(self.predictor.right)) / self.weight
+            linear[others] += self._flat(answers, 1) - self._flat(self.predictor.right)
         return linear
 
 

@@ -350,6 +350,18 @@ def test_a_wrong_number_and_a_wrong_output_are_separated(name):
     ]  # fmt: skip
 
 
+@pytest.mark.filterwarnings("error:invalid value:RuntimeWarning")
+def test_a_wrong_output_is_separated_where_an_energy_is_zero_without_rounding():
+    """Without gravity and springs the bound of the potential energy is 0."""
+    model, truth = known("free-body-with-rotors")
+    assert truth.bounds[0].tolerance("potential_energy") == 0
+    heavier = replace(model, mass=model.mass * [1.01, 1, 1, 1])
+    wrong = [replace(a, kinetic_energy=2 * a.kinetic_energy) for a in answers_of(heavier, truth)]
+    mass, energy = diagnose(model, wrong, truth).causes
+    assert identity(mass) == ("number", "mass", "body 1", "")
+    assert identity(energy) == ("output", "kinetic energy", "", "multiplied by")
+
+
 def test_a_defect_in_the_dynamics_alone_is_named():
     """Energies and momentum are found from the right numbers."""
     model, truth = known()
