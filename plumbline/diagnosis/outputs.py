@@ -480,10 +480,13 @@ class Outputs:
                   "the far points": hung, "the points of the joints that carry welds": carrying}  # fmt: skip
         parts = list[Part]()
         for what, point in points.items():
-            lever = cross(self._near - point, self.right["joint_reaction"])
+            lever, known = cross(self._near - point, self.right["joint_reaction"]), list[Array]()
             for kind in ("joint", *dict.fromkeys(model.kind)):
-                where = np.array([kind in ("joint", own) for own in model.kind])[:, None]
-                moment = self._determinate(np.array([0 * lever, lever * where]))[1]
+                moment = lever * np.array([kind in ("joint", own) for own in model.kind])[:, None]
+                if any(np.array_equal(moment, one) for one in known):
+                    continue  # no other joints have such an arm: it has the name of all
+                known.append(moment)
+                moment = self._determinate(np.array([0 * lever, moment]))[1]
                 parts.append(Part(f"the arm of {kind}s to {what}", moment, f"of {kind}s about {what}"))
         return parts
 
