@@ -6,6 +6,7 @@ Their effects follow from the responses of the right mechanism to unit wrenches 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,14 +80,37 @@ class Terms:
                 along = np.matvec(self.found.held[at].mT, part[:, at])
                 if np.max(np.abs(along), initial=0.0) > NOT_HELD * max(float(np.max(np.abs(own))), 1e-300):
                     effects[k] = np.matvec(self._responses[..., self._columns[at]], along[:, None, None])
-            for k, effect in effects.items():
-                yield Cause("term", term, f"joint {k + 1}", nominal=(1.0,), unit="×"), self.answers(effect)
-            if len(effects) > 1:
-                every = np.sum(list(effects.values()), axis=0)
-                yield Cause("term", term, "all joints", nominal=(1.0,), unit="×"), self.answers(every)
+            yield from self._of_joints(effects, Cause("term", term, nominal=(1.0,), unit="×"))
+
+    def _of_joints(self, effects: dict[int, Array], cause: Cause) -> Iterator[tuple[Cause, Answers]]:
+        """One cause at each joint, and at all where there are several, with the effects."""
+        places = {f"joint {k + 1}": effect for k, effect in effects.items()}
+        if len(effects) > 1:
+            places["all joints"] = np.sum(list(effects.values()), axis=0)
+        for place, effect in places.items():
+            yield replace(cause, place=place), self.answers(effect)
+
+    def _dampers_about_one_axis(self) -> Iterator[tuple[Cause, Answers]]:
+        """Dampers of joints with all turns that act about one axis of the body alone."""
+        kinds, damping = self.model.kinds, self.model.damping[:, 0]
+        damped = [k for k, kind in enumerate(kinds) if kind.is_spherical and damping[k]]
+        turns, omega = rotation_matrix(self.state.p), self.found.omega
+        moments = self.found.to_wrenches()[..., 1, :] if damped else np.zeros(0)
+        for i, axis in enumerate("xyz" if damped else ""):
+            effects = {}
+            for k in damped:
+                at = int(self.joints[k])
+                far, along = self.found.far[at], turns[:, at, :, i]
+                spin = omega[:, at] - (omega[:, far] if far >= 0 else 0.0)
+                lost = damping[k] * (spin - np.vecdot(spin, along)[:, None] * along)
+                units = moments[..., at, :] - (moments[..., far, :] if far >= 0 else 0.0)
+                effects[k] = np.matvec(units, lost[:, None, None])
+                effects[k][:, at, 3] += lost  # what the damper applies is a part of the joint's moment
+            yield from self._of_joints(effects, Cause("term", "damping", "", f"about the {axis} axis alone"))
 
     def fixed(self) -> Iterator[tuple[Cause, Answers]]:
-        """List rows, joints and loops that may be left out, with the effect."""
+        """List rows, joints, loops and parts of dampers that may be left out, with the effect."""
+        yield from self._dampers_about_one_axis()
         for k, kind in enumerate(self.model.kinds):
             if kind.holds_nothing:
                 continue
