@@ -10,6 +10,7 @@ IS_INSTALLED = (_PACKAGE / "adapters").is_dir()
 ROOT = _PACKAGE if IS_INSTALLED else _PACKAGE.parent  # has adapters, reference_impl, scenarios and reports
 PREFIX = "plumbline." if IS_INSTALLED else ""  # of the names of their modules
 DEFAULT_OUT = Path("plumbline-out") if IS_INSTALLED else Path("reports") / "out"
+_GENERATED = "\n<!-- What follows is generated. -->\n\n"  # in pages of docs, after what is written by hand
 
 
 def output_folder(name: str) -> Path:
@@ -20,3 +21,15 @@ def output_folder(name: str) -> Path:
 
     """
     return DEFAULT_OUT / name if IS_INSTALLED else Path(name)
+
+
+def generated_page(path: str, part: str) -> str:
+    """Return a page of the documentation with another generated part.
+
+    Args:
+        path: of the page, relative to the folder of the documentation.
+        part: Markdown, all that follows what is written by hand.
+
+    """
+    by_hand, mark, _ = (ROOT / "docs" / path).read_text(encoding="utf-8").partition(_GENERATED)
+    return by_hand + mark + part

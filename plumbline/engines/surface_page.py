@@ -1,4 +1,4 @@
-"""The pages docs/surface.md and docs/surface/ENGINE.md, written from the files of adapters/surface.
+"""The tables of docs/surface.md and docs/surface/ENGINE.md, written from the files of adapters/surface.
 
 python -m plumbline.engines.surface_page
 """
@@ -19,73 +19,14 @@ from plumbline.engines.surface import (
     declared_surface,
     exercised_rows,
 )
-from plumbline.layout import ROOT
+from plumbline.layout import ROOT, generated_page
 
-_HEAD = """# The engines' surface
-
-For everybody who asks what of an engine is compared. Every public name that could be about rigid motion is
-compared by rows of a run, not compared yet with the reason, or outside for one of five reasons (contact,
-rendering, input and output, memory, another physics):
-
-"""
-_REST = """
-A page has the names by module, class and enumeration, and what is wrong so far; each name stands on it
-once. The lists are those of `adapters/surface`, which a test compares with the installed engines.
-`plumbline list surface` counts the names and lists those that the installed version has besides, as a night
-does.
-
-A name is exercised where a relative change of 1e-6 in what it returns turns a row red (`python -m
-plumbline.studies.exercised_names > adapters/surface/exercised.json` computes it). Of names that a variant
-or the column itself uses together, everything that they return together is changed. Settings of Exudyn's
-solvers are compared on mass points that are pushed to the positions of the bodies, by a force that makes
-each parameter of a method show, and items that no column builds a mechanism of are put where the bodies are
-([points](../adapters/exudyn_points.py), [items](../adapters/exudyn_items.py)): on mechanisms of up to three
-bodies, at one state.
-
-Written by `python -m plumbline.engines.surface_page`.
-"""
 _TITLES = {COMPARED: "Compared", NOT_YET: "Not compared yet", OUTSIDE_STATUS: "Outside"}
 _NAMES = {"mujoco": "MuJoCo", "pinocchio": "Pinocchio", "exudyn": "Exudyn"}
-_WRONG: Mapping[str, str] = {
-    "mujoco": """\
-- The sensor of the actuator force at a tendon, `tendonactuatorfrc`, leaves out the gears
-  ([script](mujoco_tendon_actuator_force.py)).
-- Products of inertia of bodies whose axes are turned by 1e-6 rad or less are left out
-  ([script](mujoco_small_products_of_inertia.py)).
-- Before 4.0 `cdof` and `cdof_dot` of joints by name or number are those of others
-  ([script](mujoco_named_joint_axes.py)), and before 3.14 the moments of joints count the
-  multipliers of welds for their moments ([script](mujoco_weld_moments.py)).
-""",
-    "pinocchio": """\
-- Rates of Jacobians, Coriolis matrix, rate of the centroidal map and analytical derivatives where a
-  composite joint is universal or planar ([script](pinocchio_composite_rates.py)).
-- `computeMinverse` on long chains.
-- The kinetic energy of rotors on revolute and helical joints about a given axis
-  ([script](pinocchio_kinetic_energy_of_rotors.py)).
-- The gravity of models that `appendModel` makes ([script](pinocchio_append_model.py)), and the pitch of
-  screw joints that are made without one ([script](pinocchio_pitch_of_screws.py)).
-- The Delassus matrices of constraints between two bodies ([script](pinocchio_delassus_of_two_bodies.py)).
-- The order of the entries of kinematic Hessians in Python ([script](pinocchio_kinematic_hessians.py)).
-""",
-    "exudyn": """\
-- The tangent operators of SE(3), `TExpSE3` and `TExpSE3Inv` ([script](exudyn_tangent_operators.py)).
-- `GetODE2CoordinatesTotal`, which corrupts memory ([script](exudyn_coordinates_total.py)).
-- The masses that slides of `KinematicTree33` carry ([script](exudyn_kinematic_tree_33.py)).
-- The steps of `ODE23` and `DOPRI5`, which depend on the sign of coordinates
-  ([script](exudyn_step_control.py)).
-- Functions in Python for `PostNewton`, which are called only where `ComputeNewtonResidual` has one, too
-  ([script](exudyn_post_newton_function.py)).
-""",
-}
 
 
 def surface_pages() -> dict[str, str]:
-    """Write all pages.
-
-    Returns:
-        By path relative to the folder of the documentation Markdown.
-
-    """
+    """Return all pages with new tables, by path relative to the folder of the documentation."""
     surfaces = [declared_surface(name) for name in SURFACES]
     lines = [
         "| engine | version | compared | exercised | not yet | outside | exercised of all not outside |",
@@ -97,19 +38,16 @@ def surface_pages() -> dict[str, str]:
         link = f"[{_NAMES[one.engine]}](surface/{one.engine}.md)"
         cells = link, one.version, count[COMPARED], exercised, count[NOT_YET], count[OUTSIDE_STATUS]
         lines.append(f"| {' | '.join(map(str, cells))} | {100 * exercised / inside:.0f} % |")
-    pages = {f"surface/{one.engine}.md": "\n".join(_engine_page(one)) + "\n" for one in surfaces}
-    return {"surface.md": _HEAD + "\n".join(lines) + "\n" + _REST, **pages}
+    parts = {f"surface/{one.engine}.md": [*_engine_tables(one)] for one in surfaces}
+    parts["surface.md"] = lines
+    return {path: generated_page(path, "\n".join(part) + "\n") for path, part in parts.items()}
 
 
-def _engine_page(surface: Surface) -> Iterator[str]:
-    name, places = _NAMES[surface.engine], dict[str, list[SurfaceName]]()
+def _engine_tables(surface: Surface) -> Iterator[str]:
+    places: dict[str, list[SurfaceName]] = {}
     for one in surface.names:
         places.setdefault(one.place, []).append(one)
-    yield f"# What of {name} is compared\n"
-    yield f"For everybody who asks whether a name of {name} {surface.version} is compared: search it here."
-    yield "[The overview](../surface.md) says what the words mean.\n"
-    yield f"## Wrong so far\n\n{_WRONG[surface.engine]}"
-    yield "## Places\n"
+    yield f"## Places\n\nThe names are those of version {surface.version}.\n"
     yield "| names | compared | not yet | outside | not about motion |\n|---|---|---|---|---|"
     for place, names in places.items():
         counts = [sum(one.status == status for one in names) for status in

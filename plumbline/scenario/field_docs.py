@@ -1,11 +1,13 @@
-"""Write docs/scenario-files.md from the schema: python -m plumbline.scenario.field_docs."""
+"""Write the tables of docs/scenario-files.md from the schema: python -m plumbline.scenario.field_docs."""
 
 from __future__ import annotations
 
 from typing import Any
 
+from plumbline.layout import ROOT, generated_page
 from plumbline.scenario.loader import json_schema
-from plumbline.scenario.schema import SCHEMA_VERSION
+
+PAGE = "scenario-files.md"
 
 SECTION_HEADINGS = {  # in the page's order
     "Document": "The file",
@@ -31,110 +33,14 @@ BOUND_FORMATS = {
     "maximum": "≤ {}",
     "maxLength": "≤ {} characters",
 }
-INTRODUCTION = f"""\
-# Scenario files
-
-`python -m plumbline.scenario.field_docs` writes this page from the schema that reads the files.
-[Add a scenario](add-a-scenario.md) is a worked example.
-
-A scenario file is YAML 1.2 (UTF-8, no tabs for indentation) of schema version {SCHEMA_VERSION}.
-It describes rigid bodies on joints (a chain, a tree, loops), their state at t = 0 and their loads. Everything
-is in SI units; angles are in rad unless the field is called `degrees`; the world's z axis points up; a body's
-frame has its origin at the centre of mass. Write numbers without a unit. Unknown fields are errors.
-
-`python -m plumbline check FILE…` reports every mistake of every file with line and column;
-`python -m plumbline schema` prints the JSON Schema for editors.
-
-The initial state is given by attitudes, rod directions, joint coordinates and rates; positions and velocities
-follow, so every state satisfies the joints. Quaternions and directions are normalised; the part of a rod's
-rate along the rod that rounding left is removed.
-
-A body hangs from the one before it unless it names another `parent`. This tree has an arm that turns about
-the world's vertical, and on it a pendulum on a hinge with a damper and a rotor, and a slider with a spring of
-its own and one to the pendulum. Trees are compared at every level but that of steps; with rotors, springs,
-dampers or efforts a run compares states only:
-
-```yaml
-schema_version: 1
-title: An arm with a pendulum and a slider
-purpose: Two bodies that hang from one, on joints with axes.
-bodies:
-  - name: arm
-    mass: 0.5
-    inertia: {{principal: [0.001, 0.01, 0.01]}}
-    joint: {{kind: hinge, axis: [0, 0, 1], rates: [2.0]}}
-    proximal: [-0.2, 0, 0]
-    distal: [0.2, 0, 0]
-  - name: pendulum
-    mass: 0.2
-    inertia: {{principal: [0.002, 0.002, 0.0001]}}
-    joint: {{kind: hinge, axis: [1, 0, 0], coordinates: [0.5], damping: 0.01, armature: 0.0005}}
-    proximal: [0, 0, 0.15]
-  - name: slider
-    parent: arm
-    anchor: [0.05, 0, 0]
-    mass: 0.1
-    inertia: {{principal: [0.0001, 0.0001, 0.0001]}}
-    joint: {{kind: slide, axis: [1, 0, 0], coordinates: [0.02], stiffness: 20, rest: 0.01}}
-    proximal: [0, 0, 0]
-springs:
-  - bodies: [pendulum, slider]
-    points: [[0, 0, -0.1], [0, 0, 0]]
-    stiffness: 5
-    length: 0.2
-```
-
-Joints beyond those of the tree close loops. This is a slider-crank: a crank on the world, a rod of 0.3 m on
-its end, and a slider that moves along x and on which the rod's other end is held. Of the rates only the
-crank's is given, the others follow. States, single steps, motions, long runs and relations of loops are
-compared; a motion or long run that comes to a singular pose is compared up to it, and `plumbline check`
-names the joints that the loops keep from moving, and says where every pose is singular, so that nothing can
-be compared:
-
-```yaml
-schema_version: 1
-title: A slider-crank
-purpose: One loop of three hinges and a slide in a plane, with rows that depend on others.
-bodies:
-  - name: crank
-    mass: 0.4
-    inertia: {{principal: [0.0002, 0.002, 0.002]}}
-    joint: {{kind: hinge, axis: [0, 1, 0], coordinates: [0], rates: [3.0]}}
-    proximal: [-0.05, 0, 0]
-    distal: [0.05, 0, 0]
-  - name: rod
-    mass: 0.5
-    inertia: {{principal: [0.0003, 0.004, 0.004]}}
-    joint: {{kind: hinge, axis: [0, 1, 0]}}
-    proximal: [-0.15, 0, 0]
-  - name: slider
-    parent: world
-    mass: 0.3
-    inertia: {{principal: [0.0001, 0.0001, 0.0001]}}
-    joint: {{kind: slide, axis: [1, 0, 0], coordinates: [0.4]}}
-    proximal: [0, 0, 0]
-closes:
-  - body: slider
-    parent: rod
-    anchor: [0.15, 0, 0]
-    proximal: [0, 0, 0]
-    joint: {{kind: hinge, axis: [0, 1, 0]}}
-```
-"""
 
 
 def field_reference() -> str:
-    """Write the page.
-
-    Returns:
-        The text of docs/scenario-files.md, Markdown.
-
-    """
+    """Return the page with tables of all fields."""
     whole = json_schema()
     parts = {"Document": whole, **whole["$defs"]}
-    return "\n".join(
-        [INTRODUCTION, *(_render_section(parts[name], heading) for name, heading in SECTION_HEADINGS.items())]
-    )
+    tables = (_render_section(parts[name], heading) for name, heading in SECTION_HEADINGS.items())
+    return generated_page(PAGE, "\n".join(tables))
 
 
 def _render_section(part: dict[str, Any], heading: str) -> str:
@@ -178,4 +84,4 @@ def _base_type(field: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    print(field_reference(), end="")
+    (ROOT / "docs" / PAGE).write_text(field_reference(), encoding="utf-8")
