@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,6 +11,7 @@ import click
 
 from plumbline.cli import options
 from plumbline.cli.help_texts import EXIT_CODES, examples
+from plumbline.cli.terminal_output import log, print_json
 from plumbline.engines.environments import EnvironmentUnavailable, version_problem
 from plumbline.engines.registry import IMPORTERS
 from plumbline.execution.exit_codes import ExitCode
@@ -19,7 +19,7 @@ from plumbline.execution.plan import Plan
 from plumbline.model_files.model_run import ModelPlan
 from plumbline.processes.worker_pool import Limits
 from plumbline.scenario.generator import RANDOM_FAMILY, RandomScenarios, random_seed
-from plumbline.scenario.line_and_column_errors import did_you_mean, shorten
+from plumbline.scenario.line_and_column_errors import did_you_mean, nearest_or_all, shorten
 from plumbline.scenario.loader import Scenario
 from plumbline.storage.results_store import read_model_results, read_results
 from plumbline.storage.version_changes import add_version_change
@@ -30,8 +30,7 @@ STATES = 3  # of a model file; a reading that differs shows at any
 
 def _check_engine(_: click.Context, __: click.Parameter, name: str | None) -> str | None:
     if name is not None and name not in IMPORTERS:
-        hint = did_you_mean(name, list(IMPORTERS)) or f"there are: {', '.join(IMPORTERS)}"
-        raise click.BadParameter(f"no importer {name!r}; {hint}")
+        raise click.BadParameter(f"no importer {name!r}; {nearest_or_all(name, IMPORTERS)}")
     return name
 
 
@@ -57,12 +56,11 @@ def _check_version(_: click.Context, parameter: click.Parameter, text: str | Non
 @options.model_file_options(are_passed=True)
 @click.option("--strip-geometry", is_flag=True, help="As for `model`.")
 @options.jobs_option
-@options.timeout_option(300.0)
-@options.memory_option
+@options.limits_options(300.0)
 @options.json_option
 def bisect(
     target: Path, key: str | None, engine: str | None, good: str, bad: str, base: Any, strip_geometry: bool,
-    root: Path | None, jobs: int, timeout: float, memory: float, as_json: bool,
+    root: Path | None, jobs: int, limits: Limits, as_json: bool,
 ) -> None:  # fmt: skip
     """Find the version of an engine that changed its reading of a model file, or the verdict of a row.
 
@@ -73,7 +71,6 @@ def bisect(
 
     Exit code 0: a change was found; 1: both ends answer alike.
     """
-    limits = Limits(timeout, memory)
     try:
         if key is not None:
             change, notes = _search_result(target, key, good, bad, jobs, limits)
@@ -90,20 +87,23 @@ def bisect(
     except NoSearch as error:
         raise click.UsageError(str(error)) from None
     except EnvironmentUnavailable as error:
-        click.echo(str(error), err=True)
+        log(str(error))
         sys.exit(ExitCode.ENGINE_FAILED)
     for note in notes:
-        click.echo(note, err=True)
+        log(note)
     document = _document(change) | {"not_tried": notes}
     if key is not None:
         about = {name: document[name] for name in ("last_before", "first_after")}
         add_version_change(target, key, about | {"note": change.note})
-    click.echo(json.dumps(document, ensure_ascii=False, indent=1) if as_json else change.sentence)
+    if as_json:
+        print_json(document)
+    else:
+        click.echo(change.sentence)
     sys.exit(ExitCode.SUCCESS if change.first_after else ExitCode.DISAGREEMENT)
 
 
 def _report(version: str, text: str) -> None:
-    click.echo(f"{version}: {text}", err=True)
+    log(f"{version}: {text}")
 
 
 def _document(change: VersionChange) -> dict[str, Any]:
@@ -156,5 +156,5 @@ def _scenario(name: str, stored: Mapping[str, Any]) -> Scenario:
     origin = str(entry.get("file", ""))
     (found,) = options.read_scenarios([origin if "/" in origin else name])
     if entry.get("digest") not in (None, found.digest):
-        click.echo(f"the scenario {name} has changed since the run", err=True)
+        log(f"the scenario {name} has changed since the run")
     return found

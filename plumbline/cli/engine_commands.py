@@ -52,9 +52,8 @@ def serve(engine: str) -> None:
 )
 @click.option("--junit", type=click.Path(path_type=Path), help="A JUnit file of all checks.")
 @options.jobs_option
-@options.timeout_option(300.0)
-@options.memory_option
-def contract(engine: str, level: Any, junit: Path | None, jobs: int, timeout: float, memory: float) -> None:
+@options.limits_options(300.0)
+def contract(engine: str, level: Any, junit: Path | None, jobs: int, limits: Limits) -> None:
     """Test an engine: its start, its answers at states and its motions on mechanisms of every kind of joint.
 
     ENGINE is 'cmd:PROGRAM ARGUMENTS', FILE.py:Class or package.module:Class. What it declares as a gap is
@@ -63,7 +62,7 @@ def contract(engine: str, level: Any, junit: Path | None, jobs: int, timeout: fl
     from plumbline.execution.comparison import CONTRACT_SCENARIOS, compare
 
     try:
-        found = compare(engine, CONTRACT_SCENARIOS, level, jobs=jobs, limits=Limits(timeout, memory))
+        found = compare(engine, CONTRACT_SCENARIOS, level, jobs=jobs, limits=limits)
     except BadSpecification as error:
         raise click.BadParameter(str(error), param_hint="ENGINE") from None
     for row in found.problems:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import secrets
 import sys
 import time
@@ -14,9 +13,17 @@ from plumbline import layout
 from plumbline.cli import options
 from plumbline.cli.findings_output import describe_run
 from plumbline.cli.help_texts import EXIT_CODES, examples
-from plumbline.cli.terminal_output import command_line, count_noun, line_width, make_console
+from plumbline.cli.terminal_output import (
+    command_line,
+    count_noun,
+    line_width,
+    log,
+    make_console,
+    print_json,
+)
 from plumbline.execution.exit_codes import ExitCode
 from plumbline.execution.plan import Plan
+from plumbline.judging.known_issues import KNOWN_ISSUES_FILE
 from plumbline.processes.worker_pool import Limits
 
 MAX_MINUTES = 1e5
@@ -71,12 +78,10 @@ A session:
 @options.known_option
 @options.out_option(layout.output_folder("fuzz"))
 @options.json_option
-@options.timeout_option(300.0)
-@options.memory_option
+@options.limits_options(300.0)
 def fuzz(
     engines: list[str], seed: int | None, minutes: float, max_findings: int, corpus: Path | None,
-    corpus_size: int, jobs: int, known_files: tuple[Path, ...], out: Path, as_json: bool, timeout: float,
-    memory: float,
+    corpus_size: int, jobs: int, known_files: tuple[Path, ...], out: Path, as_json: bool, limits: Limits,
 ) -> None:  # fmt: skip
     """Compare random mechanisms at states until the time is over or enough new findings are found.
 
@@ -86,27 +91,27 @@ def fuzz(
     """
     from plumbline.studies.fuzz import Corpus, FuzzResult, search, write_findings
 
-    known_issues = options.read_known_issues(known_files, [])
+    known_issues = options.read_known_issues((KNOWN_ISSUES_FILE, *known_files), [])
     folder = options.claim_folder(out)
     result = FuzzResult(secrets.randbits(32) if seed is None else seed)
-    click.echo(f"random mechanisms of seed {result.seed} (--seed repeats them)", err=True)
-    plan = Plan([], engines, "state", jobs, Limits(timeout, memory), random_level="state",
+    log(f"random mechanisms of seed {result.seed} (--seed repeats them)")
+    plan = Plan([], engines, "state", jobs, limits, random_level="state",
                 known_issues=known_issues, are_engines_required=options.are_engines_named())  # fmt: skip
     began, is_interrupted = time.monotonic(), False
     with options.exit_on_io_error():
         try:
             search(
                 plan, result, seconds=60 * minutes, max_findings=max_findings,
-                corpus=Corpus(corpus, corpus_size), log=_log,
+                corpus=Corpus(corpus, corpus_size), log=log,
             )  # fmt: skip
         except KeyboardInterrupt:
             is_interrupted = True
         written = list(write_findings(result, folder, command_line()))
     new = result.new
     summary = f"{count_noun(result.scenario_count, 'scenario')}, {count_noun(len(new), 'new finding')}"
-    _log(f"{summary}, {time.monotonic() - began:.0f} s")
+    log(f"{summary}, {time.monotonic() - began:.0f} s")
     if as_json:
-        click.echo(json.dumps([f.record() for f in result.findings], ensure_ascii=False, indent=1))
+        print_json([f.record() for f in result.findings])
     else:
         out_console = make_console(sys.stdout)
         for line in describe_run([], result.findings, line_width(out_console), {}):
@@ -116,7 +121,3 @@ def fuzz(
     if is_interrupted:
         sys.exit(ExitCode.INTERRUPTED)
     sys.exit(ExitCode.DISAGREEMENT if new else ExitCode.SUCCESS)
-
-
-def _log(sentence: str) -> None:
-    click.echo(sentence, err=True)

@@ -21,7 +21,7 @@ from plumbline import __version__
 from plumbline.cli.help_texts import EXIT_CODES
 from plumbline.execution.exit_codes import ExitCode
 from plumbline.processes.worker_environment import SINGLE_THREAD
-from plumbline.scenario.line_and_column_errors import Problem, did_you_mean, shorten
+from plumbline.scenario.line_and_column_errors import Problem, nearest_or_all, shorten
 
 SECONDS_TO_NEXT_TRY = 0.05  # of an interruption that came during an import
 FILE_COMMANDS = ("run", "nightly", "check", "sweep", "prove", "coverage")  # whose arguments are YAML files
@@ -96,8 +96,7 @@ class LazyGroup(click.Group):
 
         """
         if args and args[0] not in COMMANDS:
-            hint = did_you_mean(args[0], list(COMMANDS)) or f"there are: {', '.join(COMMANDS)}"
-            raise click.UsageError(f"no command {args[0]!r}; {hint}", ctx)
+            raise click.UsageError(f"no command {args[0]!r}; {nearest_or_all(args[0], COMMANDS)}", ctx)
         if args and args[0] in FILE_COMMANDS and (missing := _missing_files(args[1:])):
             for word in missing:
                 problem = Problem(word, 0, 0, "", "cannot be read: No such file or directory")

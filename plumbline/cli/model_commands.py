@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -17,9 +16,16 @@ from rich.table import Table
 from plumbline import __version__
 from plumbline.cli import options
 from plumbline.cli.help_texts import EXIT_CODES, examples
-from plumbline.cli.terminal_output import ProgressDisplay, command_line, count_noun, make_console
+from plumbline.cli.terminal_output import (
+    ProgressDisplay,
+    command_line,
+    count_noun,
+    log,
+    make_console,
+    print_json,
+)
 from plumbline.cli.verdict_matrix import coloured_glyph, engine_heading
-from plumbline.engines.environments import is_optional_importer, split_version, version_problem
+from plumbline.engines.environments import is_optional_importer
 from plumbline.engines.registry import IMPORTERS
 from plumbline.execution.runner import git_commit
 from plumbline.importers.neutral_model import MODEL_UNITS, Feature
@@ -30,12 +36,7 @@ from plumbline.model_files.mechanism_of_file import feature_words, load_model_fi
 from plumbline.model_files.model_rows import IS_REFUSED, FileResult
 from plumbline.model_files.model_run import ModelPlan, ModelRunResult, run_model_files
 from plumbline.processes.worker_pool import Limits
-from plumbline.scenario.line_and_column_errors import (
-    MAX_LISTED_PROBLEMS,
-    ScenarioError,
-    did_you_mean,
-    shorten,
-)
+from plumbline.scenario.line_and_column_errors import MAX_LISTED_PROBLEMS, ScenarioError, shorten
 from plumbline.scenario.mechanism_document import scenario_text
 from plumbline.storage.results_store import row_record, to_json_value
 
@@ -51,12 +52,7 @@ MAX_REASON = 400  # characters on the terminal; the results have all
 
 def _choose_importers(_: click.Context, __: click.Parameter, names: Sequence[str]) -> tuple[str, ...]:
     for name in names:
-        base, _version = split_version(name)
-        if base not in IMPORTERS:
-            hint = did_you_mean(base, list(IMPORTERS)) or f"there are: {', '.join(IMPORTERS)}"
-            raise click.BadParameter(f"no importer {base!r}; {hint}")
-        if problem := version_problem(name):
-            raise click.BadParameter(f"{name}: {problem}")
+        options.check_importer(name)
     return tuple(dict.fromkeys(names)) or tuple(IMPORTERS)
 
 
@@ -119,8 +115,7 @@ def _parse_state(_: click.Context, __: click.Parameter, text: str | None) -> dic
 )
 @options.known_option
 @options.jobs_option
-@options.timeout_option(120.0)
-@options.memory_option
+@options.limits_options(120.0)
 @options.json_option
 @click.option("--out", type=options.FolderPath(), help="Folder for report, junit.xml, SARIF and results.")
 @click.option(
@@ -132,7 +127,7 @@ def _parse_state(_: click.Context, __: click.Parameter, text: str | None) -> dic
 def model(
     files: tuple[str, ...], base: Any, engines: tuple[str, ...], state_count: int,
     state: dict[str, float] | None, strip_geometry: bool, root: Path | None, known_files: tuple[Path, ...],
-    jobs: int, timeout: float, memory: float, as_json: bool, out: Path | None, scenario_file: Path | None,
+    jobs: int, limits: Limits, as_json: bool, out: Path | None, scenario_file: Path | None,
 ) -> None:  # fmt: skip
     """Compare what engines' importers make of a URDF or MJCF file, and name the parameter that differs.
 
@@ -149,21 +144,20 @@ def model(
         return _write_scenario(files, base, root, scenario_file)
     plan = ModelPlan(
         files, engines, options.are_engines_named(), base, root, strip_geometry, state_count,
-        state, jobs, Limits(timeout, memory),
-        tuple(options.read_user_known_issues(known_files, files)),
+        state, jobs, limits, tuple(options.read_known_issues(known_files, files)),
     )  # fmt: skip
     folder = options.claim_folder(out) if out is not None else None
     with options.exit_on_io_error(), ProgressDisplay(sys.stderr) as progress:
         result = run_model_files(plan, progress)
     document = model_document(result)
     if as_json:
-        click.echo(json.dumps(document, ensure_ascii=False, indent=1))
+        print_json(document)
     else:
         for file in result.files:
             _print_file(file, result)
         _print_missing(result)
     for problem in result.problems[:MAX_LISTED_PROBLEMS]:
-        click.echo(str(problem), err=True)
+        log(str(problem))
     if folder is not None:
         _write_reports(document, folder, as_json)
     sys.exit(result.exit_code)

@@ -14,8 +14,8 @@ import json
 import os
 import secrets
 import shutil
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Collection
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -24,17 +24,15 @@ import pyarrow as pa
 import reports
 from plumbline.cli.options import announce_result_cache
 from plumbline.execution.exit_codes import ExitCode
-from plumbline.execution.plan import LevelSelection, Plan, ProgressCallback, RunObserver
+from plumbline.execution.plan import Plan, ProgressCallback, RunObserver
 from plumbline.execution.proofs import prove_changed_motions
 from plumbline.execution.result_cache import DiskResultCache, night_cells_folder
-from plumbline.execution.runner import RunResult, compare_surfaces, exit_code, run_plan, save
+from plumbline.execution.runner import RunResult, compare_surfaces, leave_out_findings, run_plan, save
 from plumbline.execution.selftest import SelfTestResult
-from plumbline.judging.known_issues import KnownIssue, project_known_issues
 from plumbline.model.features import Feature, features
-from plumbline.processes.worker_pool import Limits, WorkerPool
+from plumbline.processes.worker_pool import WorkerPool
 from plumbline.reproduce.write import write_scripts
 from plumbline.scenario.generator import RANDOM_FAMILY, RandomScenarios, random_seed
-from plumbline.scenario.loader import Scenario
 from plumbline.storage.history_of_nights import next_night_number, stored_runs
 from plumbline.storage.results_store import write_atomically
 from plumbline.studies.coverage_study import FILE as COVERAGE_FILE
@@ -44,7 +42,6 @@ from plumbline.studies.parquet_files import write_table
 
 FEATURES_FILE = "features.json"  # features of each random mechanism of a night
 WEEK = 7  # nights
-EXTRA_REFINEMENTS = 1  # halvings of the finest step beyond a run's refinement study
 
 
 @dataclass(frozen=True)
@@ -88,24 +85,13 @@ class NightPlan:
 
 def run_nightly(
     out: Path,
-    scenarios: Sequence[Scenario],
-    engines: Sequence[str],
+    plan: Plan,
     *,
     random_count: int,
     seed: int | None,
-    jobs: int,
-    limits: Limits,
-    is_full_catalogue: bool,
     command: str,
-    random_trajectory_count: int = 0,
-    extra_refinements: int = EXTRA_REFINEMENTS,
-    long_run_seconds: float = 0.0,
-    level: LevelSelection = "all",
-    scheduler: str | None = None,
     self_test: Callable[[Path, int], SelfTestResult] | None = None,
     proof_cpu_seconds: float = 0.0,
-    known_issues: Sequence[KnownIssue] | None = None,
-    are_engines_required: bool = False,
     seen_findings: Collection[str] = (),
     progress: ProgressCallback,
     observer: RunObserver | None = None,
@@ -114,19 +100,13 @@ def run_nightly(
     """Run a night, or what is left of an interrupted one.
 
     Args:
+        plan: without random scenarios and result cache, which are the night's own.
         random_count: number of random scenarios: half of them chains, the others mechanisms of any joints.
         seed: their seed; None for the interrupted night's, or a new one.
-        limits: limits of each task.
         command: the command line, stored with the results.
-        random_trajectory_count: number of random motions, which are compared at every level.
-        extra_refinements: halvings of the finest step beyond a run's refinement study.
-        long_run_seconds: length of the long runs [s]; 0 for none.
-        scheduler: address of a dask cluster to run on.
-        proof_cpu_seconds: CPU time after which no further proof of a motion is begun [s]; 0: none is begun.
         self_test: runs the self-test of a night, given by its number, and writes its JUnit file to the given
             path; None for no self-test.
-        known_issues: expected verdicts; None for those of the project's file.
-        are_engines_required: whether an engine that is not installed has failed.
+        proof_cpu_seconds: CPU time after which no further proof of a motion is begun [s]; 0: none is begun.
         seen_findings: names of those that do not count for the exit code.
         progress: called after every task.
         observer: gets the rows of named scenarios as they are judged.
@@ -156,31 +136,16 @@ def run_nightly(
         log(f"resuming the night begun {night.started}: {finished} cells are finished")
     mechanisms = night.random_count // 2  # the others are chains
     random_scenarios = RandomScenarios(
-        night.seed, night.random_count - mechanisms, random_trajectory_count, mechanisms
+        night.seed, night.random_count - mechanisms, plan.random_trajectory_count, mechanisms
     )
-    plan = Plan(
-        scenarios,
-        engines,
-        level,
-        jobs=jobs,
-        limits=limits,
-        extra_refinements=extra_refinements,
-        long_run_seconds=long_run_seconds,
-        is_full_catalogue=is_full_catalogue,
-        scheduler=scheduler,
-        random_scenarios=random_scenarios,
-        random_level="random",
-        random_trajectory_count=random_trajectory_count,
-        result_cache=result_cache,
-        are_engines_required=are_engines_required,
-        known_issues=project_known_issues() if known_issues is None else known_issues,
-    )
+    plan = replace(plan, random_scenarios=random_scenarios, random_level="random", result_cache=result_cache)
     proofs = (
-        prove_changed_motions(scenarios, jobs, limits, proof_cpu_seconds, log) if proof_cpu_seconds else None
+        prove_changed_motions(plan.scenarios, plan.jobs, plan.limits, proof_cpu_seconds, log)
+        if proof_cpu_seconds
+        else None
     )
     result = run_plan(plan, progress, observer)
-    if seen_findings and result.metadata["exit_code"] == ExitCode.DISAGREEMENT:
-        result.metadata["exit_code"] = int(exit_code(result, seen_findings))
+    leave_out_findings(result, seen_findings)
     place = unused_path(history / result.metadata["id"])
     result.metadata |= {"id": place.name, "night": next_night_number(history)}
     result.metadata |= {"started": night.started, "random": night.random_count, "seed": night.seed}
@@ -201,7 +166,7 @@ def run_nightly(
     for name, about in result.scenarios.items():
         if about["family"] == RANDOM_FAMILY and random_seed(name) == night.seed:
             about["file"] = (place / "scenarios" / f"{name}.yaml").as_posix()
-    coverage = night_coverage(result, plan, progress) if level == "all" else None
+    coverage = night_coverage(result, plan, progress) if plan.level == "all" else None
     drawn = [features(s.model) for s in random_scenarios.mechanisms]
     if drawn:
         earlier = itertools.chain(
@@ -212,7 +177,7 @@ def run_nightly(
         result.metadata["sentence"] += (
             f"; random mechanisms: {found:,} triples of features, {new:,} of them new in {WEEK} nights"
         )
-    with WorkerPool(1, limits) as executor:
+    with WorkerPool(1, plan.limits) as executor:
         for changes in compare_surfaces(executor):
             result.metadata["sentence"] += f"; {changes.sentence}" if changes.sentence else ""
     save(result, folder, command)

@@ -8,6 +8,7 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import wraps
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -16,17 +17,17 @@ import click
 from click.core import ParameterSource
 
 from plumbline.engines import environments, specifications
-from plumbline.engines.registry import ENGINES, USER_ENGINES
+from plumbline.engines.registry import ENGINES, IMPORTERS, USER_ENGINES
 from plumbline.execution.environment_fingerprint import environment_fingerprint
 from plumbline.execution.exit_codes import ExitCode
-from plumbline.judging.known_issues import KNOWN_ISSUES_FILE, KnownIssue, load_known_issues
+from plumbline.judging.known_issues import KnownIssue, load_known_issues
 from plumbline.processes.exceptions import PlumblineError
 from plumbline.processes.isolation import FileLock, LockHeld
 from plumbline.processes.line_process import BadSpecification
 from plumbline.processes.user_cache import content_key, recall, remember
-from plumbline.processes.worker_pool import ExecutorLost, ExecutorUnavailable
+from plumbline.processes.worker_pool import ExecutorLost, ExecutorUnavailable, Limits
 from plumbline.scenario import loader as scenarios
-from plumbline.scenario.line_and_column_errors import Problem, ScenarioError, did_you_mean, shorten
+from plumbline.scenario.line_and_column_errors import Problem, ScenarioError, nearest_or_all, shorten
 from plumbline.scenario.yaml_reader import is_file, read_bytes, read_yaml
 from plumbline.truth.closed_form import ClosedFormMismatch, closed_form_motion
 
@@ -125,19 +126,30 @@ def out_option(default: Path, note: str = "") -> _Decorator:
     return click.option("--out", type=FolderPath(), default=default, help=f"Output folder{note}.")
 
 
-def timeout_option(default: float) -> _Decorator:
-    """Make the option ``--timeout``.
+def limits_options(seconds: float) -> _Decorator:
+    """Make the options ``--timeout`` and ``--memory``.
 
     Args:
-        default: the time limit of a task where the option is not given [s].
+        seconds: the time limit of a task where the option is not given [s].
 
     Returns:
-        The decorator of a command; it passes ``timeout``.
+        The decorator of a command; it passes ``limits``.
 
     """
-    return click.option(
-        "--timeout", type=FiniteNumber(MIN_TIMEOUT, MAX_TIMEOUT), default=default, help="Seconds per task."
-    )
+
+    def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(command)
+        def with_limits(*, timeout: float, memory: float, **others: Any) -> Any:
+            return command(limits=Limits(timeout, memory), **others)
+
+        return _timeout_option(seconds)(_memory_option(with_limits))
+
+    return decorate
+
+
+def _timeout_option(seconds: float) -> _Decorator:
+    kind = FiniteNumber(MIN_TIMEOUT, MAX_TIMEOUT)
+    return click.option("--timeout", type=kind, default=seconds, help="Seconds per task.")
 
 
 def _choose_engines(context: click.Context, __: click.Parameter, names: Sequence[str]) -> list[str]:
@@ -162,6 +174,15 @@ def _add_adapters(context: click.Context, _: click.Parameter, texts: Sequence[st
         raise click.BadParameter(str(error)) from None
 
 
+def check_importer(name: str) -> None:
+    """Refuse what is no importer, or no version of one; suggest the nearest name."""
+    base, _version = environments.split_version(name)
+    if base not in IMPORTERS:
+        raise click.BadParameter(f"no importer {base!r}; {nearest_or_all(base, IMPORTERS)}")
+    if problem := environments.version_problem(name):
+        raise click.BadParameter(f"{name}: {problem}")
+
+
 def _note_trust(context: click.Context, _: click.Parameter, is_trusting: bool) -> None:
     context.meta[_TRUST] = is_trusting
 
@@ -176,7 +197,9 @@ def _add_found_engine(name: str, *, is_trusting: bool) -> None:
     try:
         found = {one: (text, path) for one, text, path in specifications.found_engines(Path.cwd())}
         if name not in found:
-            raise click.BadParameter(f"no engine {name!r}; {_nearest_or_all(name, {**ENGINES, **found})}")
+            raise click.BadParameter(
+                f"no engine {name!r}; {nearest_or_all(name, sorted({*ENGINES, *found}))}"
+            )
         text, path = found[name]
         specification = specifications.resolve(text, Path.cwd())
         if path and not specifications.is_trusted(specification, path, consent=is_trusting):
@@ -285,30 +308,27 @@ known_option = click.option(
     "docs/reading-a-disagreement.md.",
 )
 json_option = click.option("--json", "as_json", is_flag=True, help="JSON on stdout, for other programs.")
-memory_option = click.option(
+_memory_option = click.option(
     "--memory", type=FiniteNumber(MIN_MEMORY, MAX_MEMORY), default=8.0, help="GB of address space per worker."
 )
 names_argument = click.argument("names", nargs=-1, metavar="[SCENARIO]...")
 
 
-def read_scenarios(names: Iterable[str | Path]) -> list[scenarios.Scenario]:
+def read_scenarios(
+    names: Iterable[str | Path], load: Callable[[Path], scenarios.Scenario] | None = None
+) -> list[scenarios.Scenario]:
     """Load scenarios; print every problem of every file to stderr and exit with 2 if there is one.
 
     Args:
         names: names of the catalogue, or paths of YAML files.
+        load: loads one file; None to load and check it anew.
 
     Returns:
         The scenarios, each once, in the order of ``names``.
 
     """
-    return _read_scenarios(names, _load_scenario)
-
-
-def _read_scenarios(
-    names: Iterable[str | Path], load: Callable[[Path], scenarios.Scenario]
-) -> list[scenarios.Scenario]:
     try:
-        return scenarios.load_scenarios(names, load)
+        return scenarios.load_scenarios(names, load or _load_scenario)
     except ScenarioError as error:
         exit_on_bad_file(error)
 
@@ -374,27 +394,13 @@ def exit_on_bad_file(error: ScenarioError) -> NoReturn:
     sys.exit(ExitCode.BAD_USAGE)
 
 
-def read_known_issues(files: Sequence[Path], chosen: Sequence[scenarios.Scenario]) -> list[KnownIssue]:
-    """Load the project's known issues and the user's; exit with 2 where a file has a problem.
+def read_known_issues(files: Sequence[Path], names: Sequence[str]) -> list[KnownIssue]:
+    """Load files of known issues; exit with 2 where one has a problem.
 
     Args:
-        chosen: the scenarios of the run, which entries of the user may name.
+        names: the scenarios or model files of the run, which entries of the user may name.
 
     """
-    return _read_known_issues((KNOWN_ISSUES_FILE, *files), [s.name for s in chosen])
-
-
-def read_user_known_issues(files: Sequence[Path], names: Sequence[str]) -> list[KnownIssue]:
-    """Load the user's known issues of model files; exit with 2 where a file has a problem.
-
-    Args:
-        names: the model files as typed, which entries may name as their scenario.
-
-    """
-    return _read_known_issues(files, names)
-
-
-def _read_known_issues(files: Sequence[Path], names: Sequence[str]) -> list[KnownIssue]:
     found: list[KnownIssue] = []
     places: dict[str, str] = {}
     for path in files:
@@ -428,20 +434,13 @@ def choose_scenarios(names: Sequence[str], families: Sequence[str]) -> list[scen
         BadParameter: no scenario is of one of the families.
 
     """
-    found = _read_scenarios(names or tuple(scenarios.catalogue()), _recall_scenario)
+    found = read_scenarios(names or tuple(scenarios.catalogue()), _recall_scenario)
     known = {s.family for s in found}
     for family in families:
         if family not in known:
-            raise click.BadParameter(
-                f"no family {family!r}; {_nearest_or_all(family, known)}", param_hint="--family"
-            )
+            hint = nearest_or_all(family, sorted(known))
+            raise click.BadParameter(f"no family {family!r}; {hint}", param_hint="--family")
     return [s for s in found if not families or s.family in families]
-
-
-def _nearest_or_all(name: str, known: Iterable[str]) -> str:
-    """Suggest the nearest known name, or list all of them."""
-    names = sorted(known)
-    return did_you_mean(name, names) or f"there are: {', '.join(names)}"
 
 
 def claim_folder(folder: Path) -> Path:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from collections.abc import Sequence
@@ -15,7 +14,7 @@ import numpy as np
 from plumbline import layout
 from plumbline.cli import options
 from plumbline.cli.help_texts import EXIT_CODES, examples
-from plumbline.cli.terminal_output import ProgressDisplay, count_noun, print_table
+from plumbline.cli.terminal_output import ProgressDisplay, count_noun, log, print_json, print_table
 from plumbline.execution.exit_codes import ExitCode
 from plumbline.model.datatypes import EngineFailure
 from plumbline.processes.worker_pool import Limits
@@ -92,12 +91,9 @@ def prove(names: tuple[str, ...], duration: float | None, precision: Any, out: P
     help="Name of the catalogue or path of a scenario: certificates of other numbers are rejected.",
 )
 @options.jobs_option
-@options.timeout_option(3600.0)
-@options.memory_option
+@options.limits_options(3600.0)
 @options.json_option
-def verify(
-    files: tuple[Path, ...], expected: str | None, jobs: int, timeout: float, memory: float, as_json: bool
-) -> None:
+def verify(files: tuple[Path, ...], expected: str | None, jobs: int, limits: Limits, as_json: bool) -> None:
     """Prove certificates again, with nothing but python-flint and NumPy; print of what they are a proof.
 
     The proof is of the numbers in the certificate: it says which scenario of the catalogue has exactly
@@ -113,7 +109,6 @@ def verify(
         raise click.UsageError(str(error)) from None
     wanted = options.read_scenarios([expected]) if expected is not None else []
     _require_provable(wanted, "--scenario")
-    limits = Limits(timeout, memory)
     with ProgressDisplay(sys.stderr) as progress:
         records = verify_certificates(files, wanted[0] if wanted else None, jobs, limits, progress)
     _finish(records, as_json)
@@ -154,7 +149,7 @@ def _prove(
     except (rejected, EngineFailure) as error:
         return record | {"verdict": "rejected", "reason": str(error)}, None
     if unkept := store_proof(*pair, times, round_enclosure(enclosure)):
-        click.echo(unkept, err=True)
+        log(unkept)
     record |= proved_radii(enclosure) | {"cpu": time.process_time() - began, "bytes": len(certificate)}
     return record, certificate
 
@@ -162,7 +157,7 @@ def _prove(
 def _finish(records: list[dict[str, Any]], as_json: bool) -> None:
     """Print the records; exit with 2 if a file is malformed, else 3 if one was not checked, 1 if rejected."""
     if as_json:
-        click.echo(json.dumps(records, ensure_ascii=False, indent=1))
+        print_json(records)
     else:
         proved = [record for record in records if record["verdict"] == "proved"]
         print_table({k: v for k, v in record.items() if k not in _SUBJECT} for record in proved)
@@ -171,10 +166,10 @@ def _finish(records: list[dict[str, Any]], as_json: bool) -> None:
                 click.echo(f"{record['file']}: {_subject_words(record)}")
     for record in records:
         if record.get("warning"):
-            click.echo(f"{record['file']}: warning: {record['warning']}", err=True)
+            log(f"{record['file']}: warning: {record['warning']}")
         if record["verdict"] != "proved":
             name = record.get("scenario") or record["file"]
-            click.echo(f"{name}: {record['verdict']}: {record['reason']}", err=True)
+            log(f"{name}: {record['verdict']}: {record['reason']}")
     verdicts = {record["verdict"] for record in records}
     codes = {
         "malformed": ExitCode.BAD_USAGE, "failed": ExitCode.ENGINE_FAILED, "rejected": ExitCode.DISAGREEMENT

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ import reports
 from plumbline import layout
 from plumbline.cli import options
 from plumbline.cli.help_texts import examples
-from plumbline.cli.terminal_output import count_noun, line_width, make_console, print_table
+from plumbline.cli.terminal_output import count_noun, line_width, log, make_console, print_json, print_table
 from plumbline.judging.rows import Verdict
 from plumbline.scenario.line_and_column_errors import did_you_mean
 from plumbline.storage.results_store import read_results
@@ -34,7 +33,7 @@ def history(folder: Path, pattern: str | None, as_json: bool) -> None:
     _check_history_folder(folder)
     document = History(folder).to_document(pattern)
     if as_json:
-        click.echo(json.dumps(document, ensure_ascii=False, indent=1))
+        print_json(document)
     else:
         _print_history(folder, document, pattern)
     if document["damaged"]:
@@ -57,7 +56,7 @@ def _print_issue(folder: Path, name: str) -> None:
         if wrong and results.scripts.keys().isdisjoint(finding["rows"]):
             written = write_scripts(options.claim_folder(folder), wrong[:1])
             for reason in written.reasons.values():
-                click.echo(f"no script: {reason}", err=True)
+                log(f"no script: {reason}")
             results = Results.load(folder)
         click.echo(issue_text(results, finding))
 
@@ -119,7 +118,7 @@ def _reproduce_model(folder: Path, keys: tuple[str, ...], form: str | None) -> N
     if not keys:
         for key, row in found.items():
             click.echo(f"{key}: {row['diagnosis'] or row['reason']}")
-        click.echo(count_noun(len(found), "difference") if found else "nothing differs", err=True)
+        log(count_noun(len(found), "difference") if found else "nothing differs")
         return
     chosen, about = options.claim_folder(folder), document["options"]
     changes = read_version_changes(folder)
@@ -199,7 +198,7 @@ def reproduce(folder: Path, keys: tuple[str, ...], form: str | None) -> None:
             found = list_disagreements(folder)
             for key, reason in found.items():
                 click.echo(f"{key}: {reason}")
-            click.echo(count_noun(len(found), "disagreement") if found else "nothing disagrees", err=True)
+            log(count_noun(len(found), "disagreement") if found else "nothing disagrees")
             return
         read_results(folder)
         written = write_scripts(options.claim_folder(folder), keys)
@@ -240,10 +239,10 @@ def explain(name: str | None, folder: Path, known_files: tuple[Path, ...]) -> No
     if name is None:
         for finding in found:
             click.echo(f"{finding.name}: {output.coverage(finding)}")
-        click.echo(count_noun(len(found), "finding") if found else "no finding", err=True)
+        log(count_noun(len(found), "finding") if found else "no finding")
         return
     chosen = found[_place_of(name, [f.name for f in found])]
-    own = options.read_user_known_issues(known_files, list(document["scenarios"]))
+    own = options.read_known_issues(known_files, list(document["scenarios"]))
     issues = {issue.name: issue for issue in (*project_known_issues(), *own)}
     issue, width = issues.get(chosen.known_issue or ""), line_width(make_console(sys.stdout))
     is_own = document["scenarios"].get(chosen.rows[0].scenario, {}).get("own", False)
@@ -260,9 +259,10 @@ def known(files: tuple[Path, ...]) -> None:
     Older files have an entry for each selection of rows; they stay valid.
     """
     from plumbline.judging.known_issue_text import entry_lines, merge_entries
+    from plumbline.judging.known_issues import KNOWN_ISSUES_FILE
     from plumbline.scenario.yaml_reader import read_yaml
 
-    options.read_known_issues(files, [])  # ends with every problem of the files
+    options.read_known_issues((KNOWN_ISSUES_FILE, *files), [])  # ends with every problem of the files
     for entry in merge_entries([entry for path in files for entry in read_yaml(path).data]):
         for line in entry_lines(entry):
             click.echo(line)

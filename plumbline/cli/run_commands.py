@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,18 +18,21 @@ from plumbline.cli.run_display import RunDisplay
 from plumbline.cli.terminal_output import (
     command_line,
     line_width,
+    log,
     make_console,
     print_findings,
+    print_json,
     print_result,
 )
 from plumbline.engines.registry import ENGINES
 from plumbline.execution import scenario_verdicts
-from plumbline.execution.exit_codes import ExitCode
 from plumbline.execution.plan import Plan
 from plumbline.execution.result_cache import DiskResultCache, user_cells_folder
-from plumbline.execution.runner import RunResult, exit_code, run_plan, save
+from plumbline.execution.runner import RunResult, leave_out_findings, run_plan, save
 from plumbline.judging.findings import find_findings
+from plumbline.judging.known_issues import KNOWN_ISSUES_FILE, KnownIssue
 from plumbline.processes.worker_pool import Limits, start_warm_process
+from plumbline.scenario.loader import Scenario
 from plumbline.storage.results_store import read_results, row_record, to_json_value
 
 MAX_PROOF_CPU_SECONDS = 1e6
@@ -79,12 +82,11 @@ new_only_option = click.option(
 @click.option("--matrix", "has_matrix", is_flag=True, help="Print each cell, scenarios × engines, too.")
 @new_only_option
 @click.option("--fresh", is_flag=True, help="Compute everything again, also what earlier runs computed.")
-@options.timeout_option(300.0)
-@options.memory_option
+@options.limits_options(300.0)
 def run(
     names: tuple[str, ...], families: tuple[str, ...], engines: list[str], level: Any, jobs: int,
     scheduler: str | None, known_files: tuple[Path, ...], out: Path, as_json: bool, user_rtol: float | None,
-    has_matrix: bool, new_only: Path | None, fresh: bool, timeout: float, memory: float,
+    has_matrix: bool, new_only: Path | None, fresh: bool, limits: Limits,
 ) -> None:  # fmt: skip
     """Compare scenarios (names of the catalogue, or paths of files; default: all) on all engines.
 
@@ -95,18 +97,18 @@ def run(
     chosen = options.choose_scenarios(names, families)
     for s in chosen:
         if s.is_from_model_file:
-            _log(f"{s.path}: {s.purpose}")
-    known_issues = options.read_known_issues(known_files, chosen)
+            log(f"{s.path}: {s.purpose}")
+    known_issues = _read_known_issues(known_files, chosen)
     seen = _seen_findings(new_only)
     folder = options.claim_folder(out)
-    cache = DiskResultCache(user_cells_folder(), _log, is_fresh=fresh)
+    cache = DiskResultCache(user_cells_folder(), log, is_fresh=fresh)
     options.announce_result_cache(cache)
     plan = Plan(
         chosen,
         engines,
         level,
         jobs,
-        Limits(timeout, memory),
+        limits,
         user_rtol=user_rtol,
         is_full_catalogue=not names and not families and {*ENGINES} <= {*engines} and level == "all",
         result_cache=cache,
@@ -119,7 +121,7 @@ def run(
 
     with options.exit_on_io_error():
         result = _run_visibly(plan, as_json, fresh)
-        _leave_out_seen(result, seen)
+        leave_out_findings(result, seen)
         save(result, folder, command_line())
         with result.cpu_times.measure("report"):
             document = read_results(folder)
@@ -133,7 +135,7 @@ def run(
             "findings": [finding.record() for finding in result.findings],
             "rows": [row_record(r) for r in result.rows],
         }
-        click.echo(json.dumps(to_json_value(document), ensure_ascii=False, indent=1))
+        print_json(to_json_value(document))
     _finish(result, report, as_json, has_matrix)
 
 
@@ -194,13 +196,12 @@ def run(
 @options.known_option
 @options.out_option(layout.output_folder("nightly"), "; complete nights are in its folder `history`")
 @new_only_option
-@options.timeout_option(1800.0)
-@options.memory_option
+@options.limits_options(1800.0)
 def nightly(
     names: tuple[str, ...], engines: list[str], random_count: int, random_trajectories: int, seed: int | None,
     extra_refinements: int, long_run_seconds: float, self_test: bool,
     proof_cpu_seconds: float, jobs: int, scheduler: str | None,
-    known_files: tuple[Path, ...], out: Path, new_only: Path | None, timeout: float, memory: float,
+    known_files: tuple[Path, ...], out: Path, new_only: Path | None, limits: Limits,
 ) -> None:  # fmt: skip
     """Run the catalogue with finer steps, long runs, random scenarios and the self-test.
 
@@ -212,20 +213,22 @@ def nightly(
 
     options.check_history_tool()
     chosen = options.choose_scenarios(names, ())
-    known_issues = options.read_known_issues(known_files, chosen)
+    known_issues = _read_known_issues(known_files, chosen)
     seen = _seen_findings(new_only)
     folder = options.claim_folder(out)
     display = RunDisplay(sys.stderr)
+    plan = Plan(
+        chosen, engines, jobs=jobs, limits=limits, extra_refinements=extra_refinements,
+        long_run_seconds=long_run_seconds, is_full_catalogue=not names and {*ENGINES} <= {*engines},
+        scheduler=scheduler, random_trajectory_count=random_trajectories, known_issues=known_issues,
+        are_engines_required=options.are_engines_named(),
+    )  # fmt: skip
     with options.exit_on_io_error(), display as progress:
         result, place = run_nightly(
-            folder, chosen, engines, random_count=random_count,
-            random_trajectory_count=random_trajectories, seed=seed, jobs=jobs,
-            limits=Limits(timeout, memory), is_full_catalogue=not names and {*ENGINES} <= {*engines},
-            extra_refinements=extra_refinements, long_run_seconds=long_run_seconds, scheduler=scheduler,
-            self_test=run_self_test if self_test and not layout.IS_INSTALLED else None, progress=progress,
-            proof_cpu_seconds=proof_cpu_seconds,
-            observer=display, command=command_line(), log=_log, known_issues=known_issues,
-            are_engines_required=options.are_engines_named(), seen_findings=seen,
+            folder, plan, random_count=random_count, seed=seed, command=command_line(),
+            self_test=run_self_test if self_test and not layout.IS_INSTALLED else None,
+            proof_cpu_seconds=proof_cpu_seconds, seen_findings=seen, progress=progress, observer=display,
+            log=log,
         )  # fmt: skip
     _finish(result, place / "report.html", as_json=False)
 
@@ -239,10 +242,9 @@ def _seen_findings(nights: Path | None) -> frozenset[str]:
     return last_findings(nights)
 
 
-def _leave_out_seen(result: RunResult, seen: frozenset[str]) -> None:
-    """Let findings of the last night not count for the exit code."""
-    if seen and result.metadata["exit_code"] == ExitCode.DISAGREEMENT:
-        result.metadata["exit_code"] = int(exit_code(result, seen))
+def _read_known_issues(files: Sequence[Path], chosen: Sequence[Scenario]) -> list[KnownIssue]:
+    """Load the project's known issues and the user's, whose entries may name scenarios of the run."""
+    return options.read_known_issues((KNOWN_ISSUES_FILE, *files), [s.name for s in chosen])
 
 
 def _run_visibly(plan: Plan, as_json: bool, is_fresh: bool) -> RunResult:
@@ -261,16 +263,12 @@ def _run_visibly(plan: Plan, as_json: bool, is_fresh: bool) -> RunResult:
         raise
 
 
-def _log(sentence: str) -> None:
-    click.echo(sentence, err=True)
-
-
 def _finish(result: RunResult, report: Path, as_json: bool, has_matrix: bool = False) -> None:
     """Print the result for people, unless stdout holds JSON, and exit with the run's code."""
     if not as_json:
         print_result(result, has_matrix=has_matrix)
     click.echo(f"report: {report}", err=as_json)
     if cached := result.cpu_times.cached_count:
-        _log(f"{cached} answers of earlier runs were used; --fresh computes them again")
-    _log("\n".join(wrap(result.cpu_times.summary(), line_width(make_console(sys.stderr)), "")))
+        log(f"{cached} answers of earlier runs were used; --fresh computes them again")
+    log("\n".join(wrap(result.cpu_times.summary(), line_width(make_console(sys.stderr)), "")))
     sys.exit(result.metadata["exit_code"])

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import click
 
 from plumbline.cli import options
-from plumbline.cli.terminal_output import count_noun, print_table
+from plumbline.cli.terminal_output import count_noun, print_json, print_table
 from plumbline.engines.protocol import protocol_schema
 from plumbline.engines.registry import ENGINES
 from plumbline.engines.surface import STATUSES, SURFACES, declared_surface
@@ -39,7 +38,7 @@ def list_(what: str, engine: str | None, as_json: bool) -> None:
     lists = {"scenarios": _scenario_records, "engines": _engine_records, "surface": _surface_records}
     records = [vars(one) for one in declared_surface(engine).names] if engine else lists[what]()
     if as_json:
-        click.echo(json.dumps(records, ensure_ascii=False, indent=1))
+        print_json(records)
     else:
         print_table({k: v for k, v in record.items() if k not in JSON_ONLY} for record in records)
 
@@ -129,5 +128,4 @@ def _describe_singular_pose(s: scenarios.Scenario) -> str:
 @click.option("--protocol", is_flag=True, help="Of the answers of engines that are programs instead.")
 def schema(protocol: bool) -> None:
     """Print the JSON Schema of scenario files, for editors and other programs."""
-    found = protocol_schema() if protocol else scenarios.json_schema()
-    click.echo(json.dumps(found, ensure_ascii=False, indent=1))
+    print_json(protocol_schema() if protocol else scenarios.json_schema())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import collections
-import json
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -16,13 +15,13 @@ import reports
 from plumbline import layout
 from plumbline.cli import options
 from plumbline.cli.help_texts import EXIT_CODES, examples
-from plumbline.cli.terminal_output import ProgressDisplay, count_noun, print_table
+from plumbline.cli.terminal_output import ProgressDisplay, count_noun, log, print_json, print_table
 from plumbline.engines.registry import ENGINES
 from plumbline.execution.exit_codes import ExitCode
 from plumbline.execution.plan import RANDOM_STATES, Plan
 from plumbline.execution.runner import run_plan
 from plumbline.judging.rows import Level, Verdict
-from plumbline.judging.smallest_detectable_mistake import COVERED_LEVELS, CoverageEntry
+from plumbline.judging.smallest_detectable_mistake import COVERED_LEVELS
 from plumbline.processes.worker_pool import Limits, WorkerPool
 from plumbline.scenario.line_and_column_errors import ScenarioError
 from plumbline.scenario.loader import Scenario
@@ -34,8 +33,8 @@ MAX_LISTED_CELLS = 10
 @click.argument("file", metavar="FILE", type=click.Path(path_type=Path))
 @options.jobs_option
 @options.out_option(layout.output_folder("sweep"))
-@options.timeout_option(300.0)
-def sweep(file: Path, jobs: int, out: Path, timeout: float) -> None:
+@options.limits_options(300.0)
+def sweep(file: Path, jobs: int, out: Path, limits: Limits) -> None:
     """Vary a scenario's parameters over a grid or distributions, as a sweep file says (docs/sweeps.md).
 
     Writes sweep.parquet, one row per cell and implementation, and its map, sweep.html.
@@ -50,7 +49,7 @@ def sweep(file: Path, jobs: int, out: Path, timeout: float) -> None:
         with ProgressDisplay(sys.stderr) as progress:
             spec, cells = sweep_file.load(file, progress)
         folder = options.claim_folder(out)
-        with options.exit_on_io_error(), WorkerPool(jobs, Limits(timeout)) as workers:
+        with options.exit_on_io_error(), WorkerPool(jobs, limits) as workers:
             engines = describe_engines(workers, list(spec.engines))
             sweep_file.check_integrators(file, spec, engines)
             with ProgressDisplay(sys.stderr) as progress:
@@ -117,26 +116,24 @@ def drift(names: tuple[str, ...], rtols: tuple[float, ...], max_cpu_seconds: flo
     folder = options.claim_folder(out)
     with options.exit_on_io_error():
         with ProgressDisplay(sys.stderr) as progress:
-            table = drifts.measure_drift(
-                chosen,
-                max_cpu_seconds,
-                rtols=rtols,
-                progress=progress,
-                log=lambda sentence: click.echo(sentence, err=True),
-            )
+            table = drifts.measure_drift(chosen, max_cpu_seconds, rtols=rtols, progress=progress, log=log)
         path = write_table(table, folder / "drift.parquet")
         print_table(table.to_pylist())
         click.echo(f"results: {path}")
-        if (folder / "results.json").is_file():
-            with options.exit_on_damaged_results():
-                click.echo(f"report: {reports.write(folder)}")
-    found = table.select(["scenario", "variant", "rtol", "steps"]).to_pylist()
-    runs = {(row["scenario"], row["variant"], row["rtol"]): False for row in found}
-    runs |= {
-        (row["scenario"], row["variant"], row["rtol"]): True for row in found if row["steps"] is not None
-    }
-    has_failed = not all(runs.values())
-    sys.exit(ExitCode.ENGINE_FAILED if has_failed else ExitCode.SUCCESS)
+        if report := _write_report_again(folder):
+            click.echo(f"report: {report}")
+    rows = table.to_pylist()
+    runs, ended = (
+        {(row["scenario"], row["variant"], row["rtol"]) for row in some}
+        for some in (rows, [row for row in rows if row["steps"] is not None])
+    )
+    sys.exit(ExitCode.SUCCESS if runs == ended else ExitCode.ENGINE_FAILED)
+
+
+def _write_report_again(folder: Path) -> Path | None:
+    """Write the report of a folder that holds results of a run."""
+    with options.exit_on_damaged_results():
+        return reports.write(folder) if (folder / "results.json").is_file() else None
 
 
 @click.command(
@@ -175,11 +172,10 @@ def drift(names: tuple[str, ...], rtols: tuple[float, ...], max_cpu_seconds: flo
 @options.jobs_option
 @options.out_option(layout.DEFAULT_OUT)
 @options.json_option
-@options.timeout_option(600.0)
-@options.memory_option
+@options.limits_options(600.0)
 def coverage(
     names: tuple[str, ...], engines: tuple[str, ...], level: Any, has_pairs: bool, jobs: int, out: Path,
-    as_json: bool, timeout: float, memory: float,
+    as_json: bool, limits: Limits,
 ) -> None:  # fmt: skip
     """Compute, for every number of every body, the smallest mistake that a run would report.
 
@@ -197,10 +193,10 @@ def coverage(
 
     chosen = options.choose_scenarios(names, ())
     if has_pairs:
-        _print_pairs(chosen, jobs, Limits(timeout, memory), as_json)
+        _print_pairs(chosen, jobs, limits, as_json)
     chosen = [s for s in chosen if names or s.level == "all"]
     levels: tuple[Level, ...] = COVERED_LEVELS if level == "all" else (level,)
-    folder, limits = options.claim_folder(out), Limits(timeout, memory)
+    folder = options.claim_folder(out)
     with options.exit_on_io_error():
         with ProgressDisplay(sys.stderr) as progress:
             rows = []
@@ -209,12 +205,13 @@ def coverage(
             with WorkerPool(jobs, limits) as executor:
                 found = study.measure_coverage(executor, chosen, rows, RANDOM_STATES, levels, progress)
         path = write_table(study.coverage_table(found), folder / study.FILE)
-        with options.exit_on_damaged_results():
-            report = reports.write(folder) if (folder / "results.json").is_file() else None
+        report = _write_report_again(folder)
+    summary = [asdict(one) for one in study.summarize_coverage(found)]
     if as_json:
-        _print_coverage_json(found)
+        entries = [asdict(entry) for entry in found]
+        print_json({"summary": summary, "blind_spots": study.blind_spots(found), "entries": entries})
     else:
-        print_table(map(asdict, study.summarize_coverage(found)))
+        print_table(summary)
         for sentence in study.blind_spots(found) if not names else []:
             click.echo(sentence)
     for kind, written in (("results", path), ("report", report)):
@@ -233,7 +230,7 @@ def _print_pairs(chosen: list[Scenario], jobs: int, limits: Limits, as_json: boo
     if as_json:
         lists = {name: [str(one) for one in some] for name, some in shown.items()}
         missing = [[str(one), str(other)] for one, other in lacking]
-        click.echo(json.dumps({"legal": len(legal), "lacking": missing, "shown": lists}, indent=1))
+        print_json({"legal": len(legal), "lacking": missing, "shown": lists})
     else:
         count = len({one for pair in legal for one in pair})
         click.echo(
@@ -243,15 +240,3 @@ def _print_pairs(chosen: list[Scenario], jobs: int, limits: Limits, as_json: boo
         for one, other in lacking[:MAX_LISTED_CELLS]:
             click.echo(f"not covered: {one} and {other}")
     sys.exit(ExitCode.DISAGREEMENT if lacking else ExitCode.SUCCESS)
-
-
-def _print_coverage_json(found: list[CoverageEntry]) -> None:
-    """Print every entry, the summary and what no scenario sees."""
-    from plumbline.studies import coverage_study as study
-
-    document = {
-        "summary": [asdict(one) for one in study.summarize_coverage(found)],
-        "blind_spots": study.blind_spots(found),
-        "entries": [asdict(entry) for entry in found],
-    }
-    click.echo(json.dumps(document, ensure_ascii=False, indent=1))

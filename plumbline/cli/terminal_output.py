@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shlex
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
+import click
 from rich.cells import cell_len
 from rich.console import Console
 from rich.markup import escape
@@ -76,6 +78,16 @@ def count_noun(count: int, singular: str, plural: str = "") -> str:
 
     """
     return f"{count} {singular if count == 1 else plural or singular + 's'}"
+
+
+def log(sentence: str) -> None:
+    """Print a sentence on stderr."""
+    click.echo(sentence, err=True)
+
+
+def print_json(document: Any) -> None:
+    """Print a document on stdout, for other programs."""
+    click.echo(json.dumps(document, ensure_ascii=False, indent=1))
 
 
 def print_table(records: Iterable[Mapping[str, Any]], title: str | None = None) -> None:
@@ -169,21 +181,19 @@ def print_result(result: RunResult, *, has_matrix: bool = False) -> None:
 
     """
     out = make_console(sys.stdout)
-    width = line_width(out)
+
+    def print_sentence(text: str, style: str) -> None:
+        for line in wrap(text, line_width(out), ""):
+            out.print(f"[{style}]{escape(line)}[/]")
+
     in_doubt = {row.reason: None for row in result.rows if row.verdict == Verdict.HARNESS_FAILED}
     for reason in in_doubt:
-        text = f"{Verdict.HARNESS_FAILED.style.glyph} the harness failed: {reason}"
-        for line in wrap(text, width, ""):
-            out.print(f"[magenta bold]{escape(line)}[/]")
+        print_sentence(f"{Verdict.HARNESS_FAILED.style.glyph} the harness failed: {reason}", "magenta bold")
     if has_matrix:
         print_matrix(matrix_of_rows(result.rows, result.engines))
     print_findings(result.rows, result.findings, result.random_batch.counts_by_verdict)
     for sentence in result.wide_issues:
-        for line in wrap(f"i {sentence}", width, ""):
-            out.print(f"[yellow]{escape(line)}[/]")
+        print_sentence(f"i {sentence}", "yellow")
     for entry in result.stale_issues:
-        text = f"! known entry {entry.id} no longer occurs: remove it from its file"
-        for line in wrap(text, width, ""):
-            out.print(f"[red]{escape(line)}[/]")
-    for line in wrap(result.metadata["sentence"], width, ""):
-        out.print(f"[bold]{escape(line)}[/]")
+        print_sentence(f"! known entry {entry.id} no longer occurs: remove it from its file", "red")
+    print_sentence(result.metadata["sentence"], "bold")

@@ -394,6 +394,12 @@ def _share(expected: dict[str, int], count: int) -> str:
     return f" {parts[0]}" if count in expected.values() else f" ({', '.join(parts)})"
 
 
+def leave_out_findings(result: RunResult, seen: Collection[str]) -> None:
+    """Let findings that an earlier run had not count for the exit code of a run."""
+    if seen and result.metadata["exit_code"] == ExitCode.DISAGREEMENT:
+        result.metadata["exit_code"] = int(exit_code(result, seen))
+
+
 def exit_code(result: RunResult, seen: Collection[str] = ()) -> ExitCode:
     """Return the exit code of a run.
 

@@ -75,6 +75,12 @@ def did_you_mean(word: str, known: Sequence[str]) -> str:
     return f"did you mean {close!r}?" if close else ""
 
 
+def nearest_or_all(word: str, known: Iterable[str]) -> str:
+    """Suggest the known word that is nearest to a misspelt one, or list all of them."""
+    names = list(known)
+    return did_you_mean(word, names) or f"there are: {', '.join(names)}"
+
+
 def shorten(text: str, limit: int = 60) -> str:
     """Cut a text that a file gives, so that a message stays readable.
 
