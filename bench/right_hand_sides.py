@@ -15,7 +15,7 @@ from scipy.sparse.linalg import splu
 from adapters import exudyn_engine, mujoco_engine, pinocchio_engine
 from adapters.exudyn_common import make_settings
 from plumbline.model.datatypes import BALL, HINGE, ROD, Array, Model, State
-from plumbline.model.kinematics import quaternion_rate
+from plumbline.model.kinematics import maximal_coordinates
 from plumbline.model.random_mechanisms import random_tree
 from plumbline.model.sampling import random_states
 from reference_impl.direct import DirectSystem, solve_dense
@@ -77,9 +77,9 @@ def tree_call(model: Model, state: State) -> Call:
 
     """
     system = TreeSystem([model])
-    q = component_first(state.r, state.p)
-    v = component_first(state.v, quaternion_rate(state.p, state.omega))
-    return lambda: system.acceleration(q, v)
+    r, p, v, pdot = maximal_coordinates(state)
+    q, qdot = component_first(r, p), component_first(v, pdot)
+    return lambda: system.acceleration(q, qdot)
 
 
 def pinocchio_crba_call(model: Model, state: State) -> Call:
@@ -110,15 +110,10 @@ def structured_call(model: Model, state: State, batch: int = 1) -> Call:
 
     """
     forest = StructuredSystem([model]).repeated(batch)
-    q, v = (
-        np.tile(x, batch)
-        for x in (
-            component_first(state.r, state.p),
-            component_first(state.v, quaternion_rate(state.p, state.omega)),
-        )
-    )
-    v = v * np.repeat(np.linspace(0.9, 1.1, batch), model.n)
-    return lambda: forest.acceleration(q, v)
+    r, p, v, pdot = maximal_coordinates(state)
+    q, qdot = (np.tile(component_first(*pair), batch) for pair in ((r, p), (v, pdot)))
+    qdot = qdot * np.repeat(np.linspace(0.9, 1.1, batch), model.n)
+    return lambda: forest.acceleration(q, qdot)
 
 
 def direct_call(model: Model, state: State) -> tuple[sparse.csc_matrix, Array, Call]:
@@ -131,10 +126,10 @@ def direct_call(model: Model, state: State) -> tuple[sparse.csc_matrix, Array, C
         S, b, and the call that assembles and solves the banded system.
 
     """
-    system, pdot = DirectSystem(model), quaternion_rate(state.p, state.omega)
-    values, b, *_ = system._entries(state.r, state.p, state.v, pdot)
+    system, at = DirectSystem(model), maximal_coordinates(state)
+    values, b, *_ = system._entries(*at)
     S = sparse.csc_matrix((values, (system._i, system._j)), shape=(system.size, system.size))
-    return S, b, lambda: system.solve(state.r, state.p, state.v, pdot)
+    return S, b, lambda: system.solve(*at)
 
 
 def superlu_call(S: sparse.csc_matrix, b: Array) -> Call:

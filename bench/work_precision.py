@@ -11,7 +11,7 @@ import numpy as np
 
 from plumbline.engines.adapter import Adapter
 from plumbline.model.datatypes import Array, Model, State
-from plumbline.model.kinematics import quaternion_rate
+from plumbline.model.kinematics import maximal_coordinates
 from reference_impl.fast.collocation import integrate_collocation
 from reference_impl.fast.tree_elimination import fastest_acceleration
 from reference_impl.integrate import integrate_dop853
@@ -29,17 +29,6 @@ class WorkPrecisionPoint:
     seconds: float
 
 
-def stack_states(states: Sequence[State]) -> tuple[Array, Array, Array, Array]:
-    """Stack the coordinates of a batch of states.
-
-    Returns:
-        r (BN, 3) [m], p (BN, 4), ṙ (BN, 3) [m/s] and ṗ (BN, 4) [1/s], state by state.
-
-    """
-    r, p, v = (np.concatenate([getattr(state, name) for state in states]) for name in ("r", "p", "v"))
-    return r, p, v, np.concatenate([quaternion_rate(state.p, state.omega) for state in states])
-
-
 def reference_positions(model: Model, states: Sequence[State]) -> Array:
     """Compute the positions at t = 2 s by collocation at the tightest tolerance, state by state.
 
@@ -50,7 +39,9 @@ def reference_positions(model: Model, states: Sequence[State]) -> Array:
         Positions of all bodies (BN, 3) [m].
 
     """
-    runs = [integrate_collocation([model], *stack_states([state]), SAMPLE_TIMES, 1e-14) for state in states]
+    runs = [
+        integrate_collocation([model], *maximal_coordinates(state), SAMPLE_TIMES, 1e-14) for state in states
+    ]
     return np.concatenate([run.r[-1] for run in runs])
 
 
@@ -88,7 +79,7 @@ def collocation_curve(model: Model, states: Sequence[State], expected: Array) ->
         One point per tolerance; the time of a run of one step is subtracted.
 
     """
-    chains, start, points = [model] * len(states), stack_states(states), []
+    chains, start, points = [model] * len(states), maximal_coordinates(*states), []
     for rtol in TOLERANCES:
 
         def run(until: Array, rtol: float = rtol) -> Array:
@@ -118,7 +109,7 @@ def dop853_curve(
         ends = [
             integrate_dop853(
                 model,
-                *stack_states([state]),
+                *maximal_coordinates(state),
                 SAMPLE_TIMES,
                 rtol,
                 acceleration=fastest_acceleration(model) if structured else None,

@@ -36,7 +36,7 @@ from plumbline.model.kinematics import (
     elastic_energy,
     joint_coordinates,
     kinetic_energy_of_rotors,
-    quaternion_rate,
+    maximal_coordinates,
     rotate_vectors,
     rotation_matrix,
     stack_states,
@@ -306,7 +306,7 @@ def maximal_quantities(model: Model, state: State, missing_gamma: Sequence[int])
         missing_gamma: joints whose rows have no γ.
 
     """
-    at = state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
+    at = maximal_coordinates(state)
     system, rows = DirectSystem(model), constraint_rows(model, *at)
     change = np.zeros(len(system.joint))
     change[: len(rows.gamma)] = np.where(np.isin(rows.joint, missing_gamma), -rows.gamma, 0.0)

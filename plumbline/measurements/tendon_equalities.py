@@ -15,7 +15,12 @@ import numpy as np
 from plumbline.equations.arithmetic import floats
 from plumbline.equations.tree import Tree
 from plumbline.model.datatypes import Array, Model, State
-from plumbline.model.kinematics import angular_velocity, joint_coordinates, quaternion_rate, rotate_vectors
+from plumbline.model.kinematics import (
+    angular_velocity,
+    joint_coordinates,
+    maximal_coordinates,
+    rotate_vectors,
+)
 from plumbline.model.loops import cut_open, determinate_projectors, wrench_length
 from plumbline.model.redescription import rods_taken_out
 from reference_impl.direct import DirectSystem
@@ -33,7 +38,7 @@ def effects_of_missing_terms(model: Model, state: State) -> dict[str, Array]:
 
     """
     system = DirectSystem(model)
-    at = state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
+    at = maximal_coordinates(state)
     u, udot, x, _ = joint_coordinates(model, state)
     defect = np.zeros(len(system.joint))
     for k, lengthening in _lengthening(model, state, u, udot).items():

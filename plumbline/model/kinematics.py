@@ -181,6 +181,21 @@ def quaternion_rate(p: Float[Array, "... 4"], omega: Float[Array, "... 3"]) -> F
     return 0.5 * quaternion_product(p, np.concatenate([np.zeros_like(omega[..., :1]), omega], -1))
 
 
+def maximal_coordinates(
+    *states: State,
+) -> tuple[
+    Float[Array, "bodies 3"], Float[Array, "bodies 4"], Float[Array, "bodies 3"], Float[Array, "bodies 4"]
+]:
+    """Return r, p, ṙ and ṗ of the bodies, in which the notes state their equations.
+
+    Args:
+        states: of mechanisms side by side, whose bodies follow each other.
+
+    """
+    r, p, v, omega = (np.concatenate([getattr(s, name) for s in states]) for name in ("r", "p", "v", "omega"))
+    return r, p, v, quaternion_rate(p, omega)
+
+
 def angular_velocity(p: Float[Array, "... 4"], pdot: Float[Array, "... 4"]) -> Float[Array, "... 3"]:
     """Return ω′ = 2 L(p) ṗ as the notes define it, also where pᵀp ≠ 1.
 

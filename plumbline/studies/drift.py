@@ -19,7 +19,7 @@ import pyarrow as pa
 
 from plumbline.model.datatypes import Array, Float, Model, Trajectory
 from plumbline.model.invariants import compute_invariants
-from plumbline.model.kinematics import joint_coordinates, quaternion_rate
+from plumbline.model.kinematics import joint_coordinates, maximal_coordinates
 from plumbline.scenario.loader import Scenario
 from plumbline.storage.results_store import DRIFT_TABLE
 from plumbline.studies.parquet_files import make_table
@@ -104,7 +104,7 @@ def _measure_variant(
 def _drifts(s: Scenario, variant: str, rtol: float, times: Sequence[float]) -> list[dict[str, Any]]:
     """By the end of each interval the largest errors until then, and the share of the steps."""
     grid = np.unique(np.concatenate([np.linspace(0, end, SAMPLES + 1) for end in times]))
-    start = s.state.r, s.state.p, s.state.v, quaternion_rate(s.state.p, s.state.omega)
+    start = maximal_coordinates(s.state)
     system = eliminated_system([s.model], joint_coordinates(s.model, s.state)[2])
     run = integrate_collocation(system, *start, grid, rtol, **VARIANTS[variant])
     errors = drift_errors(s.model, run, s.state.x)

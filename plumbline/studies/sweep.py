@@ -21,7 +21,7 @@ from plumbline.judging.trajectory_level import judge_trajectory
 from plumbline.measurements.order_and_limit import refinement_resolutions
 from plumbline.model.datatypes import Integrator, Trajectory
 from plumbline.model.invariants import compute_invariants, position_error
-from plumbline.model.kinematics import joint_coordinates, quaternion_rate
+from plumbline.model.kinematics import joint_coordinates, maximal_coordinates
 from plumbline.processes.worker_pool import Outcome, Task, WorkerPool
 from plumbline.scenario.loader import Scenario
 from plumbline.studies.parquet_files import make_table
@@ -150,12 +150,11 @@ def _run_references(counted: _Progress, valid: Mapping[int, Scenario]) -> Iterat
 def _run_reference_batch(group: Sequence[tuple[int, Scenario]]) -> list[Record]:
     """The reference's rows of one batch, in a worker; raise ArithmeticError where a cell fails."""
     x = np.concatenate([joint_coordinates(s.model, s.state)[2] for _, s in group])
-    r, p, v = (np.concatenate([getattr(s.state, name) for _, s in group]) for name in ("r", "p", "v"))
-    pdot = np.concatenate([quaternion_rate(s.state.p, s.state.omega) for _, s in group])
+    start = maximal_coordinates(*(s.state for _, s in group))
     times = group[0][1].times
     coarse, fine = (
         collocation.integrate_collocation(
-            eliminated_system([s.model for _, s in group], x), r, p, v, pdot, times, rtol,
+            eliminated_system([s.model for _, s in group], x), *start, times, rtol,
             max_steps=MAX_REFERENCE_STEPS,
         )
         for rtol in REFERENCE_RTOLS

@@ -29,6 +29,7 @@ from plumbline.model.kinematics import (
     angular_velocity,
     complete_state,
     joint_coordinates,
+    maximal_coordinates,
     quaternion_rate,
     rotate_vectors,
     rotation_matrix,
@@ -225,7 +226,7 @@ class _Base:
 
     def __init__(self, model: Model, state: State, has_elements: bool) -> None:
         self.coordinates = joint_coordinates(model, state)[2]
-        at = state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
+        at = maximal_coordinates(state)
         plain = DirectSystem(model).solve(*at, x=self.coordinates)
         system = DirectSystem(_with_rotor_rows(model) if has_elements else model)
         S, b = system.assemble(*at, self.coordinates)

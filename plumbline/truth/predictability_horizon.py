@@ -19,6 +19,7 @@ from plumbline.model.kinematics import (
     complete_state,
     cross,
     joint_coordinates,
+    maximal_coordinates,
     quaternion_conjugate,
     quaternion_product,
     quaternion_rate,
@@ -168,9 +169,7 @@ def _integrate_batch(models: list[Model], states: list[State], times: Array) -> 
 
     pairs = zip(models, states, strict=True)
     system = eliminated_system(models, np.concatenate([joint_coordinates(*pair)[2] for pair in pairs]))
-    r, p, v = (np.concatenate([getattr(state, name) for state in states]) for name in ("r", "p", "v"))
-    pdot = np.concatenate([quaternion_rate(state.p, state.omega) for state in states])
-    run = integrate_collocation(system, r, p, v, pdot, times, RTOL)
+    run = integrate_collocation(system, *maximal_coordinates(*states), times, RTOL)
     return [np.array(np.split(y, len(states), axis=1)) for y in (run.r, run.p, run.v, run.pdot, run.x)]
 
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from plumbline.model.datatypes import Array, Model, State, Trajectory
 from plumbline.model.invariants import motion_error, motion_errors, motion_samples
-from plumbline.model.kinematics import angular_velocity, quaternion_rate
+from plumbline.model.kinematics import angular_velocity, maximal_coordinates, quaternion_rate
 from plumbline.truth import TruthUnavailable
 from plumbline.truth.certificate_proof import ProvedMotion, prove_motion, round_enclosure
 from plumbline.truth.taylor import Precision, simulate_taylor
@@ -212,10 +212,7 @@ def simulate_notes_form(
         EngineFailure: the integrator stops early.
 
     """
-    start, x = (
-        (state.r, state.p, state.v, quaternion_rate(state.p, state.omega)),
-        joint_coordinates(model, state)[2],
-    )
+    start, x = maximal_coordinates(state), joint_coordinates(model, state)[2]
     run: IntegrationResult
     try:
         if (
@@ -283,7 +280,7 @@ def accurate_motion(model: Model, state: State, times: Array, substeps: int) -> 
 
     """
     stages = np.linspace(times[0], times[-1], 2 * substeps * (len(times) - 1) + 1)
-    start = state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
+    start = maximal_coordinates(state)
     run = integrate_collocation(eliminated_system([model], state.x), *start, stages, MOTION_RTOL)
     y = np.stack([np.concatenate([run.r, run.p], axis=-1), np.concatenate([run.v, run.pdot], axis=-1)], 1)
     return AccurateMotion(model, state, times, substeps, y.swapaxes(-1, -2))
@@ -382,8 +379,7 @@ def _simulate_batch(motion: AccurateMotion, cases: Sequence[tuple[Model, State]]
     """Runs of all cases by their deviations from the first, the accurate motion, each on its joints."""
     times, substeps, n = motion.times, motion.substeps, motion.model.n
     system = eliminated_system([model for model, _ in cases], np.concatenate([s.x for _, s in cases]))
-    r, p, v = (np.concatenate([getattr(state, name) for _, state in cases]) for name in ("r", "p", "v"))
-    pdot = quaternion_rate(p, np.concatenate([state.omega for _, state in cases]))
+    r, p, v, pdot = maximal_coordinates(*(state for _, state in cases))
 
     def true(stage: int) -> Array:
         return np.tile(motion.y[stage], len(cases))  # (2, 7, M)
@@ -454,10 +450,7 @@ def regular_motion(model: Model, state: State, times: Array) -> RegularMotion:
     rank = regular_rank(model, state)
     t, last, value = 0.0, float(times[-1]), smallest_singular_value(model, state, rank)
     longest = stride = float(np.min(np.diff(times)))
-    here, x = (
-        (state.r, state.p, state.v, quaternion_rate(state.p, state.omega)),
-        joint_coordinates(model, state)[2],
-    )
+    here, x = maximal_coordinates(state), joint_coordinates(model, state)[2]
     while t < last * (1 - 1e-12) and value >= MIN_MOTION_SINGULAR_VALUE:
         stride = min(stride, last - t)
         grid = t + stride * np.linspace(0, 1, STRIDE_PARTS + 1)

@@ -264,8 +264,8 @@ def test_the_first_sample_is_the_initial_state(engine, integrator):
     run = ask(engine, "simulate", subject, at, TIMES[:2], integrator.name, step_or_tolerance(integrator))
     if run is None:
         return
-    pdot = kinematics.quaternion_rate(at.p, at.omega)
-    for name, expected in (("r", at.r), ("p", at.p), ("v", at.v), ("pdot", pdot)):
+    start = kinematics.maximal_coordinates(at)
+    for name, expected in zip(("r", "p", "v", "pdot"), start, strict=True):
         assert_close(getattr(run, name)[0], expected, 1, f"first {name}", 1e-14)
 
 
@@ -401,9 +401,7 @@ def flatten_trajectory(run, true):
 
 
 def flatten_states(true):
-    pdot = [kinematics.quaternion_rate(s.p, s.omega) for s in true]
-    columns = [s.r for s in true], [s.p for s in true], [s.v for s in true], pdot
-    return np.concatenate([np.ravel(column) for column in columns])
+    return np.concatenate([np.ravel(column) for column in kinematics.maximal_coordinates(*true)])
 
 
 # -- what no engine may see --------------------------------------------------------------------

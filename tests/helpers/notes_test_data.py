@@ -6,14 +6,25 @@ polynomials over the rationals: an identity that holds there holds for all value
 
 import numpy as np
 
-from reference_impl.euler_parameters import euler_parameter_rate
+from plumbline.model.kinematics import maximal_coordinates
+from reference_impl.fast.chain_elimination import component_first
 from tests.helpers.random_chains import random_state
 
 
 def state_on_manifold(chain, rng):
     """r, p, ṙ, ṗ that satisfy every constraint and its rate to rounding."""
     state = random_state(rng, chain, rate=1.0)
-    return state.r, state.p, state.v, euler_parameter_rate(state.p, state.omega)
+    return maximal_coordinates(state)
+
+
+def components(r, p, v, pdot):
+    """q and q̇ component first, as the eliminated forms take them."""
+    return component_first(r, p), component_first(v, pdot)
+
+
+def body_first(q, v):
+    """r, p, ṙ, ṗ of q and q̇ component first."""
+    return q[:3].T, q[3:].T, v[:3].T, v[3:].T
 
 
 def state_off_manifold(chain, rng):

@@ -39,7 +39,7 @@ def state_from_seed(model: Model, seed: int = 0, rate: float = 3.0) -> State:
 
 def reference_trajectory(model: Model, state: State, times: Array) -> Trajectory:
     """The motion by the reference's collocation, held on its manifold."""
-    start = state.r, state.p, state.v, kinematics.quaternion_rate(state.p, state.omega)
+    start = kinematics.maximal_coordinates(state)
     run = integrate_collocation([model], *start, times, 1e-13, project=True)
     return Trajectory(times, run.r, run.p, run.v, run.pdot, run.steps)
 

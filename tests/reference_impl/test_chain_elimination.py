@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 
-from plumbline.model.kinematics import quaternion_rate, state_from_minimal
+from plumbline.model.kinematics import maximal_coordinates, quaternion_rate, state_from_minimal
 from plumbline.truth.rounding_bound import state_rounding_bound
 from reference_impl.direct import EPS, DirectSystem, Solution
 from reference_impl.euler_parameters import L
 from reference_impl.fast.chain_elimination import StructuredSystem, component_first
 from reference_impl.joints import constraint_rows
 from reference_impl.singular_system import SingularSystem
+from tests.helpers.notes_test_data import components
 from tests.helpers.random_chains import in_other_units, norms_per_body, random_chain
 
 JOINT_MIXES = {
@@ -51,13 +52,10 @@ def test_equals_the_direct_form_within_the_derived_bound(mix):
             for n in rng.integers(1, 11, size=4)
         ]
         forest = StructuredSystem([model for model, _ in drawn])
-        held = [np.concatenate([getattr(state, name) for _, state in drawn]) for name in ("r", "p", "v")]
-        pdot = np.concatenate([quaternion_rate(state.p, state.omega) for _, state in drawn])
-        together = split_by_chain(forest.solve(*held, pdot), forest)
+        held = maximal_coordinates(*(state for _, state in drawn))
+        together = split_by_chain(forest.solve(*held), forest)
         for (model, state), ours in zip(drawn, together, strict=True):
-            direct = DirectSystem(model).solve(
-                state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
-            )
+            direct = DirectSystem(model).solve(*maximal_coordinates(state))
             bound = state_rounding_bound(model, state)
             turned = [2 * (L(state.p) @ x.pddot[..., None])[..., 0] for x in (ours, direct)]
             for ours_, direct_, allowed in (
@@ -83,9 +81,8 @@ def test_all_unknowns_equal_the_direct_forms_on_and_off_the_manifold(mix, off):
             random_chain(rng, JOINT_MIXES[mix](rng, n), 0.5, loads=True, drag=True) for n in (1, 2, 2, 5, 8)
         ]
         forest = StructuredSystem([model for model, _ in drawn])
-        r, p, v = (np.concatenate([getattr(s, name) for _, s in drawn]) for name in ("r", "p", "v"))
-        pdot = np.concatenate([quaternion_rate(s.p, s.omega) for _, s in drawn])
-        r, p, v, pdot = (x + off * rng.normal(size=x.shape) for x in (r, p, v, pdot))
+        held = maximal_coordinates(*(state for _, state in drawn))
+        r, p, v, pdot = (x + off * rng.normal(size=x.shape) for x in held)
         for index, ours in enumerate(split_by_chain(forest.solve(r, p, v, pdot), forest)):
             body = slice(forest.first_body[index], forest.first_body[index + 1])
             direct = DirectSystem(forest.chains[index]).solve(r[body], p[body], v[body], pdot[body])
@@ -109,11 +106,7 @@ def test_a_batch_is_more_chains():
     model, state = random_chain(rng, [True, False, True])
     other, elsewhere = random_chain(rng, [False, False])
     alone = StructuredSystem([model])
-    q, v = component_first(state.r, state.p), component_first(state.v, quaternion_rate(state.p, state.omega))
-    q2, v2 = (
-        component_first(elsewhere.r, elsewhere.p),
-        component_first(elsewhere.v, quaternion_rate(elsewhere.p, elsewhere.omega)),
-    )
+    (q, v), (q2, v2) = (components(*maximal_coordinates(x)) for x in (state, elsewhere))
     answer = alone.acceleration(q, v)
     both = StructuredSystem([other, model]).acceleration(np.hstack([q2, q]), np.hstack([v2, v]))
     tiled = alone.repeated(3).acceleration(np.tile(q, 3), np.tile(v, 3))
@@ -126,15 +119,14 @@ def test_a_batch_is_more_chains():
 def test_singular_configurations_are_reported(mix):
     rng = np.random.default_rng(23)
     model, state = random_chain(rng, JOINT_MIXES[mix](rng, 4))
-    forest, pdot = StructuredSystem([model]), quaternion_rate(state.p, state.omega)
-    zero = state.p.copy()
+    forest, (r, p, v, pdot) = StructuredSystem([model]), maximal_coordinates(state)
+    zero = p.copy()
     zero[2] = 0
     with pytest.raises(SingularSystem, match=r"p of body 3"):
-        forest.solve(state.r, zero, state.v, pdot)
-    nan = state.r.copy()
-    nan[1] = np.nan
+        forest.solve(r, zero, v, pdot)
+    r[1] = np.nan
     with pytest.raises(SingularSystem, match=r"body 2"):
-        forest.solve(nan, state.p, state.v, pdot)
+        forest.solve(r, p, v, pdot)
     for change, words in (
         ({"mass": model.mass * [1, 0, 1, 1]}, r"mass of body 2 is 0\.0 kg"),
         ({"inertia": model.inertia * np.array([1, 1, 1, 0])[:, None, None]}, "inertia of body 4"),
@@ -150,12 +142,12 @@ def test_constraints_are_gaps_of_balls_and_squares_of_rods(mix):
     rods = {"balls": [False] * 5, "rods": [True] * 5, "mixed": [True, False, True, True, False]}[mix]
     model, state = random_chain(rng, rods)
     r, v = state.r + 0.1 * rng.normal(size=(5, 3)), state.v + 0.1 * rng.normal(size=(5, 3))
-    pdot, one = quaternion_rate(state.p, state.omega), model
-    forest, direct = StructuredSystem([one]), constraint_rows(one, r, state.p, v, pdot)
-    found = forest.constraints(component_first(r, state.p), component_first(v, pdot))
+    pdot = quaternion_rate(state.p, state.omega)
+    forest, direct = StructuredSystem([model]), constraint_rows(model, r, state.p, v, pdot)
+    found = forest.constraints(*components(r, state.p, v, pdot))
     for ours, theirs in zip(found, (direct.C, direct.constraint_rate(v, pdot)), strict=True):
         assert ours.shape == (1 if mix == "rods" else 3, 5)
-        kept = np.array([[row == 0 or not rod for row in range(len(ours))] for rod in one.rods])
+        kept = np.array([[row == 0 or not rod for row in range(len(ours))] for rod in model.rods])
         np.testing.assert_allclose(ours.T[kept], theirs, rtol=0, atol=1e-13)
         assert not np.any(ours.T[~kept])
 
@@ -165,8 +157,7 @@ def test_a_cause_is_named_by_the_body_of_its_own_chain(at, words):
     """Chains of 2, 3 and 2 bodies; the bodies of all are counted from 0."""
     rng = np.random.default_rng(26)
     drawn = [random_chain(rng, [False] * n) for n in (2, 3, 2)]
-    r, p, v = (np.concatenate([getattr(s, name) for _, s in drawn]) for name in ("r", "p", "v"))
-    pdot = np.concatenate([quaternion_rate(s.p, s.omega) for _, s in drawn])
+    r, p, v, pdot = maximal_coordinates(*(state for _, state in drawn))
     forest = StructuredSystem([model for model, _ in drawn])
     for broken, what in ((p, 0.0), (r, np.nan)):
         kept = broken[at].copy()
@@ -182,8 +173,8 @@ def test_baumgarte_adds_2a_and_a_squared_to_every_constraint(mix, a):
     """C̈ + 2 a Ċ + a² C = 0 of joints that are open, and of pᵀp − 1."""
     rng = np.random.default_rng(27)
     model, state = random_chain(rng, JOINT_MIXES[mix](rng, 4), loads=True, drag=True)
-    forest, pdot, h = StructuredSystem([model]), quaternion_rate(state.p, state.omega), 1e-6
-    q, v = component_first(state.r, state.p), component_first(state.v, pdot)
+    forest, h = StructuredSystem([model]), 1e-6
+    q, v = components(*maximal_coordinates(state))
     q[:3] += 0.1 * rng.normal(size=(3, 4))
     v[:3] += 0.1 * rng.normal(size=(3, 4))
     acceleration = forest.acceleration(q, v, a)
@@ -205,11 +196,11 @@ def test_a_pendulum_of_any_size_is_solved_alike(mix):
     """Micrometres and milligrams, kilometres and kilotons: no threshold has a unit."""
     rng = np.random.default_rng(28)
     model, state = random_chain(rng, JOINT_MIXES[mix](rng, 3), loads=True, drag=True)
-    here = StructuredSystem([model]).solve(state.r, state.p, state.v, quaternion_rate(state.p, state.omega))
+    here = StructuredSystem([model]).solve(*maximal_coordinates(state))
     allowed = state_rounding_bound(model, state)
     for length, mass, second in ((1e-6, 1e-9, 1e-3), (1e3, 1e6, 1e2), (1.0, 1e15, 1.0)):
         small, at = in_other_units(model, state, length, mass, second)
-        there = StructuredSystem([small]).solve(at.r, at.p, at.v, quaternion_rate(at.p, at.omega))
+        there = StructuredSystem([small]).solve(*maximal_coordinates(at))
         for name, unit, bound in (
             ("acceleration", length / second**2, allowed.acceleration),
             ("pddot", 1 / second**2, allowed.angular_acceleration / 2),
@@ -224,29 +215,28 @@ def test_a_pendulum_of_any_size_is_solved_alike(mix):
 def test_a_collapsed_rod_is_one_of_its_own_rounding(scale):
     model, state = random_chain(np.random.default_rng(24), [False, False, True])
     model, state = in_other_units(model, state, scale, 1.0, 1.0)
-    r = state.r.copy()
+    r, *rest = maximal_coordinates(state)
     r[2] -= state.u[2] * model.length[2]
     with pytest.raises(SingularSystem, match="rod above body 3 has length 0"):
-        StructuredSystem([model]).solve(r, state.p, state.v, quaternion_rate(state.p, state.omega))
+        StructuredSystem([model]).solve(r, *rest)
 
 
 def test_a_rod_short_beside_another_chain_s_is_no_collapsed_one():
     rng = np.random.default_rng(24)
     small, large = (in_other_units(*random_chain(rng, [True]), scale, 1.0, 1.0) for scale in (1e-6, 1e12))
     models, states = zip(small, large, strict=True)
-    r, p, v, omega = (np.concatenate([getattr(s, k) for s in states]) for k in ("r", "p", "v", "omega"))
-    both = StructuredSystem(models).solve(r, p, v, quaternion_rate(p, omega))
+    both = StructuredSystem(models).solve(*maximal_coordinates(*states))
     model, at = small
-    alone = StructuredSystem([model]).solve(at.r, at.p, at.v, quaternion_rate(at.p, at.omega))
+    alone = StructuredSystem([model]).solve(*maximal_coordinates(at))
     np.testing.assert_allclose(both.acceleration[:1], alone.acceleration, rtol=64 * EPS, atol=0)
 
 
 def test_a_collapsed_rod_on_a_body_that_is_not_turned_is_named_too():
     model, state = random_chain(np.random.default_rng(24), [True])
     at = state_from_minimal(model, np.array([[1.0, 0, 0, 0]]), state.omega, state.u, state.udot)
+    r, *rest = maximal_coordinates(at)
     with pytest.raises(SingularSystem, match="rod above body 1 has length 0"):
-        r = at.r - at.u * model.length
-        StructuredSystem([model]).solve(r, at.p, at.v, quaternion_rate(at.p, at.omega))
+        StructuredSystem([model]).solve(r - at.u * model.length, *rest)
 
 
 def test_losses_to_rounding_or_overflow_are_reported():
@@ -254,20 +244,18 @@ def test_losses_to_rounding_or_overflow_are_reported():
     model, state = random_chain(np.random.default_rng(24), [False] * 3)
     heavy = np.array([1.0, 1e20, 1.0])
     uneven = model.changed(mass=heavy * model.mass, inertia=heavy[:, None, None] * model.inertia)
-    pdot = quaternion_rate(state.p, state.omega)
     with pytest.raises(SingularSystem, match="joint rows are not independent"):
-        StructuredSystem([uneven]).solve(state.r, state.p, state.v, pdot)
-    forest, fast = StructuredSystem([model]), pdot.copy()
-    fast[1, 2] = np.inf
+        StructuredSystem([uneven]).solve(*maximal_coordinates(state))
+    forest, (q, v) = StructuredSystem([model]), components(*maximal_coordinates(state))
+    v[5, 1] = np.inf
     with pytest.raises(SingularSystem, match="a rate or a load is not finite"), np.errstate(all="ignore"):
-        forest.acceleration(component_first(state.r, state.p), component_first(state.v, fast))
+        forest.acceleration(q, v)
 
 
 def test_the_copies_of_a_tiled_forest_have_names_too():
     model, state = random_chain(np.random.default_rng(29), [False, False, False])
     forest = StructuredSystem([model]).repeated(2)
-    q, v = component_first(state.r, state.p), component_first(state.v, quaternion_rate(state.p, state.omega))
-    q, v = np.tile(q, 2), np.tile(v, 2)
+    q, v = (np.tile(x, 2) for x in components(*maximal_coordinates(state)))
     q[3:, 4] = 0.0
     with pytest.raises(SingularSystem, match="p of body 2"):
         forest.acceleration(q, v)
@@ -289,14 +277,8 @@ def test_one_kind_of_drag_alone_counts(mix, alone):
     model, state = random_chain(rng, JOINT_MIXES[mix](rng, 3), drag=True)
     other = {"drag_force": "drag_moment", "drag_moment": "drag_force"}[alone]
     model = model.changed(**{other: np.zeros(3)})
-    one, pdot, allowed = (
-        model,
-        quaternion_rate(state.p, state.omega),
-        state_rounding_bound(model, state),
-    )
-    ours, direct = (
-        form.solve(state.r, state.p, state.v, pdot) for form in (StructuredSystem([one]), DirectSystem(one))
-    )
+    at, allowed = maximal_coordinates(state), state_rounding_bound(model, state)
+    ours, direct = (form.solve(*at) for form in (StructuredSystem([model]), DirectSystem(model)))
     assert np.all(norms_per_body(ours.acceleration - direct.acceleration) <= allowed.acceleration)
     assert np.all(norms_per_body(ours.pddot - direct.pddot) <= allowed.angular_acceleration / 2)
 

@@ -8,32 +8,26 @@ import numpy as np
 import pytest
 from numpy.polynomial.legendre import legval
 
-from plumbline.model.kinematics import quaternion_rate
+from plumbline.model.kinematics import maximal_coordinates
 from reference_impl import integrate as raw
 from reference_impl.fast import collocation
-from reference_impl.fast.chain_elimination import StructuredSystem, component_first
+from reference_impl.fast.chain_elimination import StructuredSystem
 from reference_impl.fast.collocation import gauss_tables, integrate_collocation
+from tests.helpers.notes_test_data import components
 from tests.helpers.random_chains import in_other_units, random_chain
 
 TIMES = np.linspace(0.0, 1.0, 11)
 
 
-def initial_values(state):
-    return state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
-
-
 def make_stepper(forest, initial, table):
     """A stepper before its first step, with the scales of the initial values."""
-    r, p, v, pdot = initial
-    stepper = collocation._Stepper(
-        forest, component_first(r, p), component_first(v, pdot), 1e-6, 1e-7, table, True, baumgarte=0.0
-    )
+    stepper = collocation._Stepper(forest, *components(*initial), 1e-6, 1e-7, table, True, baumgarte=0.0)
     stepper.initialise_scales(*initial)
     return stepper
 
 
 def run(model, state, rtol, times=TIMES, **options):
-    return integrate_collocation([model], *initial_values(state), times, rtol, **options)
+    return integrate_collocation([model], *maximal_coordinates(state), times, rtol, **options)
 
 
 @pytest.mark.parametrize("S", [4, 12, 20])
@@ -57,7 +51,7 @@ def test_tables_integrate_polynomials_exactly(S):
 def test_two_methods_share_their_digits(rods):
     """Direct form with DOP853, structured form with collocation: nothing in common but the notes."""
     model, state = random_chain(np.random.default_rng(31), rods, loads=True, drag=True)
-    dop = raw.integrate_dop853(model, *initial_values(state), TIMES, 1e-13)
+    dop = raw.integrate_dop853(model, *maximal_coordinates(state), TIMES, 1e-13)
     ours = run(model, state, 1e-13)
     assert np.max(np.abs(ours.r - dop.r)) < (2e-11 if any(rods) else 1e-12)
     assert np.max(np.abs(ours.p - dop.p)) < (2e-11 if any(rods) else 1e-12)
@@ -104,9 +98,7 @@ def test_order_is_twice_the_nodes(monkeypatch):
 def test_a_batch_is_every_chain_alone():
     rng = np.random.default_rng(35)
     drawn = [random_chain(rng, rods) for rods in ([False], [True, False], [False, False, False], [True])]
-    packed = [
-        np.concatenate(parts) for parts in zip(*(initial_values(state) for _, state in drawn), strict=True)
-    ]
+    packed = maximal_coordinates(*(state for _, state in drawn))
     batch = integrate_collocation([model for model, _ in drawn], *packed, TIMES, 1e-12)
     at = 0
     for model, state in drawn:
@@ -285,11 +277,8 @@ def test_a_batch_has_every_chains_own_sizes():
     drawn[1] = in_other_units(*drawn[1], 1e-3, 1e-6, 1e-2)
 
     def sized(models):
-        r, p, v, pdot = (
-            np.concatenate(parts) for parts in zip(*(initial_values(s) for _, s in models), strict=True)
-        )
         forest = StructuredSystem([model for model, _ in models])
-        return make_stepper(forest, (r, p, v, pdot), gauss_tables(4))
+        return make_stepper(forest, maximal_coordinates(*(s for _, s in models)), gauss_tables(4))
 
     together, alone = sized(drawn), [sized([one]) for one in drawn]
     for name in ("q_size", "v_size"):
@@ -309,9 +298,7 @@ def test_open_joints_close_at_the_stabilisation_rate(rods):
 
     def left(found):
         samples = zip(found.r, found.p, found.v, found.pdot, strict=True)
-        return np.array(
-            [forest.constraints(component_first(r, p), component_first(v, pdot)) for r, p, v, pdot in samples]
-        )
+        return np.array([forest.constraints(*components(*sample)) for sample in samples])
 
     C = left(run(model, opened, 1e-9, times, baumgarte=a))
     (C_0, rate_0), t = C[0], times[:, None, None]
@@ -350,7 +337,7 @@ def test_a_step_is_made_where_its_error_is_within_the_tolerance(monkeypatch):
     monkeypatch.setattr(collocation._Stepper, "_error_over_tolerance", noted)
     forest, found = StructuredSystem([model]), []
     for h in np.geomspace(0.01, 1.0, 60):
-        stepper = make_stepper(forest, initial_values(state), gauss_tables(8))
+        stepper = make_stepper(forest, maximal_coordinates(state), gauss_tables(8))
         tails.clear()
         made, slow = stepper.try_step(h)
         assert made == (bool(tails) and tails[0] <= 1)
@@ -384,10 +371,9 @@ def test_no_crumb_before_a_time(monkeypatch):
 def test_a_thousand_steps_add_up_to_the_last_digit():
     """Constant parts: the compensated sums are the exact ones but for one rounding."""
     model, state = random_chain(np.random.default_rng(49), [False])
-    r, p, v, pdot = initial_values(state)
     forest, table = StructuredSystem([model]), gauss_tables(4)
     for push in (0.0, 0.3):
-        stepper = make_stepper(forest, (r, p, v, pdot), table)
+        stepper = make_stepper(forest, maximal_coordinates(state), table)
         first, a, h = (stepper.q, stepper.v), np.full((7, 4, 1), push), 0.1
         stepper.new_modes = table.node_to_mode @ a
         stepper._advance(a, h)

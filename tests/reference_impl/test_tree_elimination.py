@@ -6,19 +6,20 @@ import numpy as np
 import pytest
 
 from plumbline.model.datatypes import KINDS
-from plumbline.model.kinematics import quaternion_rate
+from plumbline.model.kinematics import maximal_coordinates
 from plumbline.model.random_mechanisms import ELEMENTS, random_tree
 from plumbline.model.sampling import random_states
 from plumbline.scenario.loader import find_scenario_file, load_scenario
 from plumbline.truth.rounding_bound import EPS, state_rounding_bound
 from reference_impl.direct import DirectSystem
 from reference_impl.euler_parameters import L, dot
-from reference_impl.fast.chain_elimination import StructuredSystem, component_first
+from reference_impl.fast.chain_elimination import StructuredSystem
 from reference_impl.fast.collocation import integrate_collocation
 from reference_impl.fast.tree_elimination import DenseSystem, TreeSystem, eliminated_system
 from reference_impl.integrate import integrate_dop853
 from reference_impl.joints import constraint_rows
 from reference_impl.singular_system import SingularSystem
+from tests.helpers.notes_test_data import body_first, components
 from tests.helpers.random_chains import random_model
 
 
@@ -26,13 +27,11 @@ def off_manifold(model, seed, size):
     """A state whose coordinates and rates are all off by ``size``."""
     rng = np.random.default_rng(seed)
     (state,) = random_states(model, 1, seed)
-    parts = state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
-    return [x + size * rng.normal(size=x.shape) for x in parts]
+    return [x + size * rng.normal(size=x.shape) for x in maximal_coordinates(state)]
 
 
 def accelerations(system, parts):
-    r, p, v, pdot = parts
-    a = system.acceleration(component_first(r, p), component_first(v, pdot))
+    a = system.acceleration(*components(*parts))
     return np.concatenate([a[:3].T.ravel(), a[3:].T.ravel()])
 
 
@@ -50,17 +49,13 @@ def test_trees_side_by_side_do_not_touch_each_other():
     models = [random_tree(np.random.default_rng(seed), n) for seed, n in enumerate((3, 1, 5))]
     models[1] = models[1].changed(gravity=np.array([1.0, 2.0, 3.0]))
     parts = [off_manifold(model, 1, 0.05) for model in models]
-    together = [np.concatenate(part) for part in zip(*parts, strict=True)]
+    together = components(*(np.concatenate(part) for part in zip(*parts, strict=True)))
     system = TreeSystem(models)
-    both = (
-        TreeSystem(models)
-        .repeated(2)
-        .acceleration(np.tile(component_first(*together[:2]), 2), np.tile(component_first(*together[2:]), 2))
-    )
-    once = system.acceleration(component_first(*together[:2]), component_first(*together[2:]))
+    both = TreeSystem(models).repeated(2).acceleration(*(np.tile(x, 2) for x in together))
+    once = system.acceleration(*together)
     assert np.array_equal(both, np.tile(once, 2))
     for model, own, first in zip(models, parts, system.first_body, strict=False):
-        alone = TreeSystem([model]).acceleration(component_first(*own[:2]), component_first(*own[2:]))
+        alone = TreeSystem([model]).acceleration(*components(*own))
         np.testing.assert_allclose(once[:, first : first + model.n], alone, rtol=1e-13, atol=1e-13)
 
 
@@ -70,7 +65,7 @@ def test_loops_with_rotors_side_by_side_do_not_touch_each_other():
     rotors = np.zeros((4, 2))
     rotors[[0, 2], 0] = 0.02, 0.05
     models = [replace(s.model, armature=factor * rotors) for factor in (1.0, 3.0)]
-    parts = s.state.r, s.state.p, s.state.v, quaternion_rate(s.state.p, s.state.omega)
+    parts = maximal_coordinates(s.state)
     expected = [DirectSystem(model).solve(*parts) for model in models]
     found = DenseSystem(models).solve(*(np.tile(part, (2, 1)) for part in parts))
     for at, one in zip((slice(3), slice(3, 6)), expected, strict=True):
@@ -88,26 +83,25 @@ def test_loops_with_rotors_side_by_side_do_not_touch_each_other():
 @pytest.mark.parametrize("kind", KINDS)
 def test_projection_ends_on_the_constraints(kind):
     model = random_tree(np.random.default_rng(3), 5, (kind,))
-    r, p, v, pdot = off_manifold(model, 4, 1e-5)
-    q, qdot = TreeSystem([model]).project(component_first(r, p), component_first(v, pdot))
-    rows = constraint_rows(model, q[:3].T, q[3:].T, qdot[:3].T, qdot[3:].T)
-    rate = rows.constraint_rate(qdot[:3].T, qdot[3:].T)
-    assert np.max(np.abs(np.concatenate([rows.C, rate])), initial=0.0) < 2e-14
-    assert np.max(np.abs(dot(q[3:].T, q[3:].T) - 1)) < 1e-15
-    assert np.max(np.abs(q - component_first(r, p))) < 1e-3
+    before = components(*off_manifold(model, 4, 1e-5))
+    q, qdot = TreeSystem([model]).project(*before)
+    r, p, v, pdot = body_first(q, qdot)
+    rows = constraint_rows(model, r, p, v, pdot)
+    assert np.max(np.abs([rows.C, rows.constraint_rate(v, pdot)]), initial=0.0) < 2e-14
+    assert np.max(np.abs(dot(p, p) - 1)) < 1e-15
+    assert np.max(np.abs(q - before[0])) < 1e-3
 
 
 def test_baumgarte_damps_constraint_errors():
     """C̈ + 2 a Ċ + a² C = 0, row by row, by differences along the motion."""
     model, a, h = random_tree(np.random.default_rng(8), 5), 3.0, 1e-5
-    parts = off_manifold(model, 2, 1e-3)
-    q, v = component_first(*parts[:2]), component_first(*parts[2:])
+    q, v = components(*off_manifold(model, 2, 1e-3))
     acceleration = TreeSystem([model]).acceleration(q, v, baumgarte=a)
 
     def rate(t):
-        at, moving = q + t * v + t * t / 2 * acceleration, v + t * acceleration
-        rows = constraint_rows(model, at[:3].T, at[3:].T, moving[:3].T, moving[3:].T)
-        return rows.C, rows.constraint_rate(moving[:3].T, moving[3:].T)
+        at = body_first(q + t * v + t * t / 2 * acceleration, v + t * acceleration)
+        rows = constraint_rows(model, *at)
+        return rows.C, rows.constraint_rate(*at[2:])
 
     (C, first), ahead, back = rate(0.0), rate(h)[1], rate(-h)[1]
     np.testing.assert_allclose((ahead - back) / (2 * h), -2 * a * first - a * a * C, atol=1e-6)
@@ -125,8 +119,7 @@ def test_chains_from_any_point_move_as_trees_do(joints):
     np.testing.assert_allclose(
         accelerations(own, parts), accelerations(TreeSystem([moved]), parts), rtol=256 * EPS
     )
-    r, p, v, pdot = off_manifold(moved, 1, 0.0)
-    on = component_first(r, p), component_first(v, pdot)
+    on = components(*off_manifold(moved, 1, 0.0))
     assert np.max(np.abs(own.constraints(*on)[0])) < 1e-14
     off = on[0] + 1e-3, on[1]
     np.testing.assert_allclose(own.project(*off), TreeSystem([moved]).project(*off), rtol=0, atol=64 * EPS)
@@ -150,7 +143,7 @@ def test_a_light_body_before_a_heavy_one_keeps_its_digits():
     """A cart of a milligram and a bob of a kilogram; without the refinement 12 bounds off."""
     case = load_scenario(find_scenario_file("light-cart-pole"))
     for state in random_states(case.model, 8, 1):
-        parts = state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
+        parts = maximal_coordinates(state)
         found, bound = TreeSystem([case.model]).solve(*parts), state_rounding_bound(case.model, state)
         expected = DirectSystem(case.model).solve(*parts)
         for name in ("acceleration", "joint_reaction", "joint_moment"):
@@ -177,29 +170,24 @@ def test_projection_normalises_far_from_the_constraints():
     """A free body has no constraint but pᵀp = 1, which one division meets however far p is off."""
     model = random_tree(np.random.default_rng(3), 2, ("free",))
     r, p, v, pdot = off_manifold(model, 4, 0.0)
-    q, _ = TreeSystem([model]).project(component_first(r, 3.0 * p), component_first(v, pdot))
-    np.testing.assert_allclose(q, component_first(r, p), rtol=1e-15, atol=1e-15)
+    q, _ = TreeSystem([model]).project(*components(r, 3.0 * p, v, pdot))
+    np.testing.assert_allclose(q, components(r, p, v, pdot)[0], rtol=1e-15, atol=1e-15)
 
 
 def test_projection_far_off_ends_on_unit_quaternions():
     """Newton's steps leave the unit sphere by the square of the gap; the last division returns to it."""
     model = random_tree(np.random.default_rng(3), 5, ("hinge",))
-    r, p, v, pdot = off_manifold(model, 4, 0.03)
-    q, qdot = TreeSystem([model]).project(component_first(r, p), component_first(v, pdot))
-    assert np.max(np.abs(dot(q[3:].T, q[3:].T) - 1)) < 1e-15
-    assert np.max(np.abs(dot(q[3:].T, qdot[3:].T))) < 1e-13
+    near = TreeSystem([model]).project(*components(*off_manifold(model, 4, 0.03)))
+    _, p, _, pdot = body_first(*near)
+    assert np.max(np.abs(dot(p, p) - 1)) < 1e-15
+    assert np.max(np.abs(dot(p, pdot))) < 1e-13
 
 
 @pytest.mark.parametrize("a", [0.0, 3.0])
 def test_baumgarte_damps_the_length_of_quaternions(a):
     """c = (pᵀp − 1) / 2 of every body: c̈ + 2 a ċ + a² c = 0."""
     model = random_tree(np.random.default_rng(8), 4)
-    parts = off_manifold(model, 2, 0.05)
-    p, pdot = parts[1], parts[3]
-    pddot = (
-        TreeSystem([model])
-        .acceleration(component_first(*parts[:2]), component_first(*parts[2:]), baumgarte=a)[3:]
-        .T
-    )
+    _, p, _, pdot = parts = off_manifold(model, 2, 0.05)
+    pddot = TreeSystem([model]).acceleration(*components(*parts), baumgarte=a)[3:].T
     left = dot(p, pddot) + dot(pdot, pdot) + 2 * a * dot(p, pdot) + a * a * (dot(p, p) - 1) / 2
     np.testing.assert_allclose(left, 0.0, atol=1e-12 * np.max(np.abs(pddot)))

@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from plumbline.model.kinematics import quaternion_rate
+from plumbline.model.kinematics import maximal_coordinates
 from plumbline.scenario import loader as scenarios
 from plumbline.storage.results_store import DRIFT_TABLE
 from plumbline.studies import drift
@@ -73,7 +73,7 @@ def test_the_command_writes_the_table(tmp_path, monkeypatch):
 def start_of(rng, rods, **options):
     """A random chain and its initial state as the integration takes it."""
     model, state = random_chain(np.random.default_rng(rng), rods, **options)
-    return model, (state.r, state.p, state.v, quaternion_rate(state.p, state.omega))
+    return model, maximal_coordinates(state)
 
 
 def table_of(model, state, **options):
@@ -106,8 +106,8 @@ def test_constraint_errors_are_metres_and_metres_a_second(rods):
     """A rod's stretch and its rate, a ball's distance and speed, each the worst of its state, from `rows`."""
     rng = np.random.default_rng(65)
     one, state = random_chain(rng, rods)
-    pdot, n = quaternion_rate(state.p, state.omega), one.n
-    motion = integrate_collocation([one], state.r, state.p, state.v, pdot, np.linspace(0, 0.1, 3), 1e-6)
+    n, times = one.n, np.linspace(0, 0.1, 3)
+    motion = integrate_collocation([one], *maximal_coordinates(state), times, 1e-6)
     moved = replace(
         motion,
         r=motion.r + 0.02 * rng.normal(size=(3, n, 3)),
@@ -168,7 +168,7 @@ def test_a_table_has_a_row_for_each_variant_tolerance_and_time():
         (variant, rtol, end) for rtol in rtols for variant in VARIANTS for end in times
     ]
     grid = np.unique(np.concatenate([np.linspace(0, end, 41) for end in times]))
-    start = state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
+    start = maximal_coordinates(state)
     motion = integrate_collocation([model], *start, grid, 1e-4)
     errors = drift_errors(model, motion)
     for row in table[:3]:
