@@ -1,11 +1,12 @@
 """Rules for every test: which process runs it, which run nightly, which skips continuous integration allows.
 
 `pytest -n 3` keeps the tests of a file in one process, so that what they share is computed once; the
-scenarios of the matrix are distributed one by one.  Three processes keep two cores busy while a test waits
-for a time limit, a cluster or a browser.  (pytest-xdist's loadgroup has no effect with pytest 9.2:
-pytest-dev/pytest-xdist#1386.)
+scenarios of the matrix are distributed one by one, and all of tests/architecture is in one process, which
+parses the source once.  Three processes keep two cores busy while a test waits for a time limit, a cluster or
+a browser.  (pytest-xdist's loadgroup has no effect with pytest 9.2: pytest-dev/pytest-xdist#1386.)
 """
 
+import gc
 import itertools
 import os
 import re
@@ -25,6 +26,10 @@ array_checks.install()
 from plumbline.processes import worker_pool  # noqa: E402 (after the checks)
 from plumbline.processes.user_cache import user_cache_folder  # noqa: E402
 from tests.helpers.nightly_tests import SLOW, is_nightly, stale_entries  # noqa: E402
+
+# Ten thousand collected tests live as long as the process: looking through them for garbage after every 700
+# objects, as Python does, takes half of the time of what makes many, as of syntax trees.
+gc.set_threshold(50_000, 20, 20)
 
 os.environ.pop("COLUMNS", None)  # GNU readline sets it for processes of pytest-xdist; lines would wrap
 
@@ -67,6 +72,8 @@ def pytest_xdist_make_scheduler(config, log):
 
     class Scheduling(LoadFileScheduling):
         def _split_scope(self, nodeid):
+            if nodeid.startswith("tests/architecture/"):
+                return "tests/architecture"
             return nodeid.partition(": ")[0] if "::test_cell[" in nodeid else super()._split_scope(nodeid)
 
     config.option.loadscopereorder = False  # else files of many short tests begin first

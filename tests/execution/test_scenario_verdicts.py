@@ -10,6 +10,8 @@ from plumbline.execution.runner import describe_engines, run_plan
 from plumbline.execution.scenario_verdicts import ScenarioRun
 from plumbline.processes.worker_pool import Limits, Outcome, WorkerPool, run_task
 from plumbline.scenario import loader
+from tests.helpers.catalogue import catalogue_scenarios
+from tests.helpers.shared_answers import by_content
 
 pytest.importorskip("mujoco")
 
@@ -20,13 +22,27 @@ def engines():
         return describe_engines(workers, ["reference", "mujoco"])
 
 
-def make_scenario_run(engines, level):
-    chosen = loader.load_scenario(loader.find_scenario_file("rest"))
-    return ScenarioRun(Plan([chosen], list(engines), level, random_state_count=2), chosen, engines)
+outcome_of = by_content(run_task)  # many tests begin with the same truth and the same answers
 
 
-def outcome_of(task, **lost):
-    return Outcome(task.key, **lost) if lost else run_task(task)
+def make_scenario_run(engines, level, name="rest", states=2, **more):
+    chosen = catalogue_scenarios()[name]
+    plan = Plan([chosen], list(engines), level, random_state_count=states)
+    return ScenarioRun(plan, chosen, engines, **more)
+
+
+def truth_of(bench, kind):
+    """The task of the truth of a kind."""
+    return next(x for x in bench.tasks() if x.key.kind == kind)
+
+
+def with_verdict(outcome, verdict, *quantities):
+    """The outcome with this verdict on some quantities."""
+    rows = [
+        replace(row, verdict=verdict) if row.quantity in quantities else row
+        for row in outcome.judge_result.rows
+    ]
+    return replace(outcome, judge_result=replace(outcome.judge_result, rows=rows))
 
 
 def test_runs_follow_their_truth_and_may_finish_in_any_order(engines):
@@ -123,8 +139,8 @@ def test_in_a_run_the_second_truth_is_handed_over(monkeypatch):
         return requested[-1] if uncompiled else replace(requested[-1], function=exit_process)
 
     monkeypatch.setattr(ScenarioRun, "truth_task", first_crashes)
-    chosen = loader.load_scenario(loader.find_scenario_file("rest"))
-    result = run_plan(Plan([chosen], ["mujoco"], "trajectory", limits=Limits(120)), lambda *_: None)
+    plan = Plan([catalogue_scenarios()["rest"]], ["mujoco"], "trajectory", limits=Limits(120))
+    result = run_plan(plan, lambda *_: None)
     assert len(requested) == 2
     assert result.metadata["exit_code"] == 0, result.metadata["sentence"]
 
@@ -146,18 +162,12 @@ class Recorded:
 def test_of_a_cell_whose_disagreements_are_all_recorded_only_the_scatter_is_measured(
     engines, quantities, searched
 ):
-    chosen = loader.load_scenario(loader.find_scenario_file("rest"))
-    plan = Plan([chosen], ["mujoco"], "state", random_state_count=2)
-    run = ScenarioRun(plan, chosen, {"mujoco": engines["mujoco"]}, known=Recorded(*quantities))
+    mujoco = {"mujoco": engines["mujoco"]}
+    run = make_scenario_run(mujoco, "state", known=Recorded(*quantities))
     (truth,) = run.tasks()
     (cell,) = run.on_outcome(outcome_of(truth))
     found = outcome_of(replace(cell, needs_answer=None))
-    wrong = [
-        replace(row, verdict="disagrees") if row.quantity in ("acceleration", "joint_reaction") else row
-        for row in found.judge_result.rows
-    ]
-    following = run.on_outcome(replace(found, judge_result=replace(found.judge_result, rows=wrong)))
-    (diagnosis,) = following
+    (diagnosis,) = run.on_outcome(with_verdict(found, "disagrees", "acceleration", "joint_reaction"))
     *_, is_known = diagnosis.arguments
     assert diagnosis.key.kind == TaskKind.DIAGNOSIS and is_known is not searched
 
@@ -184,20 +194,14 @@ def steps_of(bench, engine, integrator):
 def test_steps_are_not_searched_where_the_accelerations_they_are_made_of_disagree(
     engines, quantity, recorded, searched, are_states_first
 ):
-    chosen = loader.load_scenario(loader.find_scenario_file("tumbling-ball"))
-    plan = Plan([chosen], ["mujoco"], random_state_count=1)
-    bench = ScenarioRun(plan, chosen, {"mujoco": engines["mujoco"]}, known=Recorded(*recorded))
+    mujoco = {"mujoco": engines["mujoco"]}
+    bench = make_scenario_run(mujoco, "all", "tumbling-ball", 1, known=Recorded(*recorded))
     steps = steps_of(bench, "mujoco", "Euler")
-    truth = next(x for x in bench.tasks() if x.key.kind == TaskKind.STATE_TRUTH)
-    (states,) = bench.on_outcome(outcome_of(truth))
-    wrong = []
-    for task, wanted in ((states, quantity), (steps, "run_rate")):
-        found = outcome_of(replace(task, needs_answer=None))
-        rows = [
-            replace(row, verdict="disagrees") if row.quantity == wanted else row
-            for row in found.judge_result.rows
-        ]
-        wrong.append(replace(found, judge_result=replace(found.judge_result, rows=rows)))
+    (states,) = bench.on_outcome(outcome_of(truth_of(bench, TaskKind.STATE_TRUTH)))
+    wrong = [
+        with_verdict(outcome_of(replace(task, needs_answer=None)), "disagrees", wanted)
+        for task, wanted in ((states, quantity), (steps, "run_rate"))
+    ]
     following = [
         x for one in (wrong if are_states_first else wrong[::-1]) for x in bench.on_outcome(one)
         if x.key.kind == TaskKind.DIAGNOSIS
@@ -217,7 +221,7 @@ def test_a_study_of_low_order_is_left_to_the_night_where_steps_decide(engines, i
     plan, chosen = two_of_a_family(has_all_studies=False)
     assert plan.studied == {"double": "double-loaded-balls"}
     bench = ScenarioRun(plan, chosen, {"mujoco": engines["mujoco"]})
-    truth = next(x for x in bench.tasks() if x.key.kind == TaskKind.MOTION_TRUTH)
+    truth = truth_of(bench, TaskKind.MOTION_TRUTH)
     euler, rk4 = (outcome_of(steps_of(bench, "mujoco", name)) for name in ("Euler", "RK4"))
     studies = []
     for outcome in (outcome_of(truth), euler, rk4) if is_truth_first else (euler, rk4, outcome_of(truth)):
@@ -231,8 +235,7 @@ def test_a_study_of_low_order_is_left_to_the_night_where_steps_decide(engines, i
 def test_a_study_of_low_order_runs_where_steps_do_not_decide(engines):
     plan, chosen = two_of_a_family(has_all_studies=False)
     bench = ScenarioRun(plan, chosen, {"mujoco": engines["mujoco"]})
-    truth = next(x for x in bench.tasks() if x.key.kind == TaskKind.MOTION_TRUTH)
-    bench.on_outcome(outcome_of(truth))
+    bench.on_outcome(outcome_of(truth_of(bench, TaskKind.MOTION_TRUTH)))
     lost = Outcome(steps_of(bench, "mujoco", "Euler").key, failure="crashed")
     assert [x.key for x in bench.on_outcome(lost)] == [replace(lost.key, kind=TaskKind.TRAJECTORY)]
     assert bench.left_to_the_night == 0
@@ -243,8 +246,8 @@ def test_every_study_runs_at_night_and_on_the_plainest_scenario(engines):
         plan, _ = two_of_a_family(has_all_studies)
         (chosen,) = [s for s in plan.scenarios if s.name == name]
         bench = ScenarioRun(plan, chosen, {"mujoco": engines["mujoco"]})
-        truth = next(x for x in bench.tasks() if x.key.kind == TaskKind.MOTION_TRUTH)
-        following = [x.key.integrator for x in bench.on_outcome(outcome_of(truth))]
+        truth = outcome_of(truth_of(bench, TaskKind.MOTION_TRUTH))
+        following = [x.key.integrator for x in bench.on_outcome(truth)]
         assert following == ["Euler", "implicit", "implicitfast", "RK4"]
 
 
@@ -261,28 +264,21 @@ def test_of_methods_of_one_order_the_first_ones_study_runs(name, plainer, left):
     plan, chosen = two_of_a_family(False, name, plainer)
     with WorkerPool(1) as workers:
         bench = ScenarioRun(plan, chosen, describe_engines(workers, ["exudyn"]))
-    truth = next(x for x in bench.tasks() if x.key.kind == TaskKind.MOTION_TRUTH)
-    assert [x.key.integrator for x in bench.on_outcome(outcome_of(truth))] == ["trapezoidal"]
+    truth = outcome_of(truth_of(bench, TaskKind.MOTION_TRUTH))
+    assert [x.key.integrator for x in bench.on_outcome(truth)] == ["trapezoidal"]
     bench.on_outcome(outcome_of(steps_of(bench, "exudyn", "generalized-alpha")))
     assert bench.left_to_the_night == left
 
 
 @pytest.mark.parametrize(("of_steps", "expected"), [("agrees", "information"), ("disagrees", "unresolved")])
 def test_what_a_study_leaves_open_is_information_where_every_step_agrees(engines, of_steps, expected):
-    chosen = loader.load_scenario(loader.find_scenario_file("tumbling-ball"))
-    bench = ScenarioRun(Plan([chosen], ["mujoco"], random_state_count=1), chosen, engines)
-    truth = next(x for x in bench.tasks() if x.key.kind == TaskKind.MOTION_TRUTH)
-    studies = bench.on_outcome(outcome_of(truth))
+    bench = make_scenario_run({"mujoco": engines["mujoco"]}, "all", "tumbling-ball", 1)
+    studies = bench.on_outcome(outcome_of(truth_of(bench, TaskKind.MOTION_TRUTH)))
     study = next(x for x in studies if (x.key.engine, x.key.integrator) == ("mujoco", "RK4"))
     for task, quantity, verdict in (
         (study, "position_limit", "unresolved"), (steps_of(bench, "mujoco", "RK4"), "run_rate", of_steps),
     ):  # fmt: skip
-        found = outcome_of(task)
-        rows = [
-            replace(row, verdict=verdict) if row.quantity == quantity else row
-            for row in found.judge_result.rows
-        ]
-        bench.on_outcome(replace(found, judge_result=replace(found.judge_result, rows=rows)))
+        bench.on_outcome(with_verdict(outcome_of(task), verdict, quantity))
     (row,) = [r for r in bench.findings().rows if (r.integrator, r.quantity) == ("RK4", "position_limit")]
     assert row.verdict == expected
 
