@@ -303,7 +303,7 @@ class DirectSystem:
         return kept
 
     def _dense(self, values: Array) -> Array:
-        S = np.zeros((self.size, self.size))
+        S = np.zeros((self.size, self.size), values.dtype)
         S[self._i, self._j] = values
         return S
 

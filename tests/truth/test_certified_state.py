@@ -1,10 +1,12 @@
-"""The certified truth: enclosures that hold, and two formulations that share nothing with it."""
+"""The certified truth: enclosures that hold, and the notes' equations, which share nothing with it."""
 
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from plumbline.model.datatypes import BODY_FIELDS
 from plumbline.truth import TruthUnavailable, import_truth_tool
 from plumbline.truth.certified_state import (
     MAX_RELATIVE_RADIUS,
@@ -12,13 +14,54 @@ from plumbline.truth.certified_state import (
     certify_state,
     enclose_quantities,
 )
-from tests.helpers.notes_system_multiprecision import notes_solution
+from reference_impl.direct import DirectSystem
+from reference_impl.euler_parameters import A, L, dAs_dp, dot
+from reference_impl.joints import constraint_rows
 from tests.helpers.random_chains import random_chain
 
 flint = pytest.importorskip("flint")
 mpmath = pytest.importorskip("mpmath")
 
 JOINT_PATTERNS = [[0], [1], [0, 0], [1, 1], [0, 1], [1, 0], [1, 0, 1, 0]]
+
+
+def exactly(model, state):
+    """A chain with ``mpf`` for numbers, and r, p, ṙ, ṗ in which its joints are closed to all digits."""
+    exact, root = (np.frompyfunc(function, 1, 1) for function in (mpmath.mpf, mpmath.sqrt))
+    names = ("mass", "inertia", "point", "length", "gravity", *BODY_FIELDS)
+    model = replace(model, **{name: exact(getattr(model, name)) for name in names})
+    p, omega, u, udot = (exact(getattr(state, name)) for name in ("p", "omega", "u", "udot"))
+    p = p / root(dot(p, p))[:, None]
+    pdot = (L(p).mT @ omega[..., None])[..., 0] / 2
+    u = u / np.where(model.rods, root(dot(u, u)), 1)[:, None]
+    udot = udot - u * dot(u, udot)[:, None]
+    r, v, tip = [], [], np.zeros((2, 3), int)
+    for k in range(model.n):
+        near, far = (
+            np.array([A(p[k]) @ s, dAs_dp(p[k], s) @ pdot[k]]) for s in (model.proximal[k], model.distal[k])
+        )
+        centre = tip + model.length[k] * np.array([u[k], udot[k]]) - near
+        tip = centre + far
+        r.append(centre[0])
+        v.append(centre[1])
+    return model, (np.array(r), p, np.array(v), pdot)
+
+
+def notes_solution(model, state):
+    """r̈, ω̇′ and the joints' forces by (N5) at fifty digits, Euler parameters, multipliers and a dense solve."""
+    with mpmath.workdps(50):
+        model, at = exactly(model, state)
+        S, b = DirectSystem(model).assemble(*at)
+        x = np.array(list(mpmath.lu_solve(mpmath.matrix(S.tolist()), mpmath.matrix(b.tolist()))))
+        rows, n = constraint_rows(model, *at), model.n
+        reaction = np.zeros((n, 3), object)
+        np.subtract.at(reaction, rows.joint, x[7 * n : 7 * n + len(rows.joint), None] * rows.r_near)
+        pddot = x[3 * n : 7 * n].reshape(n, 4, 1)
+        return {
+            "acceleration": x[: 3 * n].reshape(n, 3),
+            "angular_acceleration": 2 * (L(at[1]) @ pddot)[..., 0],  # L̇ ṗ = 0 (N9)
+            "joint_reaction": reaction,
+        }
 
 
 def max_difference(enclosure, other):
