@@ -48,7 +48,7 @@ def exactly(model, state):
 
 
 def notes_solution(model, state):
-    """r̈, ω̇′ and the joints' forces by (N5) at fifty digits, Euler parameters, multipliers and a dense solve."""
+    """r̈, ω̇′ and the joints' forces by (N5) at fifty digits: multipliers, and a dense solve."""
     with mpmath.workdps(50):
         model, at = exactly(model, state)
         S, b = DirectSystem(model).assemble(*at)
