@@ -19,12 +19,14 @@ from plumbline.engines.adapter import UNSUPPORTED_KINDS
 from plumbline.engines.registry import ENGINES, load_adapter
 from plumbline.model import kinematics
 from plumbline.model.datatypes import BadInput, EngineFailure, Unsupported
+from plumbline.truth.certified_state import certify_state
 from plumbline.truth.rounding_bound import state_rounding_bound
 from tests.helpers import engine_process as worker
-from tests.helpers import newton_euler, pendulums
+from tests.helpers import pendulums
 from tests.helpers.nightly_tests import SLOW
 from tests.helpers.pendulums import JOINT_PATTERNS
 from tests.helpers.refinement import observed_orders, romberg_columns
+from tests.helpers.true_answers import true_trajectory
 
 STATES = 6
 STEP = 2.0**-7  # s, for runs whose accuracy does not matter
@@ -148,7 +150,7 @@ def test_a_declared_gap_is_real(engine, kind):
 def expected_states(joints, loaded):
     subject = pendulums.make_model(JOINT_PATTERNS[joints], loads=loaded, drag=loaded)
     states = [pendulums.state_from_seed(subject, seed) for seed in range(STATES)]
-    return subject, states, [newton_euler.solve(subject, at) for at in states]
+    return subject, states, [certify_state(subject, at, mass_matrix=True).quantities for at in states]
 
 
 def assert_close(got, expected, scale, quantity, relative):
@@ -196,14 +198,13 @@ def test_states_obey_newton_and_euler(engine, joints, loaded):
             if bound is not None:
                 limit = getattr(bound, name)[:, None]
             assert_agrees(engine, got, name, expected, limit, 1.0)
-        energy, height = newton_euler.kinetic_energy(subject, at), newton_euler.potential_energy(subject, at)
-        assert_agrees(engine, got, "kinetic_energy", energy, energy, 1e-12)
-        assert_agrees(engine, got, "potential_energy", height, g * subject.mass @ levers, 1e-13)
-        momentum = newton_euler.angular_momentum(subject, at)
-        size = np.sum(subject.mass * levers * np.linalg.norm(at.v, axis=1))
-        assert_agrees(engine, got, "angular_momentum", momentum, size, 1e-12)
-        M = newton_euler.mass_matrix(subject, at)
-        assert_agrees(engine, got, "mass_matrix", M, np.abs(M).max(), 1e-12)
+        for name, size, relative in (
+            ("kinetic_energy", true.kinetic_energy, 1e-12),
+            ("potential_energy", g * subject.mass @ levers, 1e-13),
+            ("angular_momentum", np.sum(subject.mass * levers * np.linalg.norm(at.v, axis=1)), 1e-12),
+            ("mass_matrix", np.abs(true.mass_matrix).max(), 1e-12),
+        ):
+            assert_agrees(engine, got, name, getattr(true, name), size, relative)
 
 
 def single_body(
@@ -375,14 +376,14 @@ def test_converges_to_the_truth_with_its_declared_order(engine, integrator, case
         return
     rows = [flatten_trajectory(run, true) for run in runs]
     if integrator.kind == "tolerance":
-        assert_close(rows[0], flatten_states(true), 1, "at 1e-12", 1e-9)
+        assert_close(rows[0], flatten_trajectory(true, true), 1, "at 1e-12", 1e-9)
         return
     orders = observed_orders(np.array(rows))[-2:]
     assert np.all(np.abs(orders - integrator.order) < 0.1), f"orders {orders}"
     *_, previous, limit = romberg_columns(np.array(rows), integrator.error_exponents)
     uncertainty = 10 * np.max(np.abs(limit[-1] - previous[-1])) + 1e-11
     assert uncertainty < 1e-5, f"extrapolation is uncertain by {uncertainty}"
-    assert_close(limit[-1], flatten_states(true), 1, "extrapolated", uncertainty)
+    assert_close(limit[-1], flatten_trajectory(true, true), 1, "extrapolated", uncertainty)
 
 
 @cache
@@ -391,17 +392,13 @@ def convergence_case(case):
     subject = pendulums.make_model(JOINT_PATTERNS[joints], loads=bool(loaded), drag=bool(loaded))
     at = pendulums.state_from_seed(subject, rate=1.0)
     times = np.linspace(0, 0.25, 5)  # short of the singularities of an engine that counts in angles
-    return subject, at, times, newton_euler.integrate(subject, at, times)
+    return subject, at, times, true_trajectory(subject, at, times)
 
 
 def flatten_trajectory(run, true):
     """All of a trajectory in one row of numbers; p and ṗ with the sign of the truth's."""
-    sign = np.sign(np.sum(run.p * np.array([s.p for s in true]), -1, keepdims=True))
+    sign = np.sign(np.sum(run.p * true.p, -1, keepdims=True))
     return np.concatenate([np.ravel(x) for x in (run.r, sign * run.p, run.v, sign * run.pdot)])
-
-
-def flatten_states(true):
-    return np.concatenate([np.ravel(column) for column in kinematics.maximal_coordinates(*true)])
 
 
 # -- what no engine may see --------------------------------------------------------------------

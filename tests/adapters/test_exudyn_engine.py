@@ -17,7 +17,9 @@ from plumbline.reproduce.engine_client import EngineClient
 from plumbline.reproduce.measure import StepMeasure
 from plumbline.reproduce.shrink import ReproductionCase
 from plumbline.scenario.loader import find_scenario_file, load_scenario
-from tests.helpers import newton_euler, pendulums
+from plumbline.truth.certified_state import certify_state
+from tests.helpers import pendulums
+from tests.helpers.true_answers import true_trajectory
 
 TIMES = np.linspace(0.0, 2.0, 9)
 
@@ -43,7 +45,7 @@ def test_builtin_initial_accelerations_are_finite_differences():
     """The reason why `evaluate` solves M, C, f and γ itself: Exudyn's own are off by some 1e-6."""
     subject = pendulums.make_model("bb", seed=1)
     start = pendulums.state_from_seed(subject)
-    truth = newton_euler.solve(subject, start)
+    truth = certify_state(subject, start).quantities
     scale = np.abs(truth.acceleration).max()
     with silence_engine():
         chain = ExudynChain(subject, start)
@@ -77,8 +79,8 @@ def test_the_tree_reports_singular_angles():
     assert stated == pytest.approx(np.sqrt(2 * np.arccos(0.1) / 40), abs=2.0**-9)
     before = np.array([0.0, 0.25])
     run = ExudynTree().simulate(subject, start, before, "RK44", 2.0**-11)
-    true = newton_euler.integrate(subject, start, before)[-1]
-    assert np.abs(np.abs(run.p[-1] @ true.p.T) - 1).max() < 1e-10
+    true = true_trajectory(subject, start, before)
+    assert np.abs(np.abs(run.p[-1] @ true.p[-1].T) - 1).max() < 1e-10
 
 
 def test_the_tree_reports_singular_angles_of_a_free_body():

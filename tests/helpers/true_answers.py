@@ -8,7 +8,11 @@ import pytest
 from plumbline.engines.adapter import Adapter
 from plumbline.model.datatypes import Array, Integrator, Model, State, StateQuantities, Trajectory
 from plumbline.model.invariants import attitude_error, position_error
+from plumbline.model.kinematics import quaternion_rate
+from plumbline.truth import TruthUnavailable
 from plumbline.truth.rounding_bound import MAX_RELATIVE_BOUND, RoundingBound
+from plumbline.truth.taylor import simulate_taylor
+from tests.helpers.pendulums import reference_trajectory
 
 
 def sizes(x: Array | float) -> Array:
@@ -33,6 +37,16 @@ def assert_within_bound(found: StateQuantities, truth: StateQuantities, bound: R
 def assert_reported(found: StateQuantities, truth: StateQuantities, bound: RoundingBound) -> None:
     """The accelerations differ from the true ones by more than rounding."""
     assert np.any(sizes(found.acceleration - truth.acceleration) > bound.acceleration)
+
+
+def true_trajectory(model: Model, state: State, times: Array) -> Trajectory:
+    """The motion by Taylor's method in extended precision; by the reference where heyoka is missing."""
+    try:
+        run = simulate_taylor(model, state, times, "extended")
+    except TruthUnavailable:
+        return reference_trajectory(model, state, times)
+    r, p, v, omega = (np.asarray(getattr(run, name), float) for name in ("r", "p", "v", "omega"))
+    return Trajectory(times, r, p, v, quaternion_rate(p, omega), run.steps)
 
 
 def converging_runs(
