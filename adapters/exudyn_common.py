@@ -18,7 +18,7 @@ from plumbline.model.datatypes import Array, EngineFailure, Float, Model
 Sample = TypeVar("Sample")
 items: Any = exudyn.itemInterface  # its constructors are untyped
 Output: Any = exudyn.OutputVariableType
-
+IMPLICIT, EXPLICIT = "MainSolverImplicitSecondOrder", "MainSolverExplicit"
 
 Ways = Mapping[str, Callable[..., Any]]  # by kind of item what adds one in another way, with its parameters
 
@@ -165,6 +165,11 @@ def initialized_solver(
         yield
     finally:
         solver.FinalizeSolver(mbs, settings)
+
+
+def call_parts(solver: Any, parts: str, *given: Any) -> list[Any]:
+    """Call the functions of a solver with these names in turn."""
+    return [getattr(solver, part)(*given) for part in parts.split()]
 
 
 def mass_matrix_and_force(solver: Any, mbs: Any) -> tuple[Float[Array, "nq nq"], Float[Array, "nq"]]:

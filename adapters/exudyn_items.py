@@ -15,6 +15,7 @@ import numpy as np
 from exudyn import kinematicTree, rigidBodyUtilities, robotics
 
 from adapters.exudyn_common import (
+    IMPLICIT,
     Output,
     initialized_solver,
     items,
@@ -32,11 +33,10 @@ from plumbline.model.kinematics import quaternion_rate, rotate_vectors, rotation
 from plumbline.model.probe_frames import PROBE_ATTITUDE, anchor_point, probe_points
 
 AXES = np.eye(3)
-IMPLICIT = "MainSolverImplicitSecondOrder"
 utilities: Any = rigidBodyUtilities  # as below, functions are untyped
 trees: Any = kinematicTree
 robots: Any = robotics
-PLANES = [(1, 2), (2, 0), (0, 1)]  # coordinates in the planes normal to x, y and z
+SPACE, PLANES, LINES = [[0, 1, 2]], [[1, 2], [2, 0], [0, 1]], [[0], [1], [2]]  # coordinates of parts
 ITEM, MASS = "itemInterface", "MainSolverStatic"
 
 
@@ -62,11 +62,13 @@ def bodies_at(model: Model, state: State) -> list[Body]:
 
 
 class _Items(SurfaceRecord):
-    """A system to which a part adds items, and the rows that it finds."""
+    """A system to which a part adds items for the bodies, and the rows that it finds."""
 
-    def __init__(self, found: Any) -> None:
+    def __init__(self, found: Any, bodies: Sequence[Body], anchor: Array) -> None:
         super().__init__()
-        self.found = found
+        self.found, self.bodies, self.anchor = found, bodies, anchor
+        self.masses = np.array([[one.mass] for one in bodies])
+        self.places = np.array([one.place for one in bodies])
         self.mbs, self.container = make_system()
 
     def node(self, kind: str, **given: Any) -> Any:
@@ -91,17 +93,57 @@ class _Items(SurfaceRecord):
         body = self.mbs.AddObject(items.ObjectGround())
         return self.marker("MarkerBodyRigid", bodyNumber=body, localPosition=list(place))
 
+    def grounded_coordinate(self) -> Any:
+        """A marker of a coordinate that does not move."""
+        ground = self.node("NodePointGround")
+        return self.marker("MarkerNodeCoordinate", nodeNumber=ground, coordinate=0)
+
+    def point_nodes(self) -> list[Any]:
+        """Nodes that have the bodies' places as coordinates."""
+        given = [{"initialCoordinates": one.place, "initialVelocities": one.velocity} for one in self.bodies]
+        return [self.node("NodePoint", **own) for own in given]
+
+    def rigid_bodies(self) -> list[Any]:
+        """Bodies of unit inertia where the bodies are."""
+        made = []
+        for one in self.bodies:
+            given = {"referenceCoordinates": [*one.place, *one.attitude]}
+            rates = quaternion_rate(one.attitude, one.turn.T @ one.spin)
+            node = self.node("NodeRigidBodyEP", initialVelocities=[*one.velocity, *rates], **given)
+            made.append(self.mbs.AddObject(make_rigid_body(node, one.mass, AXES)))
+        return made
+
     def of_body(self, body: Any, output: str, point: Sequence[float] = (0.0, 0.0, 0.0)) -> Array:
         return np.array(self.mbs.GetObjectOutputBody(body, getattr(Output, output), list(point)))
 
-    def of_object(self, item: Any, output: str) -> Array:
-        return np.array(self.mbs.GetObjectOutput(item, getattr(Output, output)))
+    def of_objects(self, objects: Sequence[Any], output: str) -> Array:
+        return np.array([self.mbs.GetObjectOutput(item, getattr(Output, output)) for item in objects])
 
-    def jacobian(self, item: Any) -> Array:
-        """Of a constraint, times the velocities of its coordinates."""
+    def sensed(self, sensors: Sequence[Any]) -> Array:
+        return np.array([self.mbs.GetSensorValues(sensor) for sensor in sensors])
+
+    def jacobians(self, constraints: Sequence[Any]) -> Array:
+        """Those of constraints, times the velocities of their coordinates."""
         what, data = exudyn.ComputeItemType.ConstraintJacobian, self.mbs.systemData
-        rates = np.array(data.GetODE2Coordinates_t())[np.array(data.GetObjectLTGODE2(item))]
-        return np.asarray(np.array(self.mbs.ComputeItem(item, what)) @ rates)
+        rates = np.array(data.GetODE2Coordinates_t())
+        columns = [rates[np.array(data.GetObjectLTGODE2(item))] for item in constraints]
+        pairs = zip(constraints, columns, strict=True)
+        return np.array([np.array(self.mbs.ComputeItem(item, what)) @ own for item, own in pairs])
+
+    def equations(self, constraints: Sequence[Any]) -> Array:
+        """What constraints want to be zero."""
+        what = exudyn.ComputeItemType.AlgebraicEquations
+        return np.array([self.mbs.ComputeItem(item, what) for item in constraints])
+
+    def momenta(self, bodies: Sequence[Any]) -> list[Array]:
+        """The system's mass matrix times its velocities, of bodies."""
+        solver: Any = exudyn.MainSolverStatic()
+        with initialized_solver(solver, self.mbs, make_settings()):
+            solver.ComputeMassMatrix(self.mbs)  # ComputeItem fails at mass points
+            M = np.array(solver.GetSystemMassMatrix())
+        data = self.mbs.systemData
+        momenta = M @ np.array(data.GetODE2Coordinates_t())
+        return [momenta[np.array(data.GetObjectLTGODE2(body))] for body in bodies]
 
 
 def _call(*names: str) -> Call:
@@ -115,116 +157,64 @@ def add_item_answers(record: SurfaceRecord, model: Model, state: State) -> None:
 
 
 def _add_part_of_items(
-    record: SurfaceRecord, part: Callable[..., None], bodies: Sequence[Body], anchor: Array
+    record: SurfaceRecord, part: Callable[[_Items], None], bodies: Sequence[Body], anchor: Array
 ) -> None:
-    part(_Items(record.found), bodies, anchor)
+    part(_Items(record.found, bodies, anchor))
 
 
-def _momenta(s: _Items, bodies: Sequence[Any]) -> list[Array]:
-    """The system's mass matrix times its velocities, of bodies."""
-    solver: Any = exudyn.MainSolverStatic()
-    with initialized_solver(solver, s.mbs, make_settings()):
-        solver.ComputeMassMatrix(s.mbs)  # ComputeItem fails at mass points
-        M = np.array(solver.GetSystemMassMatrix())
-    data = s.mbs.systemData
-    momenta = M @ np.array(data.GetODE2Coordinates_t())
-    return [momenta[np.array(data.GetObjectLTGODE2(body))] for body in bodies]
+def _gathered(values: Sequence[Array], rows: Sequence[Sequence[int]]) -> Array:
+    """Vectors of bodies by values of parts, which have these coordinates each: their mean."""
+    total = np.zeros((len(values) // len(rows), 3))
+    for i, value in enumerate(values):
+        own = rows[i % len(rows)]
+        total[i // len(rows), own] += value[: len(own)]
+    return total / (sum(map(len, rows)) / 3)
 
 
-def _add_points(node_kind: str, body_kind: str) -> Callable[..., None]:
-    """Mass points: half of each place is the reference."""
+def _add_points(node_kind: str, body_kind: str, rows: Sequence[Sequence[int]]) -> Callable[[_Items], None]:
+    """Mass points of some coordinates each, of which half is the reference."""
 
-    def add(s: _Items, bodies: Sequence[Body], anchor: Array) -> None:
+    def add(s: _Items) -> None:
         nodes, points = [], []
-        for one in bodies:
-            half = (one.place / 2).tolist()
-            given = {
-                "referenceCoordinates": half,
-                "initialCoordinates": half,
-                "initialVelocities": one.velocity,
-            }
-            nodes.append(s.node(node_kind, **given))
-            points.append(s.body(body_kind, nodes[-1], mass=one.mass))
+        for one in s.bodies:
+            for own in rows:
+                half = (one.place[own] / 2).tolist()
+                given = {"referenceCoordinates": half, "initialCoordinates": half}
+                nodes.append(s.node(node_kind, initialVelocities=one.velocity[own].tolist(), **given))
+                along = {"referenceRotation": _to_x(own[0])} if rows is LINES else {}
+                points.append(s.body(body_kind, nodes[-1], mass=one.mass, **along))
         s.mbs.Assemble()
         call = _call(node_kind, body_kind)
-        s.add("body_position", call, [s.of_body(point, "Position") for point in points])
-        s.add("body_velocity", call, [s.of_body(point, "Velocity") for point in points])
-        masses = np.array([one.mass for one in bodies])[:, None]
-        s.add("body_velocity", (*call, MASS), np.array(_momenta(s, points)) / masses)
-        for output in ("Displacement", "Coordinates"):
-            values = [s.mbs.GetNodeOutput(node, getattr(Output, output)) for node in nodes]
-            call = *_call(node_kind), f"OutputVariableType.{output}"
-            s.add("body_position", call, 2 * np.array(values))
+        for quantity, output in (("body_position", "Position"), ("body_velocity", "Velocity")):
+            values = np.array([s.of_body(point, output) for point in points])
+            in_space = np.sum(values.reshape(-1, len(rows), 3), axis=1)  # of lines, which have directions
+            s.add(quantity, call, _gathered(values, rows) if rows is PLANES else in_space)
+        s.add("body_velocity", (*call, MASS), _gathered(s.momenta(points), rows) / s.masses)
+        if rows is SPACE:
+            for output in ("Displacement", "Coordinates"):
+                halves = [s.mbs.GetNodeOutput(node, getattr(Output, output)) for node in nodes]
+                call = *_call(node_kind), f"OutputVariableType.{output}"
+                s.add("body_position", call, 2 * np.array(halves))
 
     return add
 
 
-def _add_created_points(s: _Items, bodies: Sequence[Body], anchor: Array) -> None:
-    points = [
-        s.mbs.CreateMassPoint(
-            referencePosition=one.place, initialVelocity=one.velocity, **sizes_of_body(mass=one.mass)
-        )
-        for one in bodies
-    ]
-    points = [
-        point[-1] if isinstance(point, list) else point for point in points
-    ]  # before 1.10 with the node
+def _add_created_points(s: _Items) -> None:
+    create, points = s.mbs.CreateMassPoint, []
+    for one in s.bodies:
+        given = {"referencePosition": one.place, "initialVelocity": one.velocity}
+        points.append(create(**given, **sizes_of_body(mass=one.mass)))
+    # before 1.10 with the node
+    points = [point[-1] if isinstance(point, list) else point for point in points]
     s.mbs.Assemble()
     call = ("MainSystem.CreateMassPoint",)
     s.add("body_position", call, [s.of_body(point, "Position") for point in points])
-    masses = np.array([one.mass for one in bodies])[:, None]
-    s.add("body_velocity", call, np.array(_momenta(s, points)) / masses)
-
-
-def _add_plane_points(node_kind: str, body_kind: str) -> Callable[..., None]:
-    """Mass points in the three planes, of whose coordinates each is in two."""
-
-    def add(s: _Items, bodies: Sequence[Body], anchor: Array) -> None:
-        made = []
-        for k, one in enumerate(bodies):
-            for plane in map(list, PLANES):
-                given = {"initialCoordinates": one.place[plane], "initialVelocities": one.velocity[plane]}
-                made.append((k, plane, s.body(body_kind, s.node(node_kind, **given), mass=one.mass)))
-        s.mbs.Assemble()
-        places, velocities, momenta = np.zeros((3, len(bodies), 3))
-        for (k, plane, body), momentum in zip(made, _momenta(s, [x[-1] for x in made]), strict=True):
-            places[k, plane] += s.of_body(body, "Position")[:2] / 2
-            velocities[k, plane] += s.of_body(body, "Velocity")[:2] / 2
-            momenta[k, plane] += momentum / (2 * bodies[k].mass)
-        call = _call(node_kind, body_kind)
-        s.add("body_position", call, places)
-        s.add("body_velocity", call, velocities)
-        s.add("body_velocity", (*call, MASS), momenta)
-
-    return add
+    s.add("body_velocity", call, np.array(s.momenta(points)) / s.masses)
 
 
 def _to_x(axis: int) -> Array:
     """A turn that has a coordinate axis as its first column."""
     return np.roll(AXES, -axis, axis=1)
-
-
-def _add_lines(body_kind: str) -> Callable[..., None]:
-    """A mass on a line along each axis."""
-
-    def add(s: _Items, bodies: Sequence[Body], anchor: Array) -> None:
-        lines = []
-        for one in bodies:
-            for axis in range(3):
-                half = [float(one.place[axis] / 2)]
-                given = {"referenceCoordinates": half, "initialCoordinates": half}
-                node = s.node("Node1D", initialVelocities=[float(one.velocity[axis])], **given)
-                lines.append(s.body(body_kind, node, referenceRotation=_to_x(axis), mass=one.mass))
-        s.mbs.Assemble()
-        call = _call("Node1D", body_kind)
-        for quantity, output in (("body_position", "Position"), ("body_velocity", "Velocity")):
-            values = [s.of_body(line, output) for line in lines]
-            s.add(quantity, call, np.sum(np.reshape(values, (-1, 3, 3)), axis=1))
-        momenta = np.reshape(_momenta(s, lines), (-1, 3))
-        masses = np.array([one.mass for one in bodies])[:, None]
-        s.add("body_velocity", (*call, MASS), momenta / masses)
-
-    return add
 
 
 def _turn_about(values: Any) -> list[Array]:
@@ -242,105 +232,87 @@ def _angles(one: Body) -> Array:
     return np.asarray(Pose(one.place, one.attitude).forms["xyz"])
 
 
-def _add_rotors(body_kind: str) -> Callable[..., None]:
+def _add_rotors(body_kind: str) -> Callable[[_Items], None]:
     """A rotor about each axis: attitudes are their turns in a row, spins their sum."""
 
-    def add(s: _Items, bodies: Sequence[Body], anchor: Array) -> None:
+    def add(s: _Items) -> None:
         inertia, rotors = 0.5, []
         frames = [np.roll(_to_x(axis), 2, axis=1) for axis in range(3)]  # whose third column is the axis
-        for one in bodies:
+        for one in s.bodies:
             for frame, angle, rate in zip(frames, _angles(one), one.spin, strict=True):
                 given = {"initialCoordinates": [float(angle)], "initialVelocities": [float(rate)]}
                 node = s.node("Node1D", **given)
                 rotors.append(s.body(body_kind, node, inertia=inertia, referenceRotation=frame))
         s.mbs.Assemble()
         call = _call("Node1D", body_kind)
-        turns = [s.of_body(rotor, "RotationMatrix").reshape(3, 3) for rotor in rotors]
-        own = np.reshape([turn @ frame.T for turn, frame in zip(turns, frames * len(bodies), strict=True)],
-                         (-1, 3, 3, 3))  # fmt: skip
-        s.add_axes(call, _probe_axes(own))
+        turns = np.reshape([s.of_body(rotor, "RotationMatrix") for rotor in rotors], (-1, 3, 3, 3))
+        s.add_axes(call, _probe_axes([turn @ np.array(frames).mT for turn in turns]))
         spins = np.reshape([s.of_body(rotor, "AngularVelocity") for rotor in rotors], (-1, 3, 3))
         s.add("frame_angular_velocity", call, np.sum(spins, axis=1))
-        momenta = np.reshape(_momenta(s, rotors), (-1, 3))
-        s.add("frame_angular_velocity", (*call, MASS), momenta / inertia)
+        s.add("frame_angular_velocity", (*call, MASS), _gathered(s.momenta(rotors), LINES) / inertia)
 
     return add
 
 
-def _add_plane_bodies(node_kind: str, body_kind: str, turning: str, sliding: str) -> Callable[..., None]:
+def _add_plane_bodies(node_kind: str, body_kind: str, turning: str, sliding: str) -> Callable[[_Items], None]:
     """Bodies in the three planes, at half of each velocity, with joints that would hold probe points."""
 
-    def add(s: _Items, bodies: Sequence[Body], anchor: Array) -> None:
-        made = []
-        for k, one in enumerate(bodies):
+    def add(s: _Items) -> None:
+        inertia, bodies, points, joints = 0.5, [], [], []
+        for one in s.bodies:
             reach = one.turn @ one.arm
-            for axis, plane in enumerate(map(list, PLANES)):
-                angle, inertia = float(_angles(one)[axis]), 0.5
+            for angle, spin, plane in zip(_angles(one).tolist(), one.spin.tolist(), PLANES, strict=True):
                 turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
                 node = s.node(
                     node_kind, initialCoordinates=[*one.place[plane], angle],
-                    initialVelocities=[*one.velocity[plane] / 2, float(one.spin[axis])],
+                    initialVelocities=[*one.velocity[plane] / 2, spin],
                 )  # fmt: skip
-                body = s.body(body_kind, node, inertia=inertia, mass=one.mass)
-                point = [*(turn.T @ reach[plane]), 0.0]
-                here = s.marker("MarkerBodyRigid", bodyNumber=body, localPosition=point)
+                bodies.append(s.body(body_kind, node, inertia=inertia, mass=one.mass))
+                points.append([*(turn.T @ reach[plane]), 0.0])
+                here = s.marker("MarkerBodyRigid", bodyNumber=bodies[-1], localPosition=points[-1])
                 there = s.ground([*(one.place + reach)[plane], 0.0])
-                across = [[*(turn.T @ normal), 0.0] for normal in np.eye(2)]
-                joints = [s.object(turning, there, here)]
-                joints += [
-                    s.object(sliding, there, here, axisMarker0=[*along, 0.0], normalMarker1=normal)
-                    for along, normal in zip(np.eye(2)[::-1].tolist(), across, strict=True)
-                ]
-                made.append((k, axis, plane, body, point, joints))
+                joints.append(s.object(turning, there, here))
+                for along, across in (([0, 1.0, 0], turn[0]), ([1.0, 0, 0], turn[1])):
+                    axes = {"axisMarker0": along, "normalMarker1": [*across, 0.0]}
+                    joints.append(s.object(sliding, there, here, **axes))
         s.mbs.Assemble()
-        count, place, velocity = len(bodies), *np.zeros((2, len(bodies), 3))
-        held, slid, spins, turned, momenta, spun = np.zeros((6, count, 3))
-        turns = np.tile(np.eye(3), (count, 3, 1, 1))
-        own = _momenta(s, [one[3] for one in made])
-        for (k, axis, plane, body, point, joints), momentum in zip(made, own, strict=True):
-            place[k, plane] += s.of_body(body, "Position", point)[:2] / 2
-            velocity[k, plane] += s.of_body(body, "Velocity", point)[:2]
-            spins[k, axis] = s.of_body(body, "AngularVelocity")[2]
-            turns[k, axis][np.ix_(plane, plane)] = s.of_body(body, "RotationMatrix").reshape(3, 3)[:2, :2]
-            held[k, plane] += s.jacobian(joints[0])
-            rows = np.array([s.jacobian(joint) for joint in joints[1:]])
-            slid[k, plane] += rows[:, 0]
-            turned[k, axis] = (rows[0, 1] - rows[1, 1]) / 2
-            momenta[k, plane] += momentum[:2] / bodies[k].mass
-            spun[k, axis] = momentum[2] / inertia
+
+        def read(output: str) -> list[Array]:
+            return [s.of_body(body, output, point) for body, point in zip(bodies, points, strict=True)]
+
         call, by = _call(node_kind, body_kind), "MainSystem.ComputeItem"
-        s.add_axes(call, _probe_axes(turns))
-        s.add("frame_position", call, place)
-        s.add("frame_velocity", call, velocity)
-        s.add("frame_angular_velocity", call, spins)
-        s.add("body_velocity", (*call, MASS), momenta)
-        s.add("frame_angular_velocity", (*call, MASS), spun)
-        s.add("frame_velocity", (*_call(turning), by), held)
-        s.add("frame_velocity", (*_call(sliding), by), slid)
+        turns, momenta = np.tile(AXES, (len(bodies), 1, 1)), s.momenta(bodies)
+        for i, turn in enumerate(read("RotationMatrix")):
+            turns[i][np.ix_(PLANES[i % 3], PLANES[i % 3])] = turn.reshape(3, 3)[:2, :2]
+        s.add_axes(call, _probe_axes(turns.reshape(-1, 3, 3, 3)))
+        s.add("frame_position", call, _gathered(read("Position"), PLANES))
+        s.add("frame_velocity", call, 2 * _gathered(read("Velocity"), PLANES))
+        spins = [spin[2] for spin in read("AngularVelocity")]
+        s.add("frame_angular_velocity", call, np.reshape(spins, (-1, 3)))
+        s.add("body_velocity", (*call, MASS), 2 * _gathered(momenta, PLANES) / s.masses)
+        spun = np.reshape([momentum[2] for momentum in momenta], (-1, 3))
+        s.add("frame_angular_velocity", (*call, MASS), spun / inertia)
+        held, along, across = np.reshape(s.jacobians(joints), (-1, 3, 2)).swapaxes(0, 1)
+        s.add("frame_velocity", (*_call(turning), by), 2 * _gathered(held, PLANES))
+        slid = np.stack([along[:, 0], across[:, 0]], axis=1)
+        s.add("frame_velocity", (*_call(sliding), by), 2 * _gathered(slid, PLANES))
+        turned = np.reshape(along[:, 1] - across[:, 1], (-1, 3)) / 2
         s.add("frame_angular_velocity", (*_call(sliding), by), turned)
 
     return add
 
 
-def _own_points(s: _Items, bodies: Sequence[Body]) -> list[Any]:
-    """Nodes that have the bodies' places as coordinates."""
-    return [
-        s.node("NodePoint", initialCoordinates=one.place, initialVelocities=one.velocity) for one in bodies
-    ]
-
-
-def _add_coordinate_constraints(s: _Items, bodies: Sequence[Body], anchor: Array) -> None:
+def _add_coordinate_constraints(s: _Items) -> None:
     """Constraints of single coordinates, whose equations and Jacobians say places and velocities.
 
     Half of each coordinate and of each velocity is the constraint's offset.
     """
-    ground = s.node("NodePointGround")
-    fixed = s.marker("MarkerNodeCoordinate", nodeNumber=ground, coordinate=0)
-    nodes = _own_points(s, bodies)
+    fixed, nodes = s.grounded_coordinate(), s.point_nodes()
     points = [s.body("ObjectMassPoint", node, mass=1.0) for node in nodes]
     long, short = "ObjectConnectorCoordinate", "CoordinateConstraint"
-    made: dict[str, list[Any]] = {}
-    for node, point, one in zip(nodes, points, bodies, strict=True):
+    what, by_user = "OutputVariableType.ConstraintEquation", f"{long}OffsetUserFunction"
+    create, made = exudyn.MainSystem.CreateCoordinateConstraint, dict[Call, list[Any]]()
+    for node, point, one in zip(nodes, points, s.bodies, strict=True):
         halves = zip((one.place / 2).tolist(), (one.velocity / 2).tolist(), strict=True)
         for i, (place, velocity) in enumerate(halves):
             marker = s.marker("MarkerNodeCoordinate", nodeNumber=node, coordinate=i)
@@ -348,39 +320,29 @@ def _add_coordinate_constraints(s: _Items, bodies: Sequence[Body], anchor: Array
             by_velocity = {
                 "velocityLevel": True, "offsetUserFunction_t": lambda mbs, t, item, offset, x=velocity: x
             }  # fmt: skip
-            for name, kind, given in (
-                (long, long, {"factorValue1": 2.0}), (short, short, {}),
-                (f"{long}OffsetUserFunction", short, by_place),
-                (f"{long}OffsetUserFunction_t", short, by_velocity),
-            ):  # fmt: skip
-                made.setdefault(name, []).append(s.object(kind, fixed, marker, **given))
-            create, ends = exudyn.MainSystem.CreateCoordinateConstraint, [None, point]
-            names = known_arguments(
-                create, dict.fromkeys(("itemNumbers", "bodyOrNodeList", "bodyNumbers"), ends)
-            )
-            own = dict([*names.items()][:1])  # under the name of the version
+            for call, kind, given in (
+                ((*_call(long), what), long, {"factorValue1": 2.0}),
+                ((*_call(short), what), short, {}),
+                (_call(by_user), short, by_place),
+                (_call(f"{by_user}_t"), short, by_velocity),
+            ):
+                made.setdefault(call, []).append(s.object(kind, fixed, marker, **given))
+            ends = {key: [None, point] for key in ("itemNumbers", "bodyOrNodeList", "bodyNumbers")}
+            own = dict([*known_arguments(create, ends).items()][:1])  # under the name of the version
             joint = create(s.mbs, coordinates=[None, i], offset=place, **own)
-            made.setdefault("created", []).append(joint)
+            made.setdefault(("MainSystem.CreateCoordinateConstraint",), []).append(joint)
     s.mbs.Assemble()
-    what = "OutputVariableType.ConstraintEquation"
-    for name, quantity, call, factor in (
-        (long, "body_position", (*_call(long), what), 0.5),
-        (short, "body_position", (*_call(short), what), 1.0),
-        (f"{long}OffsetUserFunction", "body_position", _call(f"{long}OffsetUserFunction"), 2.0),
-        (f"{long}OffsetUserFunction_t", "body_velocity", _call(f"{long}OffsetUserFunction_t"), 2.0),
-        ("created", "body_position", ("MainSystem.CreateCoordinateConstraint",), 2.0),
-    ):
-        values = np.reshape([s.of_object(joint, "ConstraintEquation") for joint in made[name]], (-1, 3))
-        s.add(quantity, call, factor * values)
-    rates = np.reshape([s.jacobian(joint) for joint in made[short]], (-1, 3))
+    for (call, joints), factor in zip(made.items(), (0.5, 1.0, 2.0, 2.0, 2.0), strict=True):
+        quantity = "body_velocity" if call[0].endswith("_t") else "body_position"
+        s.add(quantity, call, factor * s.of_objects(joints, "ConstraintEquation").reshape(-1, 3))
+    rates = s.jacobians(made[*_call(short), what]).reshape(-1, 3)
     s.add("body_velocity", (*_call(short), "MainSystem.ComputeItem"), rates)
 
 
-def _add_vector_constraints(s: _Items, bodies: Sequence[Body], anchor: Array) -> None:
+def _add_vector_constraints(s: _Items) -> None:
     """Constraints of all coordinates of a node or a body."""
-    ground = s.node("NodePointGround")
-    fixed = s.marker("MarkerNodeCoordinates", nodeNumber=ground)
-    nodes = _own_points(s, bodies)
+    fixed = s.marker("MarkerNodeCoordinates", nodeNumber=s.node("NodePointGround"))
+    nodes = s.point_nodes()
     points = [s.body("ObjectMassPoint", node, mass=1.0) for node in nodes]
     of_nodes = [s.marker("MarkerNodeCoordinates", nodeNumber=node) for node in nodes]
     of_bodies = [s.marker("MarkerObjectODE2Coordinates", objectNumber=point) for point in points]
@@ -400,112 +362,89 @@ def _add_vector_constraints(s: _Items, bodies: Sequence[Body], anchor: Array) ->
         )
     }
     s.mbs.Assemble()
-    what = exudyn.ComputeItemType.AlgebraicEquations
     for call, own_joints in joints.items():
-        equations = [np.array(s.mbs.ComputeItem(joint, what)) for joint in own_joints]
-        s.add("body_position", call, np.array(equations) / 2)
-        s.add("body_velocity", call, np.array([s.jacobian(joint) for joint in own_joints]) / 2)
+        s.add("body_position", call, s.equations(own_joints) / 2)
+        s.add("body_velocity", call, s.jacobians(own_joints) / 2)
 
 
-def _rigid_bodies(s: _Items, bodies: Sequence[Body]) -> list[Any]:
-    """Bodies of unit inertia where the bodies are."""
-    made = []
-    for one in bodies:
-        rates = quaternion_rate(one.attitude, one.turn.T @ one.spin)
-        node = s.node(
-            "NodeRigidBodyEP", referenceCoordinates=[*one.place, *one.attitude],
-            initialVelocities=[*one.velocity, *rates],
-        )  # fmt: skip
-        made.append(s.mbs.AddObject(make_rigid_body(node, one.mass, AXES)))
-    return made
-
-
-def _add_relative_markers(s: _Items, bodies: Sequence[Body], anchor: Array) -> None:
+def _add_relative_markers(s: _Items) -> None:
     """Markers of one coordinate of a body or between two, read by connectors."""
-    ground = s.mbs.CreateGround(referencePosition=anchor)
-    fixed = s.marker("MarkerNodeCoordinate", nodeNumber=s.node("NodePointGround"), coordinate=0)
-    made: dict[str, list[Any]] = {}
-    for body, one in zip(_rigid_bodies(s, bodies), bodies, strict=True):
+    ground, fixed = s.mbs.CreateGround(referencePosition=s.anchor), s.grounded_coordinate()
+    between, made = "MarkerBodiesRelative", dict[str, list[Any]]()
+    for body, one in zip(s.rigid_bodies(), s.bodies, strict=True):
         ends = {"bodyNumbers": [ground, body], "localPosition1": one.arm}
         node = s.mbs.GetObject(body)["nodeNumber"]
         for axis in range(3):
             for kind, given in (
-                ("MarkerBodiesRelativeTranslationCoordinate", {"axis0": AXES[axis], **ends}),
-                ("MarkerBodiesRelativeRotationCoordinate", {"axis0": AXES[axis], **ends}),
+                (f"{between}TranslationCoordinate", {"axis0": AXES[axis], **ends}),
+                (f"{between}RotationCoordinate", {"axis0": AXES[axis], **ends}),
                 ("MarkerNodeRotationCoordinate", {"nodeNumber": node, "rotationCoordinate": axis}),
             ):
                 marker = s.marker(kind, **given)
                 connector = s.object("CoordinateSpringDamper", fixed, marker, stiffness=2.0)
                 made.setdefault(kind, []).append(connector)
     s.mbs.Assemble()
-    for kind, moved, turned in (
-        ("MarkerBodiesRelativeTranslationCoordinate", "frame_position_from_anchor", "frame_velocity"),
-        ("MarkerBodiesRelativeRotationCoordinate", "", "frame_angular_velocity"),
-        ("MarkerNodeRotationCoordinate", "axes", "frame_angular_velocity"),
-    ):
-        call = _call(kind) + (("MainSystem.CreateGround",) if kind.endswith("TranslationCoordinate") else ())
+    for kind, connectors in made.items():
+        call, is_shift = _call(kind), "Translation" in kind
+        call += ("MainSystem.CreateGround",) * is_shift
         place, rate = (
-            np.reshape([s.of_object(one, output) for one in made[kind]], (-1, 3))
-            for output in ("Displacement", "Velocity")
+            s.of_objects(connectors, output).reshape(-1, 3) for output in ("Displacement", "Velocity")
         )
-        s.add(turned, call, rate)
-        if moved == "axes":
-            turns = _probe_axes([_turn_about(angles) for angles in place])
-            s.add("frame_axes_by_angles", call, np.reshape(np.array(turns).mT, (-1, 3)))
-        elif moved:
-            s.add(moved, (*call, "OutputVariableType.Displacement"), place)
+        s.add("frame_velocity" if is_shift else "frame_angular_velocity", call, rate)
+        if is_shift:
+            s.add("frame_position_from_anchor", (*call, "OutputVariableType.Displacement"), place)
+        elif not kind.startswith(between):
+            turns = np.array(_probe_axes([_turn_about(angles) for angles in place]))
+            s.add("frame_axes_by_angles", call, np.reshape(turns.mT, (-1, 3)))
 
 
-def _add_connectors(s: _Items, bodies: Sequence[Body], anchor: Array) -> None:
+def _add_connectors(s: _Items) -> None:
     """Connectors and joints between the anchor and probe points, and what they say of the distance."""
-    turn, shift = rotation_matrix(PROBE_ATTITUDE), anchor / 2
-    fixed = s.ground(anchor)
+    turn, shift = rotation_matrix(PROBE_ATTITUDE), s.anchor / 2
+    fixed, turned = s.ground(s.anchor), {"rotationMarker0": turn}
     made = []
-    for body, one in zip(_rigid_bodies(s, bodies), bodies, strict=True):
+    for body, one in zip(s.rigid_bodies(), s.bodies, strict=True):
         marker = s.marker("MarkerBodyRigid", bodyNumber=body, localPosition=one.arm)
         made.append((
             s.object("ObjectConnectorCartesianSpringDamper", fixed, marker, stiffness=[2.0] * 3),
             s.object("ObjectConnectorDistance", fixed, marker, distance=1.0),
-            s.object("ObjectConnectorRigidBodySpringDamper", fixed, marker, rotationMarker0=turn,
-                     damping=3 * np.eye(6)),
-            s.object("ObjectJointGeneric", fixed, marker, rotationMarker0=turn,
+            s.object("ObjectConnectorRigidBodySpringDamper", fixed, marker, damping=3 * np.eye(6), **turned),
+            s.object("ObjectJointGeneric", fixed, marker, **turned,
                      offsetUserFunction=lambda mbs, t, item, given: [*shift, 0.0, 0.0, 0.0]),
         ))  # fmt: skip
     spring, rod, six, joint = zip(*made, strict=True)
-    sensors = {
-        "Force": [s.sensor("SensorObject", objectNumber=x, outputVariableType=Output.Force) for x in spring],
-        "Distance": [
-            s.sensor("SensorObject", objectNumber=x, outputVariableType=Output.Distance) for x in rod
-        ],
-    }
+    forces, distances = (
+        [s.sensor("SensorObject", objectNumber=x, outputVariableType=output) for x in own]
+        for own, output in ((spring, Output.Force), (rod, Output.Distance))
+    )
     s.mbs.Assemble()
-    sensed = {name: np.array([s.mbs.GetSensorValues(x) for x in own]) for name, own in sensors.items()}
     away, what = "frame_position_from_anchor", "OutputVariableType."
-    s.add(away, (*_call("SensorObject"), f"{what}Force"), sensed["Force"] / 2)
-    s.add("frame_distance", (*_call("SensorObject"), f"{what}Distance"), sensed["Distance"].reshape(-1, 1))
-    local = np.array([s.of_object(one, "DisplacementLocal") for one in six])
-    s.add(away, (f"{what}DisplacementLocal",), local @ turn.T)
-    for quantity, output in (("frame_velocity", "ForceLocal"), ("frame_angular_velocity", "TorqueLocal")):
-        values = np.array([s.of_object(one, output) for one in six])
-        s.add(quantity, (f"{what}{output}",), values @ turn.T / 3)
-    energies = np.array([[s.of_object(one, "PotentialEnergy")] for one in spring])  # of a stiffness of 2 N/m
-    s.add("frame_distance", (f"{what}PotentialEnergy",), np.sqrt(energies))
-    poses = np.reshape([s.of_object(one, "HomogeneousTransformationLocal") for one in six], (-1, 4, 4))
+    s.add(away, (*_call("SensorObject"), f"{what}Force"), s.sensed(forces) / 2)
+    s.add("frame_distance", (*_call("SensorObject"), f"{what}Distance"), s.sensed(distances).reshape(-1, 1))
+    for quantity, output, size in (
+        (away, "DisplacementLocal", 1),
+        ("frame_velocity", "ForceLocal", 3),
+        ("frame_angular_velocity", "TorqueLocal", 3),
+    ):
+        s.add(quantity, (f"{what}{output}",), s.of_objects(six, output) @ turn.T / size)
+    energies = s.of_objects(spring, "PotentialEnergy")  # of a stiffness of 2 N/m
+    s.add("frame_distance", (f"{what}PotentialEnergy",), np.sqrt(energies)[:, None])
+    poses = s.of_objects(six, "HomogeneousTransformationLocal").reshape(-1, 4, 4)
     s.add(away, (f"{what}HomogeneousTransformationLocal",), poses[:, :3, 3] @ turn.T)
     s.add_axes((f"{what}HomogeneousTransformationLocal",), turn @ poses[:, :3, :3] @ turn)
-    equations = np.array([s.mbs.ComputeItem(one, exudyn.ComputeItemType.AlgebraicEquations) for one in joint])
-    s.add(away, _call("ObjectJointGenericOffsetUserFunction"), equations[:, :3] + shift)
+    s.add(away, _call("ObjectJointGenericOffsetUserFunction"), s.equations(joint)[:, :3] + shift)
 
 
-def _seen(item: dict[str, Any]) -> dict[str, Any]:
-    """The parameters of an item that are given once, and not for drawing."""
-    return {name: value for name, value in item.items() if not name.startswith("V") and "HT" not in name}
+def _changed(item: dict[str, Any], **given: Any) -> dict[str, Any]:
+    """The parameters of an item that are given once, and not for drawing, some of them others."""
+    own = {name: value for name, value in item.items() if not name.startswith("V") and "HT" not in name}
+    return own | given
 
 
-def _add_loads(s: _Items, bodies: Sequence[Body], anchor: Array) -> None:
+def _add_loads(s: _Items) -> None:
     """Loads of mass times place, by sensors and functions, and with parameters that are set later."""
-    loads, later, changed = [], [], []
-    for node, one in zip(_own_points(s, bodies), bodies, strict=True):
+    mbs, loads, later, changed = s.mbs, [], [], []
+    for node, one in zip(s.point_nodes(), s.bodies, strict=True):
         s.body("ObjectMassPoint", node, mass=one.mass)
         marker = s.marker("MarkerNodePosition", nodeNumber=node)
         push = (one.mass * one.place).tolist()
@@ -513,75 +452,69 @@ def _add_loads(s: _Items, bodies: Sequence[Body], anchor: Array) -> None:
         def law(mbs: Any, t: float, load: Any, push: Any = push) -> Any:
             return push
 
-        loads.append(s.mbs.AddLoad(items.Force(markerNumber=marker, loadVectorUserFunction=law)))
-        later.append(s.mbs.AddLoad(items.Force(markerNumber=marker)))
-        changed.append(s.mbs.AddLoad(items.Force(markerNumber=marker)))
-        s.mbs.SetLoadParameter(later[-1], "loadVector", push)
-        s.mbs.ModifyLoad(changed[-1], _seen(s.mbs.GetLoad(changed[-1])) | {"loadVector": push})
+        loads.append(mbs.AddLoad(items.Force(markerNumber=marker, loadVectorUserFunction=law)))
+        later.append(mbs.AddLoad(items.Force(markerNumber=marker)))
+        changed.append(mbs.AddLoad(items.Force(markerNumber=marker)))
+        mbs.SetLoadParameter(later[-1], "loadVector", push)
+        mbs.ModifyLoad(changed[-1], _changed(mbs.GetLoad(changed[-1]), loadVector=push))
     sensors = [s.sensor("SensorLoad", loadNumber=load) for load in loads]
-    s.mbs.Assemble()
-    masses = np.array([one.mass for one in bodies])[:, None]
+    mbs.Assemble()
     for call, values in (
-        (("MainSystem.GetLoadValues",), [s.mbs.GetLoadValues(load) for load in loads]),
-        (_call("SensorLoad"), [s.mbs.GetSensorValues(sensor) for sensor in sensors]),
-        (("MainSystem.SetLoadParameter",), [s.mbs.GetLoadValues(load) for load in later]),
-        (("MainSystem.ModifyLoad",), [s.mbs.GetLoadValues(load) for load in changed]),
-        (("MainSystem.GetLoadParameter",), [s.mbs.GetLoadParameter(load, "loadVector") for load in later]),
+        (("MainSystem.GetLoadValues",), [mbs.GetLoadValues(load) for load in loads]),
+        (_call("SensorLoad"), s.sensed(sensors)),
+        (("MainSystem.SetLoadParameter",), [mbs.GetLoadValues(load) for load in later]),
+        (("MainSystem.ModifyLoad",), [mbs.GetLoadValues(load) for load in changed]),
+        (("MainSystem.GetLoadParameter",), [mbs.GetLoadParameter(load, "loadVector") for load in later]),
     ):
-        s.add("body_position", call, np.array(values) / masses)
+        s.add("body_position", call, np.array(values) / s.masses)
 
 
-def _add_parameters(s: _Items, bodies: Sequence[Body], anchor: Array) -> None:
+def _add_parameters(s: _Items) -> None:
     """Markers at probe points that they are set to later, and sensors that read others later."""
-    made = []
-    for body, one in zip(_rigid_bodies(s, bodies), bodies, strict=True):
+    mbs, bodies, position = s.mbs, s.rigid_bodies(), Output.Position
+    firsts, seconds, sensors = list[Any](), list[Any](), list[list[Any]]()
+    for body, one in zip(bodies, s.bodies, strict=True):
         first, second = (s.marker("MarkerBodyRigid", bodyNumber=body) for _ in range(2))
-        s.mbs.SetMarkerParameter(first, "localPosition", one.arm)
-        s.mbs.ModifyMarker(second, _seen(s.mbs.GetMarker(second)) | {"localPosition": one.arm})
-        velocity = s.sensor("SensorMarker", markerNumber=first, outputVariableType=Output.Velocity)
-        third, fourth = (
-            s.sensor("SensorMarker", markerNumber=first, outputVariableType=Output.Velocity) for _ in range(2)
-        )
-        s.mbs.SetSensorParameter(third, "outputVariableType", Output.Position)
-        s.mbs.ModifySensor(fourth, _seen(s.mbs.GetSensor(fourth)) | {"outputVariableType": Output.Position})
-        made.append((body, first, second, velocity, third, fourth))
-    s.mbs.Assemble()
-    body, first, second, velocity, third, fourth = zip(*made, strict=True)
-    position = Output.Position
+        firsts.append(first)
+        seconds.append(second)
+        mbs.SetMarkerParameter(first, "localPosition", one.arm)
+        mbs.ModifyMarker(second, _changed(mbs.GetMarker(second), localPosition=one.arm))
+        own = {"markerNumber": first, "outputVariableType": Output.Velocity}
+        sensors.append([s.sensor("SensorMarker", **own) for _ in range(3)])
+        _, third, fourth = sensors[-1]
+        mbs.SetSensorParameter(third, "outputVariableType", position)
+        mbs.ModifySensor(fourth, _changed(mbs.GetSensor(fourth), outputVariableType=position))
+    mbs.Assemble()
+    arms = [mbs.GetMarkerParameter(marker, "localPosition") for marker in firsts]
+    read = [mbs.GetSensorParameter(velocity, "markerNumber") for velocity, _, _ in sensors]
     for name, values in (
-        ("SetMarkerParameter", [s.mbs.GetMarkerOutput(one, position) for one in first]),
-        ("ModifyMarker", [s.mbs.GetMarkerOutput(one, position) for one in second]),
-        ("SetSensorParameter", [s.mbs.GetSensorValues(one) for one in third]),
-        ("ModifySensor", [s.mbs.GetSensorValues(one) for one in fourth]),
-        ("GetMarkerParameter", [
-            s.of_body(one, "Position", s.mbs.GetMarkerParameter(marker, "localPosition"))
-            for one, marker in zip(body, first, strict=True)
-        ]),
-        ("GetSensorParameter", [
-            s.mbs.GetMarkerOutput(s.mbs.GetSensorParameter(one, "markerNumber"), position) for one in velocity
-        ]),
+        ("SetMarkerParameter", [mbs.GetMarkerOutput(one, position) for one in firsts]),
+        ("ModifyMarker", [mbs.GetMarkerOutput(one, position) for one in seconds]),
+        ("SetSensorParameter", s.sensed([third for _, third, _ in sensors])),
+        ("ModifySensor", s.sensed([fourth for _, _, fourth in sensors])),
+        ("GetMarkerParameter",
+         [s.of_body(body, "Position", arm) for body, arm in zip(bodies, arms, strict=True)]),
+        ("GetSensorParameter", [mbs.GetMarkerOutput(one, position) for one in read]),
     ):  # fmt: skip
-        s.add("frame_position", (f"MainSystem.{name}",), np.array(values))
-    nodes = [s.mbs.GetObjectParameter(one, "nodeNumber") for one in body]
-    places = [s.mbs.GetNodeParameter(node, "referenceCoordinates")[:3] for node in nodes]
+        s.add("frame_position", (f"MainSystem.{name}",), values)
+    nodes = [mbs.GetObjectParameter(one, "nodeNumber") for one in bodies]
+    places = [mbs.GetNodeParameter(node, "referenceCoordinates")[:3] for node in nodes]
     s.add("body_position", ("MainSystem.GetNodeParameter",), places)
 
 
-def _add_algebraic_coordinates(s: _Items, bodies: Sequence[Body], anchor: Array) -> None:
-    count = 3 * len(bodies)
-    node = s.node("NodeGenericAE", numberOfAECoordinates=count, referenceCoordinates=[0.0] * count,
-                  initialCoordinates=[0.0] * count)  # fmt: skip
+def _add_algebraic_coordinates(s: _Items) -> None:
+    zeros = [0.0] * s.places.size
+    node = s.node("NodeGenericAE", numberOfAECoordinates=len(zeros), referenceCoordinates=zeros,
+                  initialCoordinates=zeros)  # fmt: skip
     s.mbs.Assemble()
-    places = np.array([one.place for one in bodies])
-    s.mbs.systemData.SetAECoordinates(places.ravel())
+    s.mbs.systemData.SetAECoordinates(s.places.ravel())
     found = np.array(s.mbs.GetNodeOutput(node, Output.Coordinates)).reshape(-1, 3)
     s.add("body_position", (*_call("NodeGenericAE"), "SystemData.SetAECoordinates"), found)
 
 
-def _add_linear_systems(s: _Items, bodies: Sequence[Body], anchor: Array) -> None:
+def _add_linear_systems(s: _Items) -> None:
     """A system 2 q̈ + 2 K q = 0 with K of places, half of it by functions: its Jacobian and eigenvalues."""
-    places = np.array([one.place for one in bodies])
-    sizes = np.abs(places).ravel()
+    sizes = np.abs(s.places).ravel()
     node = s.node("NodeGenericODE2", numberOfODE2Coordinates=len(sizes), referenceCoordinates=0 * sizes,
                   initialCoordinates=0 * sizes, initialCoordinates_t=0 * sizes)  # fmt: skip
     K = np.diag(sizes)
@@ -597,27 +530,26 @@ def _add_linear_systems(s: _Items, bodies: Sequence[Body], anchor: Array) -> Non
         solver.ComputeJacobianODE2RHS(s.mbs, scalarFactor_ODE2=-1.0, scalarFactor_ODE2_t=0.0)
         jacobian = np.array(solver.GetSystemJacobian())
     call = *_call("ObjectGenericODE2JacobianUserFunction"), f"{IMPLICIT}.ComputeJacobianODE2RHS"
-    s.add("body_position", call, (np.sign(places.ravel()) * np.diag(jacobian) / 2).reshape(-1, 3))
+    s.add("body_position", call, np.sign(s.places) * np.diag(jacobian).reshape(-1, 3) / 2)
     order, found = np.argsort(sizes, kind="stable"), np.zeros(len(sizes))
     module: Any = exudyn
     name = "ComputeODE2Eigenvalues"
     for owner, function in (("", partial(module.ComputeODE2Eigenvalues, s.mbs)),
                             ("MainSystem.", s.mbs.ComputeODE2Eigenvalues)):  # fmt: skip
         found[order] = np.sort(function()[0])
-        s.add("body_position", (f"{owner}{name}",), np.sign(places) * found.reshape(-1, 3))
+        s.add("body_position", (f"{owner}{name}",), np.sign(s.places) * found.reshape(-1, 3))
 
 
-def _add_equations(s: _Items, bodies: Sequence[Body], anchor: Array) -> None:
+def _add_equations(s: _Items) -> None:
     """The solver's residual of constraints that hold the bodies in the origin."""
     fixed, joints = s.ground(), []
-    for body in _rigid_bodies(s, bodies):
+    for body in s.rigid_bodies():
         marker = s.marker("MarkerBodyPosition", bodyNumber=body)
         joints.append(s.object("ObjectJointSpherical", fixed, marker, constrainedAxes=[1, 1, 1]))
     s.mbs.Assemble()
     solver: Any = exudyn.MainSolverImplicitSecondOrder()
     settings, data = make_settings(), s.mbs.systemData
     settings.timeIntegration.generalizedAlpha.computeInitialAccelerations = False
-
     with initialized_solver(solver, s.mbs, settings):
         for quantity, is_velocity in (("body_position", False), ("body_velocity", True)):
             solver.ComputeAlgebraicEquations(s.mbs, is_velocity)
@@ -659,10 +591,10 @@ def _shapes(one: Body) -> dict[str, tuple[Any, Array]]:
     }
 
 
-def _add_inertias(s: _Items, bodies: Sequence[Body], anchor: Array) -> None:
+def _add_inertias(s: _Items) -> None:
     """The momentum about the centre of mass with inertias that functions return, or shapes change."""
-    masses = np.array([one.mass for one in bodies])
-    centre = masses @ np.array([one.place for one in bodies]) / np.sum(masses)
+    bodies, masses = s.bodies, s.masses.ravel()
+    centre = masses @ s.places / np.sum(masses)
 
     def add(name: str, inertias: Sequence[Array]) -> None:
         total = sum(
@@ -688,15 +620,13 @@ def _pose(turn: Array, place: Array) -> Array:
     return pose
 
 
-def _add_robots(s: _Items, bodies: Sequence[Body], anchor: Array) -> None:
+def _add_robots(s: _Items) -> None:
     """Robots of one link on a base at the anchor, with the probe frame as their tool."""
-    base, angle, poses = _pose(rotation_matrix(PROBE_ATTITUDE), anchor), 0.4, []
-    turned = _pose(_turn_about([0.0, 0.0, -angle])[2], np.zeros(3))
-    for one in bodies:
-        robot = robots.Robot(
-            base=robots.RobotBase(HT=base),
-            tool=robots.RobotTool(HT=_pose(rotation_matrix(PROBE_ATTITUDE), one.arm)),
-        )
+    probe, angle, poses = rotation_matrix(PROBE_ATTITUDE), 0.4, []
+    base, turned = _pose(probe, s.anchor), _pose(_turn_about([0.0, 0.0, -angle])[2], np.zeros(3))
+    for one in s.bodies:
+        tool = robots.RobotTool(HT=_pose(probe, one.arm))
+        robot = robots.Robot(base=robots.RobotBase(HT=base), tool=tool)
         before = np.linalg.inv(base) @ _pose(one.turn, one.place) @ turned
         robot.AddLink(robots.RobotLink(one.mass, [0.0] * 3, AXES, jointType="Rz", preHT=before))
         poses.append(np.array(robot.JointHT([angle])[0]) @ np.array(robot.GetToolHT()))
@@ -705,10 +635,11 @@ def _add_robots(s: _Items, bodies: Sequence[Body], anchor: Array) -> None:
     s.add_axes(call, found[:, :3, :3])
 
 
-PARTS: Sequence[Callable[..., None]] = (
-    _add_points("NodePoint", "ObjectMassPoint"), _add_points("Point", "MassPoint"), _add_created_points,
-    _add_plane_points("NodePoint2D", "ObjectMassPoint2D"), _add_plane_points("Point2D", "MassPoint2D"),
-    _add_lines("ObjectMass1D"), _add_lines("Mass1D"),
+PARTS: Sequence[Callable[[_Items], None]] = (
+    _add_points("NodePoint", "ObjectMassPoint", SPACE), _add_points("Point", "MassPoint", SPACE),
+    _add_created_points,
+    _add_points("NodePoint2D", "ObjectMassPoint2D", PLANES), _add_points("Point2D", "MassPoint2D", PLANES),
+    _add_points("Node1D", "ObjectMass1D", LINES), _add_points("Node1D", "Mass1D", LINES),
     _add_rotors("ObjectRotationalMass1D"), _add_rotors("Rotor1D"),
     _add_plane_bodies(
         "NodeRigidBody2D", "ObjectRigidBody2D", "ObjectJointRevolute2D", "ObjectJointPrismatic2D"

@@ -9,7 +9,8 @@ rounding; masses and sizes are the same for all mechanisms, since all points sha
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from copy import copy
 from functools import partial
 from typing import Any
@@ -18,7 +19,11 @@ import exudyn
 import numpy as np
 
 from adapters.exudyn_common import (
+    EXPLICIT,
+    IMPLICIT,
     Output,
+    call_parts,
+    initialized_solver,
     items,
     make_rigid_body,
     make_settings,
@@ -40,7 +45,6 @@ from plumbline.model.kinematics import (
 from plumbline.model.probe_frames import PROBE_ATTITUDE
 
 AXES = np.eye(3)
-IMPLICIT, EXPLICIT = "MainSolverImplicitSecondOrder", "MainSolverExplicit"
 STIFFNESS = 2.0  # N/m
 PULL = 1.0  # 1/s², of the force −m x of points that are pulled back
 TURN = np.array([0.3, -0.2, 0.5])  # rad, of bodies that turn for a second
@@ -200,21 +204,35 @@ def _set(owner: Any, path: str, value: Any) -> None:
     setattr(owner, last, value)
 
 
-def _settings(options: Mapping[str, Any]) -> Any:
-    """Make settings of one step of 1 s; deprecated names of options are options, too."""
-    settings = make_settings()
-    settings.timeIntegration.numberOfSteps, settings.timeIntegration.endTime = 1, 1.0
+def _set_all(owner: Any, options: Mapping[str, Any]) -> None:
+    """Set options by their paths; deprecated names are options, too."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         for path, value in options.items():
-            if path in SETTERS:
-                SETTERS[path](settings, value)
-            else:
-                _set(settings.timeIntegration, path, value)
+            _set(owner, path, value)
+
+
+def _settings(options: Mapping[str, Any]) -> Any:
+    """Make settings of one step of 1 s."""
+    settings = make_settings()
+    settings.timeIntegration.numberOfSteps, settings.timeIntegration.endTime = 1, 1.0
+    for path in SETTERS.keys() & options.keys():
+        SETTERS[path](settings, options[path])
+    _set_all(settings.timeIntegration, {path: x for path, x in options.items() if path not in SETTERS})
     return settings
 
 
-def _solve(solver: Any, mbs: Any, settings: Any) -> None:
+def _solve(mbs: Any, options: Mapping[str, Any], stores: bool = False) -> None:
+    """Solve by the solver that the options concern.
+
+    Args:
+        stores: whether sensors store what they read.
+
+    """
+    is_explicit = any(path.startswith(("solverType", "explicit")) for path in options)
+    settings, solver = _settings(options), getattr(exudyn, EXPLICIT if is_explicit else IMPLICIT)()
+    if stores:
+        settings.solution.sensors.active = True
     if not solver.SolveSystem(mbs, settings):
         raise EngineFailure(f"Exudyn's solver failed: {solver.GetErrorString()}")
 
@@ -232,13 +250,8 @@ def add_point_answers(record: SurfaceRecord, state: State) -> None:
 
 
 def _add_step(points: _Points, names: Any, options: Any, factors: Factors) -> None:
-    pull = PULL * ("computeLoadsJacobian" in options)
-    mbs, _container = points.system(pull=pull)
-    settings = _settings(options)
-    is_implicit = "generalizedAlpha.useNewmark" in options
-    _solve(
-        exudyn.MainSolverImplicitSecondOrder() if is_implicit else exudyn.MainSolverExplicit(), mbs, settings
-    )
+    mbs, _container = points.system(pull=PULL * ("computeLoadsJacobian" in options))
+    _solve(mbs, options)
     points.add_results(names, points.read(mbs), factors)
 
 
@@ -260,10 +273,7 @@ def _add_root(points: _Points, names: Any, options: Mapping[str, Any]) -> None:
     settings = _settings({})
     newton = settings.staticSolver.newton
     newton.relativeTolerance, newton.absoluteTolerance, newton.maxIterations = TIGHT, 1e-300, 100
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)
-        for path, value in options.items():
-            _set(newton, path, value)
+    _set_all(newton, options)
     settings.staticSolver.verboseMode = 0
     mbs.SolveStatic(settings)
     points.add(names, points.read(mbs)[0])
@@ -280,7 +290,7 @@ def _add_adaptive_steps(points: _Points) -> None:
                     "adaptiveStepRecoveryIterations": 50}, 1, 2, 0.3 * 2.5),
         ("minimumStepSize", {"adaptiveStepDecrease": 0.1, "minimumStepSize": 0.05}, 2, 1, 0.05),
     ):  # fmt: skip
-        solver, trials = exudyn.MainSolverImplicitSecondOrder(), list[float]()
+        trials = list[float]()
 
         def count(mbs: Any, t: float, trials: list[float] = trials) -> bool:
             trials.append(t)
@@ -288,7 +298,7 @@ def _add_adaptive_steps(points: _Points) -> None:
 
         mbs, _container = points.system(is_lawful=lambda: len(trials) > failures)  # noqa: B023
         mbs.SetPreStepUserFunction(count)
-        found = _after_step(points, solver, mbs, _settings(adaptive | options), step)
+        found = _after_step(points, mbs, adaptive | options, step)
         points.add_results(_names("TimeIntegrationSettings", names), found, _exact(time))
 
 
@@ -297,7 +307,7 @@ def _exact(t: float) -> Factors:
     return t**2 / 2 + t**3 / 6, t + t**2 / 2
 
 
-def _after_step(points: _Points, solver: Any, mbs: Any, settings: Any, step: int) -> tuple[Array, Array]:
+def _after_step(points: _Points, mbs: Any, options: Mapping[str, Any], step: int) -> tuple[Array, Array]:
     """Solve, and return places and velocities after so many steps."""
     found = list[tuple[Array, Array]]()
 
@@ -306,7 +316,7 @@ def _after_step(points: _Points, solver: Any, mbs: Any, settings: Any, step: int
         return True
 
     mbs.SetPostStepUserFunction(read)
-    _solve(solver, mbs, settings)
+    _solve(mbs, options)
     mbs.SetPostStepUserFunction(0)
     return found[step]  # the first is before the first step
 
@@ -331,82 +341,81 @@ def _add_automatic_steps(points: _Points) -> None:
          {"stepSizeMaxIncrease": 1e3, "absoluteTolerance": 1e-300, "relativeTolerance": tolerance}),
     ):  # fmt: skip
         mbs, _container = own.system()
-        settings = _settings({"solverType": "ODE23"} | options | more)
-        x, v = _after_step(own, exudyn.MainSolverExplicit(), mbs, settings, 2)
+        x, v = _after_step(own, mbs, {"solverType": "ODE23"} | options | more, 2)
         signs, call = np.sign(points.places), _names("TimeIntegrationSettings", names)
         points.add_results(call, (signs * x, signs * v), _exact(h + second))
 
 
+@contextmanager
 def _initialized(
     points: _Points, options: Mapping[str, Any], kind: str = IMPLICIT, pull: float = 0.0
-) -> tuple[Any, Any, Any, Any]:
+) -> Iterator[tuple[Any, Any, Any]]:
     """Initialise a solver for one step of 1 s."""
-    (mbs, container), settings, solver = points.system(pull=pull), _settings(options), getattr(exudyn, kind)()
-    if not solver.InitializeSolver(mbs, settings):
-        raise EngineFailure(f"Exudyn could not initialise its solver: {solver.GetErrorString()}")
-    solver.it.currentStepSize, solver.it.currentStepIndex = 1.0, 1
-    return solver, mbs, settings, container
+    (mbs, _container), settings, solver = (
+        points.system(pull=pull),
+        _settings(options),
+        getattr(exudyn, kind)(),
+    )
+    with initialized_solver(solver, mbs, settings):
+        solver.it.currentStepSize, solver.it.currentStepIndex = 1.0, 1
+        yield solver, mbs, settings
 
 
 def _add_parts_of_a_step(points: _Points) -> None:
     """Take a step of generalised-α by its parts, with the parameters that the solver says."""
-    solver, mbs, settings, _container = _initialized(points, {"generalizedAlpha.spectralRadius": 0.7})
-    solver.UpdateCurrentTime(mbs, settings)
-    solver.InitializeStep(mbs, settings)
-    solver.ComputeNewtonUpdate(mbs, settings, True)
-    x, v = points.read(mbs)
-    solver.ComputeNewtonResidual(mbs, settings)
-    solver.ComputeNewtonJacobian(mbs, settings)
-    change = np.linalg.solve(solver.GetSystemJacobian(), solver.GetSystemResidual()).reshape(x.shape)
-    by = "UpdateCurrentTime InitializeStep ComputeNewtonUpdate ComputeNewtonResidual ComputeNewtonJacobian"
-    own = "alphaF alphaM factJacAlgorithmic newmarkBeta newmarkGamma spectralRadius"
-    beta, gamma, radius = solver.newmarkBeta, solver.newmarkGamma, solver.spectralRadius
-    forward = (solver.alphaF - solver.alphaM) / (1 - radius / (radius + 1) + (1 - radius) / (radius + 1))
-    factors = _factors(gamma, beta, forces=(1.0, 2 * solver.factJacAlgorithmic + forward))
-    points.add_results(_names(IMPLICIT, f"{by} {own}"), (x - change, v - gamma / beta * change), factors)
-    solver.FinalizeSolver(mbs, settings)
+    with _initialized(points, {"generalizedAlpha.spectralRadius": 0.7}) as (solver, mbs, settings):
+        call_parts(solver, "UpdateCurrentTime InitializeStep", mbs, settings)
+        solver.ComputeNewtonUpdate(mbs, settings, True)
+        x, v = points.read(mbs)
+        call_parts(solver, "ComputeNewtonResidual ComputeNewtonJacobian", mbs, settings)
+        change = np.linalg.solve(solver.GetSystemJacobian(), solver.GetSystemResidual()).reshape(x.shape)
+        beta, gamma, radius = solver.newmarkBeta, solver.newmarkGamma, solver.spectralRadius
+        forward = (solver.alphaF - solver.alphaM) / (1 - radius / (radius + 1) + (1 - radius) / (radius + 1))
+        factors = _factors(gamma, beta, forces=(1.0, 2 * solver.factJacAlgorithmic + forward))
+        by = (
+            "UpdateCurrentTime InitializeStep ComputeNewtonUpdate ComputeNewtonResidual ComputeNewtonJacobian"
+        )
+        own = "alphaF alphaM factJacAlgorithmic newmarkBeta newmarkGamma spectralRadius"
+        ends = x - change, v - gamma / beta * change
+        points.add_results(_names(IMPLICIT, f"{by} {own}"), ends, factors)
 
 
 def _add_whole_steps(points: _Points) -> None:
     """Take a step by the solver's function, and read what Newton's method and generalised-α keep."""
-    solver, mbs, settings, _container = _initialized(points, {"generalizedAlpha.spectralRadius": 0.7})
-    settings.timeIntegration.generalizedAlpha.computeInitialAccelerations = True
-    kept = list[Array]()
-
-    def after(mbs: Any, t: float) -> bool:
-        kept.append(np.array(solver.GetStartOfStepStateAAlgorithmic()))
-        return True
-
-    mbs.SetPostStepUserFunction(after)
-    solver.SolveSteps(mbs, settings)
-    mbs.SetPostStepUserFunction(0)
-    af, am = 0.7 / 1.7, 0.4 / 1.7
+    af, am, kept = 0.7 / 1.7, 0.4 / 1.7, list[Array]()
     last = (2 * (1 - af) + af - am) / (1 - am)
     gamma = 0.5 + af - am
     beta = (gamma + 0.5) ** 2 / 4
-    points.add_results(
-        _names(IMPLICIT, "SolveSteps"), points.read(mbs), _factors(gamma, beta, forces=(1.0, last))
-    )
-    for name, value in (
-        ("GetStartOfStepStateAAlgorithmic", kept[-1]),
-        ("GetAAlgorithmic", np.array(solver.GetAAlgorithmic()) / last),
-        ("GetNewtonSolution", -np.array(solver.GetNewtonSolution()) / (2 * beta * (1 - af) / (1 - am))),
-    ):
-        points.add(_names(IMPLICIT, name), value.reshape(-1, 3))
-    solver.FinalizeSolver(mbs, settings)
+    with _initialized(points, {"generalizedAlpha.spectralRadius": 0.7}) as (solver, mbs, settings):
+        settings.timeIntegration.generalizedAlpha.computeInitialAccelerations = True
+
+        def after(mbs: Any, t: float) -> bool:
+            kept.append(np.array(solver.GetStartOfStepStateAAlgorithmic()))
+            return True
+
+        mbs.SetPostStepUserFunction(after)
+        solver.SolveSteps(mbs, settings)
+        mbs.SetPostStepUserFunction(0)
+        factors = _factors(gamma, beta, forces=(1.0, last))
+        points.add_results(_names(IMPLICIT, "SolveSteps"), points.read(mbs), factors)
+        for name, value in (
+            ("GetStartOfStepStateAAlgorithmic", kept[-1]),
+            ("GetAAlgorithmic", np.array(solver.GetAAlgorithmic()) / last),
+            ("GetNewtonSolution", -np.array(solver.GetNewtonSolution()) / (2 * beta * (1 - af) / (1 - am))),
+        ):
+            points.add(_names(IMPLICIT, name), value)
 
 
 def _add_changed_newton(points: _Points) -> None:
     """Let Newton's method end after one iteration, by what the solver keeps of its settings."""
-    solver, mbs, settings, _container = _initialized(points, NEWMARK, pull=PULL)
-    newton = solver.newton
-    _set(newton, "active", False)
-    solver.newton = newton
-    solver.SolveSteps(mbs, settings)
-    solver.FinalizeSolver(mbs, settings)
     last = 2.0 - PULL * (0.5 - 0.25)  # where the place was not changed by the last acceleration yet
-    factors = _factors(0.5, 0.25, forces=(1.0, last))
-    points.add_results(_names(IMPLICIT, "newton"), points.read(mbs), factors)
+    with _initialized(points, NEWMARK, pull=PULL) as (solver, mbs, settings):
+        newton = solver.newton
+        _set(newton, "active", False)
+        solver.newton = newton
+        solver.SolveSteps(mbs, settings)
+        factors = _factors(0.5, 0.25, forces=(1.0, last))
+        points.add_results(_names(IMPLICIT, "newton"), points.read(mbs), factors)
 
 
 def _add_changed_steps(points: _Points) -> None:
@@ -417,20 +426,14 @@ def _add_changed_steps(points: _Points) -> None:
         for name, start, end, arguments in (
             ("ReduceStepSize", 1.0, reduced, (1,)), ("IncreaseStepSize", 0.25, 0.5, ()),
         ):  # fmt: skip
-            solver, mbs, settings, _container = _initialized(points, options, kind)
-            solver.it.currentStepSize = start
-            getattr(solver, name)(mbs, settings, *arguments)
-            solver.UpdateCurrentTime(mbs, settings)
-            solver.InitializeStep(mbs, settings)
-            solver.Newton(mbs, settings)
-            solver.FinishStep(mbs, settings)
-            points.add_results(_names(kind, f"{name} {by}"), points.read(mbs), _exact(end))
-            solver.FinalizeSolver(mbs, settings)
-        solver, mbs, settings, _container = _initialized(points, options, kind)
-        solver.SetSystemMassMatrix(np.diag(points.places.ravel()))
-        places = np.diag(solver.GetSystemMassMatrix()).reshape(-1, 3)
-        points.add(_names(kind, "SetSystemMassMatrix"), places)
-        solver.FinalizeSolver(mbs, settings)
+            with _initialized(points, options, kind) as (solver, mbs, settings):
+                solver.it.currentStepSize = start
+                getattr(solver, name)(mbs, settings, *arguments)
+                call_parts(solver, "UpdateCurrentTime InitializeStep Newton FinishStep", mbs, settings)
+                points.add_results(_names(kind, f"{name} {by}"), points.read(mbs), _exact(end))
+        with _initialized(points, options, kind) as (solver, *_):
+            solver.SetSystemMassMatrix(np.diag(points.places.ravel()))
+            points.add(_names(kind, "SetSystemMassMatrix"), np.diag(solver.GetSystemMassMatrix()))
 
 
 def _add_own_functions(points: _Points) -> None:
@@ -441,24 +444,17 @@ def _add_own_functions(points: _Points) -> None:
         ends.append(points.read(mbs))
         return True
 
-    def accept(*_: Any) -> float:
-        return 0.0
-
-    equation = {
-        "ComputeNewtonResidual": _own_residual,
-        "ComputeNewtonJacobian": partial(_own_jacobian, masses),
-    }
     for functions in (
         {"UpdateCurrentTime": _own_time}, {"InitializeStep": _own_begin}, {"FinishStep": finish},
         {"Newton": partial(_own_newton, masses)}, {"ComputeNewtonUpdate": _own_update},
         # without PostNewton the residual fails: docs/surface/exudyn_post_newton_function.py
-        {**equation, "PostNewton": accept},
+        {"ComputeNewtonResidual": _own_residual, "ComputeNewtonJacobian": partial(_own_jacobian, masses),
+         "PostNewton": lambda *_: 0.0},
     ):  # fmt: skip
-        solver, mbs, settings, _container = _initialized(points, LINEAR)
-        for name, function in functions.items():
-            getattr(solver, f"SetUserFunction{name}")(mbs, function)
-        solver.SolveSteps(mbs, settings)
-        solver.FinalizeSolver(mbs, settings)
+        with _initialized(points, LINEAR) as (solver, mbs, settings):
+            for name, function in functions.items():
+                getattr(solver, f"SetUserFunction{name}")(mbs, function)
+            solver.SolveSteps(mbs, settings)
         found = ends[-1] if "FinishStep" in functions else points.read(mbs)
         names = " ".join(f"SetUserFunction{name}" for name in functions if name != "PostNewton")
         points.add_results(_names(IMPLICIT, names), found, EXACT)
@@ -511,15 +507,12 @@ def _own_jacobian(masses: Array, solver: Any, mbs: Any, settings: Any) -> bool:
 
 def _add_initialisation(points: _Points) -> None:
     """Initialise an explicit solver, and call the parts of it again."""
-    solver, mbs, settings, _container = _initialized(points, RUNGE_KUTTA, EXPLICIT)
-    solver.InitializeSolverPreChecks(mbs, settings)
-    for part in (one for one in INITIALISATION if one != "InitializeSolverOutput"):
-        getattr(solver, part)(mbs, settings)
-    solver.SolveSteps(mbs, settings)
-    solver.FinalizeSolver(mbs, settings)
-    names = "InitializeSolverPreChecks", *INITIALISATION
-    own = " ".join(name for name in names if name != "InitializeSolverOutput")
-    points.add_results(_names(EXPLICIT, own), points.read(mbs), EXACT)
+    parts = " ".join(x for x in INITIALISATION if x != "InitializeSolverOutput")
+    with _initialized(points, RUNGE_KUTTA, EXPLICIT) as (solver, mbs, settings):
+        call_parts(solver, f"InitializeSolverPreChecks {parts}", mbs, settings)
+        solver.SolveSteps(mbs, settings)
+    names = _names(EXPLICIT, f"InitializeSolverPreChecks {parts}")
+    points.add_results(names, points.read(mbs), EXACT)
 
 
 def _add_stored(points: _Points) -> None:
@@ -529,9 +522,7 @@ def _add_stored(points: _Points) -> None:
     nodes = range(points.count)
     sensors = [mbs.AddSensor(items.SensorNode(nodeNumber=node, **velocity)) for node in nodes]
     mbs.Assemble()
-    settings = _settings(LINEAR)
-    settings.solution.sensors.active = True
-    _solve(exudyn.MainSolverImplicitSecondOrder(), mbs, settings)
+    _solve(mbs, LINEAR, stores=True)
     stored = np.array([mbs.GetSensorStoredData(sensor)[-1] for sensor in sensors])  # time and values
     points.add(("MainSystem.GetSensorStoredData",), stored[:, 1:] / EXACT[1])
 
@@ -552,15 +543,13 @@ def _add_held(points: _Points) -> None:
                 own = mbs.AddMarker(items.MarkerNodeCoordinate(nodeNumber=node, coordinate=i))
                 mbs.AddObject(items.CoordinateConstraint(markerNumbers=[fixed, own]))
     mbs.Assemble()
-    settings = _settings({})
-    solver: Any = exudyn.MainSolverImplicitSecondOrder()
+    settings, solver = _settings({}), exudyn.MainSolverImplicitSecondOrder()
     _set(settings.timeIntegration, "generalizedAlpha.storeInitialAlgebraicCoordinates", True)
-    solver.InitializeSolver(mbs, settings)
-    force = np.array(mbs.systemData.GetAECoordinates()).reshape(-1, 3)
+    with initialized_solver(solver, mbs, settings):
+        force = np.array(mbs.systemData.GetAECoordinates()).reshape(-1, 3)
     call = ("GeneralizedAlphaSettings.storeInitialAlgebraicCoordinates", "itemInterface.CoordinateConstraint")
     points.add(call, force / points.mass[:, None])
-    solver.FinalizeSolver(mbs, settings)
-    _solve(exudyn.MainSolverExplicit(), mbs, _settings(RUNGE_KUTTA | {"explicit.eliminateConstraints": True}))
+    _solve(mbs, RUNGE_KUTTA | {"explicit.eliminateConstraints": True})
     velocities = np.array(mbs.systemData.GetODE2Coordinates_t()).reshape(2, -1, 3)
     call = "ExplicitIntegrationSettings.eliminateConstraints", "itemInterface.CoordinateConstraint"
     points.add(call, np.sum(velocities, axis=0))
@@ -591,8 +580,6 @@ def _add_turns(record: SurfaceRecord, state: State) -> None:
             node = mbs.AddNode(items.NodeRigidBodyRotVecLG(initialVelocities=[0.0, 0, 0, *TURN], **given))
             bodies.append(mbs.AddObject(make_rigid_body(node, 1.0, np.eye(3))))
         mbs.Assemble()
-        is_explicit = "solverType" in options
-        kind = exudyn.MainSolverExplicit if is_explicit else exudyn.MainSolverImplicitSecondOrder
-        _solve(kind(), mbs, _settings(options))
+        _solve(mbs, options)
         turns = [mbs.GetObjectOutputBody(body, Output.RotationMatrix, [0.0, 0, 0]) for body in bodies]
         record.add_axes(names, np.array(turns).reshape(-1, 3, 3) @ rotation_matrix(PROBE_ATTITUDE))
