@@ -31,6 +31,12 @@ def add_item(mbs: Any, ways: Ways, kind: str, **given: Any) -> Any:
     return add(getattr(items, kind)(**given))
 
 
+def changed_item(item: Mapping[str, Any], **given: Any) -> dict[str, Any]:
+    """Return the parameters of an item that are given once, and not for drawing, some of them others."""
+    own = {name: value for name, value in item.items() if not name.startswith("V") and "HT" not in name}
+    return own | given
+
+
 LOADS = ("LoadForceVector", "LoadTorqueVector", "Force", "Torque")
 NEWTON_TOLERANCE = 1e-12  # relative and absolute; at the engine's defaults extrapolation stops at 2e-9
 

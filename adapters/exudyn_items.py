@@ -17,6 +17,7 @@ from exudyn import kinematicTree, rigidBodyUtilities, robotics
 from adapters.exudyn_common import (
     IMPLICIT,
     Output,
+    changed_item,
     initialized_solver,
     items,
     known_arguments,
@@ -435,12 +436,6 @@ def _add_connectors(s: _Items) -> None:
     s.add(away, _call("ObjectJointGenericOffsetUserFunction"), s.equations(joint)[:, :3] + shift)
 
 
-def _changed(item: dict[str, Any], **given: Any) -> dict[str, Any]:
-    """The parameters of an item that are given once, and not for drawing, some of them others."""
-    own = {name: value for name, value in item.items() if not name.startswith("V") and "HT" not in name}
-    return own | given
-
-
 def _add_loads(s: _Items) -> None:
     """Loads of mass times place, by sensors and functions, and with parameters that are set later."""
     mbs, loads, later, changed = s.mbs, [], [], []
@@ -456,7 +451,7 @@ def _add_loads(s: _Items) -> None:
         later.append(mbs.AddLoad(items.Force(markerNumber=marker)))
         changed.append(mbs.AddLoad(items.Force(markerNumber=marker)))
         mbs.SetLoadParameter(later[-1], "loadVector", push)
-        mbs.ModifyLoad(changed[-1], _changed(mbs.GetLoad(changed[-1]), loadVector=push))
+        mbs.ModifyLoad(changed[-1], changed_item(mbs.GetLoad(changed[-1]), loadVector=push))
     sensors = [s.sensor("SensorLoad", loadNumber=load) for load in loads]
     mbs.Assemble()
     for call, values in (
@@ -478,12 +473,12 @@ def _add_parameters(s: _Items) -> None:
         firsts.append(first)
         seconds.append(second)
         mbs.SetMarkerParameter(first, "localPosition", one.arm)
-        mbs.ModifyMarker(second, _changed(mbs.GetMarker(second), localPosition=one.arm))
+        mbs.ModifyMarker(second, changed_item(mbs.GetMarker(second), localPosition=one.arm))
         own = {"markerNumber": first, "outputVariableType": Output.Velocity}
         sensors.append([s.sensor("SensorMarker", **own) for _ in range(3)])
         _, third, fourth = sensors[-1]
         mbs.SetSensorParameter(third, "outputVariableType", position)
-        mbs.ModifySensor(fourth, _changed(mbs.GetSensor(fourth), outputVariableType=position))
+        mbs.ModifySensor(fourth, changed_item(mbs.GetSensor(fourth), outputVariableType=position))
     mbs.Assemble()
     arms = [mbs.GetMarkerParameter(marker, "localPosition") for marker in firsts]
     read = [mbs.GetSensorParameter(velocity, "markerNumber") for velocity, _, _ in sensors]

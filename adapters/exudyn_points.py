@@ -216,8 +216,9 @@ def _settings(options: Mapping[str, Any]) -> Any:
     """Make settings of one step of 1 s."""
     settings = make_settings()
     settings.timeIntegration.numberOfSteps, settings.timeIntegration.endTime = 1, 1.0
-    for path in SETTERS.keys() & options.keys():
-        SETTERS[path](settings, options[path])
+    for path, set_option in SETTERS.items():
+        if path in options:
+            set_option(settings, options[path])
     _set_all(settings.timeIntegration, {path: x for path, x in options.items() if path not in SETTERS})
     return settings
 

@@ -8,13 +8,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import exudyn
 import numpy as np
 from exudyn import rigidBodyUtilities
 
-from adapters.exudyn_common import Ways, add_item, items, known_arguments, make_rigid_body, sizes_of_body
+from adapters.exudyn_common import (
+    IMPLICIT,
+    Ways,
+    add_item,
+    call_parts,
+    changed_item,
+    items,
+    known_arguments,
+    make_rigid_body,
+    sizes_of_body,
+)
 from adapters.pose_functions import Pose, rate_maps
 from plumbline.engines.variants import Variant, variants_of
 from plumbline.model.datatypes import Array, Float, JointKind, Model, Unsupported
@@ -75,17 +86,13 @@ def _no_rates_of_its_own(p: Float[Array, "4"]) -> Float[Array, "3 3"]:
     return np.eye(3)
 
 
-def _weight(marker: Any, gravity: Array) -> Any:
-    return items.LoadMassProportional(markerNumber=marker, loadVector=gravity.tolist())
+def _weight(marker: Any, gravity: Array, kind: str = "LoadMassProportional") -> Any:
+    return getattr(items, kind)(markerNumber=marker, loadVector=gravity.tolist())
 
 
 def _weight_by_function(marker: Any, gravity: Array) -> Any:
     given = {"loadVector": [0.0] * 3, "loadVectorUserFunction": lambda mbs, t, load: gravity.tolist()}
     return items.LoadMassProportional(markerNumber=marker, **given)
-
-
-def _short_weight(marker: Any, gravity: Array) -> Any:
-    return items.Gravity(markerNumber=marker, loadVector=gravity.tolist())
 
 
 def _short_body(node: Any, mass: float, J: Array) -> Any:
@@ -135,47 +142,68 @@ def _by_helper(add: Callable[..., Any], place: str, velocity: str, turn: str, sp
 USUAL_BODY = _node("NodeRigidBodyEP")
 
 
-def _set_later(set_parameters: Callable[..., None]) -> Any:
-    """Add a body of another mass and at rest, and set both later."""
+def _set_later(modifies: bool) -> Any:
+    """Add a body of another mass and at rest, and set both later: parameters, or whole items."""
 
     def add(mbs: Any, piece: Piece) -> tuple[Any, Any]:
         other, rest = replace(piece.part, mass=2 * piece.part.mass), np.zeros(3)
         node, body = USUAL_BODY(mbs, replace(piece, part=other, velocity=rest, spin=rest))
         rates = [*piece.velocity, *(euler_parameter_rates(piece.turn) @ piece.spin)]
-        set_parameters(mbs, node, body, rates, piece.part.mass)
+        given: Any
+        for name, item, given in (
+            ("Node", node, {"initialVelocities": rates}),
+            ("Object", body, sizes_of_body(mass=piece.part.mass)),
+        ):
+            if modifies:
+                whole = changed_item(getattr(mbs, f"Get{name}")(item), **given)
+                getattr(mbs, f"Modify{name}")(item, whole)
+                continue
+            for key, value in given.items():
+                getattr(mbs, f"Set{name}Parameter")(item, key, value)
         return node, body
 
     return add
 
 
-def _set_parameters(mbs: Any, node: Any, body: Any, rates: list[float], mass: float) -> None:
-    mbs.SetNodeParameter(node, "initialVelocities", rates)
-    for name, value in sizes_of_body(mass=mass).items():
-        mbs.SetObjectParameter(body, name, value)
+def _made(owner: str, name: str, given: str, turn: Float[Array, "3 3"] | None = None) -> Any:
+    """How a joint is added as an item or by a function of the system or of the utilities, given these.
+
+    Args:
+        turn: of its axes in those of the usual one.
+
+    """
+
+    def add(mbs: Any, joint: Joint) -> Any:
+        far, near = joint.turns if turn is None else joint.turns @ turn
+        values: dict[str, Any] = {
+            "markerNumbers": list(joint.markers), "rotationMarker0": far, "rotationMarker1": near,
+            "bodyNumbers": list(joint.bodies), "body0": joint.bodies[0], "body1": joint.bodies[1],
+            "localPosition0": joint.points[0], "localPosition1": joint.points[1],
+            "position": joint.place, "point": joint.place, "axis": joint.axes[:, 2],
+            "rotationMatrixAxes": joint.axes, "constrainedAxes": [*joint.rows], "distance": joint.length,
+        }  # fmt: skip
+        own = {key: values[key] for key in given.split()}
+        if owner == "itemInterface":
+            return mbs.AddObject(getattr(items, name)(**own))
+        if owner == "rigidBodyUtilities":
+            own["mbs"] = mbs
+        made = getattr(utilities if "mbs" in own else mbs, name)(**own)
+        return made[0] if isinstance(made, list | tuple) else made  # of older versions with its markers
+
+    return add
 
 
-def _modify(mbs: Any, node: Any, body: Any, rates: list[float], mass: float) -> None:
-    given: Any
-    for name, item, given in (
-        ("Node", node, {"initialVelocities": rates}),
-        ("Object", body, sizes_of_body(mass=mass)),
-    ):
-        whole = getattr(mbs, f"Get{name}")(item) | given
-        seen = {key: value for key, value in whole.items() if not key.startswith("V")}
-        getattr(mbs, f"Modify{name}")(item, seen)
+OF_BALL, OF_ROD = "markerNumbers constrainedAxes", "markerNumbers distance"
+ON_AXES = "markerNumbers rotationMarker0 rotationMarker1"
+_usual_rod = _made("itemInterface", "ObjectConnectorDistance", OF_ROD)
+_usual_ball = _made("itemInterface", "ObjectJointSpherical", OF_BALL)
+_usual_other = _made("itemInterface", "ObjectJointGeneric", f"{ON_AXES} constrainedAxes")
 
 
 def _usual_joint(mbs: Any, joint: Joint) -> Any:
-    ends = list(joint.markers)
     if joint.kind.holds_distance:
-        return mbs.AddObject(items.ObjectConnectorDistance(markerNumbers=ends, distance=joint.length))
-    if joint.kind.is_spherical:
-        return mbs.AddObject(items.ObjectJointSpherical(markerNumbers=ends, constrainedAxes=joint.rows))
-    far, near = joint.turns
-    item = items.ObjectJointGeneric(
-        markerNumbers=ends, constrainedAxes=joint.rows, rotationMarker0=far, rotationMarker1=near
-    )
-    return mbs.AddObject(item)
+        return _usual_rod(mbs, joint)
+    return (_usual_ball if joint.kind.is_spherical else _usual_other)(mbs, joint)
 
 
 def _moves(*motions: str) -> Callable[[JointKind], bool]:
@@ -186,56 +214,9 @@ def _moves(*motions: str) -> Callable[[JointKind], bool]:
 TURNS, SLIDES, BOTH = _moves("turn"), _moves("slide"), _moves("slide", "turn")
 
 
-def _item(kind: str, turn: Array) -> Callable[[Any, Joint], Any]:
-    """A joint of this kind, whose axes are turned in those of the usual one."""
-
-    def add(mbs: Any, joint: Joint) -> Any:
-        far, near = joint.turns @ turn
-        ends = list(joint.markers)
-        make = getattr(items, kind)
-        return mbs.AddObject(make(markerNumbers=ends, rotationMarker0=far, rotationMarker1=near))
-
-    return add
-
-
-def _short(kind: str) -> Callable[[Any, Joint], Any]:
-    """A ball joint or a rod by the short name of its item."""
-
-    def add(mbs: Any, joint: Joint) -> Any:
-        own = {"distance": joint.length} if joint.kind.holds_distance else {"constrainedAxes": joint.rows}
-        return mbs.AddObject(getattr(items, kind)(markerNumbers=list(joint.markers), **own))
-
-    return add
-
-
-def _by_utility(function: str) -> Callable[[Any, Joint], Any]:
-    def add(mbs: Any, joint: Joint) -> Any:
-        create = getattr(utilities, function)
-        made = create(mbs, *joint.bodies, point=joint.place, axis=joint.axes[:, 2])
-        return made[0] if isinstance(made, list | tuple) else made
-
-    return add
-
-
 def _ball_of_generic(mbs: Any, joint: Joint) -> Any:
     rows = [*joint.rows, 0, 0, 0]
     return mbs.AddObject(items.ObjectJointGeneric(markerNumbers=list(joint.markers), constrainedAxes=rows))
-
-
-def _created(function: str, given: str) -> Callable[[Any, Joint], Any]:
-    """A joint by a function of the system that takes these."""
-
-    def create(mbs: Any, joint: Joint) -> Any:
-        values: dict[str, Any] = {
-            "position": joint.place, "axis": joint.axes[:, 2], "rotationMatrixAxes": joint.axes,
-            "constrainedAxes": list(joint.rows), "distance": joint.length,
-            "localPosition0": joint.points[0], "localPosition1": joint.points[1],
-        }  # fmt: skip
-        own = {name: values[name] for name in given.split()}
-        made = getattr(mbs, function)(bodyNumbers=list(joint.bodies), **own)
-        return made[0] if isinstance(made, list) else made  # before 1.10 with its markers
-
-    return create
 
 
 def _assemble(mbs: Any) -> None:
@@ -382,29 +363,30 @@ def _load_by_function(kind: str) -> Callable[..., Any]:
     return add
 
 
-def _law_by_function(kind: str, argument: str) -> Callable[..., Any]:
-    """A connector whose law k (x − offset) + d v + constant a function computes from x and v."""
+def _by_function(kind: str, argument: str, law: Callable[..., Any]) -> Callable[..., Any]:
+    """A connector whose law a function computes from its parameters and what the engine gives it."""
 
-    def add(mbs: Any, stiffness: Any, damping: Any, **given: Any) -> Any:
-        rest = given.get("offset", 0.0)
-        constant = next((given[name] for name in ("force", "torque") if name in given), 0.0)
+    def add(mbs: Any, **given: Any) -> Any:
+        def user(mbs: Any, t: float, item: int, *motion: Any) -> Any:
+            return law(given, *motion)
 
-        def law(mbs: Any, t: float, item: int, x: float, rate: float, *numbers: Any) -> float:
-            return float(stiffness * (x - rest) + damping * rate + constant)
-
-        return add_item(mbs, {}, kind, stiffness=stiffness, damping=damping, **given, **{argument: law})
+        return add_item(mbs, {}, kind, **given, **{argument: user})
 
     return add
 
 
-def _six_by_function(mbs: Any, damping: Array, **given: Any) -> Any:
-    def law(
-        mbs: Any, t: float, item: int, shift: Any, turn: Any, velocity: Any, spin: Any, *numbers: Any
-    ) -> list[float]:
-        return [float(x) for x in damping @ np.append(velocity, spin)]
+def _law(own: Mapping[str, Any], x: float, rate: float, *_: Any) -> float:
+    """The law k (x − offset) + d v + constant."""
+    constant = own.get("force", own.get("torque", 0.0))
+    return float(own["stiffness"] * (x - own.get("offset", 0.0)) + own["damping"] * rate + constant)
 
-    given["springForceTorqueUserFunction"] = law
-    return add_item(mbs, {}, DRAG, damping=damping, **given)
+
+def _law_of_drag(own: Mapping[str, Any], shift: Any, turn: Any, *motion: Any) -> list[float]:
+    return [float(x) for x in own["damping"] @ np.append(*motion[:2])]
+
+
+def _law_of_axes(own: Mapping[str, Any], x: Any, rate: Any, *_: Any) -> list[float]:
+    return [float(d * one) for d, one in zip(own["damping"], rate, strict=True)]
 
 
 def _drag_by_two(way: Callable[..., Any]) -> Callable[..., Any]:
@@ -417,14 +399,6 @@ def _drag_by_two(way: Callable[..., Any]) -> Callable[..., Any]:
         return way(mbs, markerNumbers=markerNumbers, stiffness=[0.0] * 3, damping=moving)
 
     return add
-
-
-def _cartesian_by_function(mbs: Any, damping: list[float], **given: Any) -> Any:
-    def law(mbs: Any, t: float, item: int, x: Any, rate: Any, *numbers: Any) -> list[float]:
-        return [float(d * one) for d, one in zip(damping, rate, strict=True)]
-
-    kind = "ObjectConnectorCartesianSpringDamper"
-    return add_item(mbs, {}, kind, damping=damping, springForceUserFunction=law, **given)
 
 
 def _has_drag(model: Model) -> bool:
@@ -472,7 +446,7 @@ WAYS: tuple[tuple[str, str, Callable[..., Any]], ...] = (
     *(
         (f"ObjectConnector{name}SpringDamper",
          f"itemInterface.ObjectConnector{name}SpringDamperSpring{what}UserFunction",
-         _law_by_function(f"ObjectConnector{name}SpringDamper", f"spring{what}UserFunction"))
+         _by_function(f"ObjectConnector{name}SpringDamper", f"spring{what}UserFunction", _law))
         for name, what in (("", "Force"), ("Linear", "Force"), ("Torsional", "Torque"))
     ),
     *(
@@ -484,11 +458,14 @@ WAYS: tuple[tuple[str, str, Callable[..., Any]], ...] = (
             ("RigidBody", _created_between("CreateRigidBodySpringDamper", **_NOT_INTRINSIC)),
         )
     ),
-    (DRAG, f"itemInterface.{DRAG}SpringForceTorqueUserFunction", _six_by_function),
+    (DRAG, f"itemInterface.{DRAG}SpringForceTorqueUserFunction",
+     _by_function(DRAG, "springForceTorqueUserFunction", _law_of_drag)),
     (DRAG, "itemInterface.ObjectConnectorCartesianSpringDamper itemInterface.CartesianSpringDamper",
      _drag_by_two(_renamed("CartesianSpringDamper"))),
     (DRAG, "itemInterface.ObjectConnectorCartesianSpringDamperSpringForceUserFunction",
-     _drag_by_two(_cartesian_by_function)),
+     _drag_by_two(
+         _by_function("ObjectConnectorCartesianSpringDamper", "springForceUserFunction", _law_of_axes)
+     )),
     (DRAG, "MainSystem.CreateCartesianSpringDamper",
      _drag_by_two(_created_between("CreateCartesianSpringDamper"))),
 )  # fmt: skip
@@ -511,8 +488,7 @@ def _initialize_by_parts(solver: Any, mbs: Any, settings: Any) -> bool:
     """Initialise, and call the parts of it again: without the whole before them they are refused later."""
     if not solver.InitializeSolver(mbs, settings) or not solver.InitializeSolverPreChecks(mbs, settings):
         return False
-    for part in INITIALISATION:
-        getattr(solver, part)(mbs, settings)
+    call_parts(solver, " ".join(INITIALISATION), mbs, settings)
     return True
 
 
@@ -558,7 +534,6 @@ def _texts(owner: str, *names: str) -> str:
     return " ".join(f"{owner}.{name}" for name in names)
 
 
-SOLVER = "MainSolverImplicitSecondOrder"
 VARIANTS = (
     _spelling(
         "itemInterface.NodeRigidBodyRxyz",
@@ -586,14 +561,14 @@ VARIANTS = (
         ),
     ),
     _spelling(
-        "MainSystem.SetNodeParameter MainSystem.SetObjectParameter", add_body=_set_later(_set_parameters)
+        "MainSystem.SetNodeParameter MainSystem.SetObjectParameter", add_body=_set_later(modifies=False)
     ),
-    _spelling("MainSystem.ModifyNode MainSystem.ModifyObject", add_body=_set_later(_modify)),
+    _spelling("MainSystem.ModifyNode MainSystem.ModifyObject", add_body=_set_later(modifies=True)),
     _option(_texts("MainSystem", *ASSEMBLY, "systemIsConsistent"), assemble=_assemble_by_parts),
     _option("SystemData.GetSystemState SystemData.SetSystemState", assemble=_assemble_and_set_state),
     *of_ways(_spelling, _is_open),
     _option(
-        _texts(SOLVER, "InitializeSolverPreChecks", *INITIALISATION), initialize=_initialize_by_parts
+        _texts(IMPLICIT, "InitializeSolverPreChecks", *INITIALISATION), initialize=_initialize_by_parts
     ),
     _option("MainSolverStatic", solver=lambda: exudyn.MainSolverStatic()),
     _option(
@@ -610,34 +585,34 @@ VARIANTS = (
     _spelling(
         "itemInterface.RigidEP itemInterface.RigidBody itemInterface.Gravity "
         "rigidBodyUtilities.InertiaTensor2Inertia6D",
-        add_body=_node("RigidEP", weight=_short_weight, make_body=_short_body),
+        add_body=_node("RigidEP", weight=partial(_weight, kind="Gravity"), make_body=_short_body),
     ),
     _spelling(
         "itemInterface.LoadMassProportionalLoadVectorUserFunction",
         add_body=_node("NodeRigidBodyEP", weight=_weight_by_function),
     ),
     *(
-        _joints(f"itemInterface.{name}", add, are_meant)
-        for name, add, are_meant in (
-            ("SphericalJoint", _short("SphericalJoint"), _is_ball),
-            ("DistanceConstraint", _short("DistanceConstraint"), _is_rod),
-            ("ObjectJointRevoluteZ", _item("ObjectJointRevoluteZ", np.eye(3)), TURNS),
-            ("ObjectJointPrismaticX", _item("ObjectJointPrismaticX", TURN_TO_X), SLIDES),
-            ("ObjectJointGeneric", _ball_of_generic, _is_ball),
+        _joints(f"itemInterface.{name}", _made("itemInterface", name, given, turn), are_meant)
+        for name, given, are_meant, turn in (
+            ("SphericalJoint", OF_BALL, _is_ball, None),
+            ("DistanceConstraint", OF_ROD, _is_rod, None),
+            ("ObjectJointRevoluteZ", ON_AXES, TURNS, None),
+            ("ObjectJointPrismaticX", ON_AXES, SLIDES, TURN_TO_X),
         )
     ),
+    _joints("itemInterface.ObjectJointGeneric", _ball_of_generic, _is_ball),
     *(
-        _joints(f"rigidBodyUtilities.{name}", _by_utility(name), are_meant)
-        for name, are_meant in (("AddRevoluteJoint", TURNS), ("AddPrismaticJoint", SLIDES))
-    ),
-    *(
-        _joints(f"MainSystem.{name}", _created(name, given), are_meant)
-        for name, given, are_meant in (
-            ("CreateRevoluteJoint", "position axis", TURNS),
-            ("CreatePrismaticJoint", "position axis", SLIDES),
-            ("CreateGenericJoint", "position rotationMatrixAxes constrainedAxes", BOTH),
-            ("CreateSphericalJoint", "position constrainedAxes", _is_ball),
-            ("CreateDistanceConstraint", "localPosition0 localPosition1 distance", _is_rod),
+        _joints(f"{owner}.{name}", _made(owner, name, given), are_meant)
+        for owner, name, given, are_meant in (
+            ("rigidBodyUtilities", "AddRevoluteJoint", "body0 body1 point axis", TURNS),
+            ("rigidBodyUtilities", "AddPrismaticJoint", "body0 body1 point axis", SLIDES),
+            ("MainSystem", "CreateRevoluteJoint", "bodyNumbers position axis", TURNS),
+            ("MainSystem", "CreatePrismaticJoint", "bodyNumbers position axis", SLIDES),
+            ("MainSystem", "CreateGenericJoint", "bodyNumbers position rotationMatrixAxes constrainedAxes",
+             BOTH),
+            ("MainSystem", "CreateSphericalJoint", "bodyNumbers position constrainedAxes", _is_ball),
+            ("MainSystem", "CreateDistanceConstraint",
+             "bodyNumbers localPosition0 localPosition1 distance", _is_rod),
         )
     ),
 )  # fmt: skip
