@@ -269,8 +269,8 @@ class _KinematicTree:
         self.revolute_groups = self.linkage.revolute_groups
         self.initial_angle_rates = self.linkage.W @ self.linkage.nu
         self.mbs, self.container = make_system()
-        add_tree = change.add_tree or self._add_tree
-        self.node, self.tree = add_tree(self.mbs, self.linkage.links, model.gravity, self.initial_angle_rates)
+        given = self.linkage.links, model.gravity, self.initial_angle_rates
+        self.node, self.tree = change.add_tree(self.mbs, *given)
         self._add_joint_elements()
         self.body_axes_of_links = self.linkage.body_axes  # (N, 3, 3) B
         self.sensors: dict[Any, list[Any]] = {output: [] for output in SENSOR_OUTPUTS}
@@ -283,18 +283,17 @@ class _KinematicTree:
             add_point_spring(self.mbs, model, i, ends, change.ways)
         self.mbs.Assemble()
 
+    def _place(self, body: int, point: Array) -> dict[str, Any]:
+        """Where a point of a body is, as markers and sensors have it."""
+        local = self.body_axes_of_links[body].T @ (point - self.linkage.origins[body])
+        link = self.linkage.link_of_body[body]
+        return {"objectNumber": self.tree, "linkNumber": link, "localPosition": local.tolist()}
+
     def _point_marker(self, ground: Any, body: int, point: Array) -> Any:
         """Add a marker at a point of a body, or of the world."""
         if body < 0:
             return self.mbs.AddMarker(items.MarkerBodyRigid(bodyNumber=ground, localPosition=point.tolist()))
-        local = self.body_axes_of_links[body].T @ (point - self.linkage.origins[body])
-        return self.mbs.AddMarker(
-            items.MarkerKinematicTreeRigid(
-                objectNumber=self.tree,
-                linkNumber=self.linkage.link_of_body[body],
-                localPosition=local.tolist(),
-            )
-        )
+        return self.mbs.AddMarker(items.MarkerKinematicTreeRigid(**self._place(body, point)))
 
     def _add_joint_elements(self) -> None:
         """Add rotors, dampers, springs and efforts, on coordinates that are x less the state's x."""
@@ -307,49 +306,10 @@ class _KinematicTree:
             force[link] = model.effort[joint, i] + k[link] * (model.rest[joint, i] - self.state.x[joint, i])
         if not (np.any(a) or np.any(c) or np.any(k) or np.any(force)):
             return
-        if self.change.add_elements is not None:
-            self.change.add_elements(self.mbs, self.node, a, c, k, force)
-            return
-        self.mbs.AddObject(
-            items.ObjectGenericODE2(
-                nodeNumbers=[self.node],
-                massMatrix=np.diag(a),
-                dampingMatrix=np.diag(c),
-                stiffnessMatrix=np.diag(k),
-                forceVector=force,
-            )
-        )
-
-    def _add_tree(self, mbs: Any, links: list[_Link], gravity: Array, rates: Array) -> tuple[Any, Any]:
-        zeros = [0.0] * len(links)
-        matrices: Any = exudyn.Matrix3DList
-        vectors: Any = exudyn.Vector3DList
-        node = mbs.AddNode(
-            items.NodeGenericODE2(
-                referenceCoordinates=zeros,
-                initialCoordinates=zeros,
-                initialCoordinates_t=rates.tolist(),
-                numberOfODE2Coordinates=len(links),
-            )
-        )
-        return node, mbs.AddObject(
-            items.ObjectKinematicTree(
-                nodeNumber=node,
-                gravity=gravity.tolist(),
-                jointTypes=[link.joint for link in links],
-                linkParents=[link.parent for link in links],
-                jointTransformations=matrices([link.axes_in_parent for link in links]),
-                jointOffsets=vectors([link.offset for link in links]),
-                linkInertiasCOM=matrices([link.inertia for link in links]),
-                linkCOMs=vectors([link.centre for link in links]),
-                linkMasses=[link.mass for link in links],
-            )
-        )
+        self.change.add_elements(self.mbs, self.node, a, c, k, force)
 
     def _add_loads_and_sensors(self, k: int, ground: Any) -> None:
-        link = self.linkage.link_of_body[k]
-        centre = (-self.body_axes_of_links[k].T @ self.linkage.origins[k]).tolist()
-        place = {"objectNumber": self.tree, "linkNumber": link, "localPosition": centre}
+        place = self._place(k, np.zeros(3))
         marker = self.mbs.AddMarker(items.MarkerKinematicTreeRigid(**place))
         moment = self.body_axes_of_links[k].T @ self.model.moment[k]
         add_loads(self.mbs, self.model, k, marker, ground, moment, self.change.ways)

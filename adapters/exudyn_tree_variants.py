@@ -6,7 +6,7 @@ that each exercises.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,7 +14,16 @@ import exudyn
 import numpy as np
 from exudyn import kinematicTree, rigidBodyUtilities, robotics
 
-from adapters.exudyn_common import Ways, items, make_settings, set_explicit_method, set_linear_solver
+from adapters.exudyn_common import (
+    EXPLICIT,
+    Ways,
+    call_parts,
+    initialized_solver,
+    items,
+    make_settings,
+    set_explicit_method,
+    set_linear_solver,
+)
 from adapters.exudyn_variants import MANY_BODIES, of_ways
 from plumbline.engines.variants import variants_of
 from plumbline.model.datatypes import Array, EngineFailure, Float, Model
@@ -22,7 +31,6 @@ from plumbline.model.datatypes import Array, EngineFailure, Float, Model
 utilities: Any = rigidBodyUtilities  # as below, functions are untyped
 trees: Any = kinematicTree
 robots: Any = robotics
-SOLVER = "MainSolverExplicit"
 LONG_STEP = 1.0  # s: of one step of Euler's method, in which v₁ = v₀ + h a to rounding
 
 
@@ -129,52 +137,57 @@ def _by_step(run: Callable[[Any, Any], bool]) -> Callable[[Any, Matrices], Matri
     return evaluate
 
 
-def _run_by_function(mbs: Any, settings: Any) -> bool:
-    return bool(exudyn.SolveDynamic(mbs, settings, solverType=exudyn.DynamicSolverType.ExplicitEuler))
-
-
-def _run_by_system(mbs: Any, settings: Any) -> bool:
-    return bool(mbs.SolveDynamic(settings, solverType=exudyn.DynamicSolverType.ExplicitEuler))
-
-
-def _run_by_parts(part: str) -> Callable[[Any, Any], bool]:
-    """Take the step by this part of a solver, and by what is before and after it."""
+def _run_by_parts(parts: str) -> Callable[[Any, Any], bool]:
+    """Take the step by these parts of a solver."""
 
     def run(mbs: Any, settings: Any) -> bool:
         solver: Any = exudyn.MainSolverExplicit()
-        if not solver.InitializeSolver(mbs, settings):
-            return False
-        solver.it.currentStepSize, solver.it.currentStepIndex = LONG_STEP, 1
-        solver.UpdateCurrentTime(mbs, settings)
-        solver.InitializeStep(mbs, settings)
-        done = getattr(solver, part)(mbs, settings)
-        solver.FinishStep(mbs, settings)
-        solver.FinalizeSolver(mbs, settings)
-        return bool(done)
+        with initialized_solver(solver, mbs, settings):
+            solver.it.currentStepSize, solver.it.currentStepIndex = LONG_STEP, 1
+            return False not in call_parts(solver, parts, mbs, settings)
 
     return run
 
 
-def _run_by_steps(mbs: Any, settings: Any) -> bool:
-    solver: Any = exudyn.MainSolverExplicit()
-    done = solver.InitializeSolver(mbs, settings) and solver.SolveSteps(mbs, settings)
-    solver.FinalizeSolver(mbs, settings)
-    return bool(done)
+EULER: Any = exudyn.DynamicSolverType.ExplicitEuler
+STEPS: Mapping[str, Callable[[Any, Any], bool]] = {
+    "SolveDynamic": lambda mbs, settings: bool(exudyn.SolveDynamic(mbs, settings, solverType=EULER)),
+    "MainSystem.SolveDynamic": lambda mbs, settings: bool(mbs.SolveDynamic(settings, solverType=EULER)),
+    f"DynamicSolverType.ExplicitEuler {EXPLICIT}.UpdateCurrentTime {EXPLICIT}.InitializeStep "
+    f"{EXPLICIT}.Newton {EXPLICIT}.FinishStep":
+        _run_by_parts("UpdateCurrentTime InitializeStep Newton FinishStep"),
+    f"{EXPLICIT}.DiscontinuousIteration":
+        _run_by_parts("UpdateCurrentTime InitializeStep DiscontinuousIteration FinishStep"),
+    f"{EXPLICIT}.SolveSteps": _run_by_parts("SolveSteps"),
+}  # fmt: skip
 
 
 def _coordinate_marker(mbs: Any, node: Any, link: int) -> Any:
     return mbs.AddMarker(items.MarkerNodeCoordinate(nodeNumber=node, coordinate=link))
 
 
-def _grounded(connect: Callable[..., Any]) -> Callable[..., None]:
+def _grounded(kind: str, by_function: bool = False) -> Callable[..., None]:
     """Springs, dampers and efforts of coordinates, one by one, against a grounded node."""
 
     def add(mbs: Any, node: Any, a: Array, c: Array, k: Array, force: Array) -> None:
         ground = mbs.AddNode(items.NodePointGround())
         fixed = mbs.AddMarker(items.MarkerNodeCoordinate(nodeNumber=ground, coordinate=0))
         for link in np.flatnonzero((c != 0) | (k != 0)):
-            marker = _coordinate_marker(mbs, node, int(link))
-            mbs.AddObject(connect([fixed, marker], float(k[link]), float(c[link])))
+            stiffness, damping = float(k[link]), float(c[link])
+
+            def law(
+                mbs: Any, t: float, item: int, x: float, rate: float, *_: Any,
+                k: float = stiffness, c: float = damping,
+            ) -> float:  # fmt: skip
+                return k * x + c * rate
+
+            own = (
+                {"springForceUserFunction": law}
+                if by_function
+                else {"stiffness": stiffness, "damping": damping}
+            )
+            markers = [fixed, _coordinate_marker(mbs, node, int(link))]
+            mbs.AddObject(getattr(items, kind)(markerNumbers=markers, **own))
         _add_rest(mbs, node, a, force)
 
     return add
@@ -188,44 +201,31 @@ def _add_rest(mbs: Any, node: Any, a: Array, force: Array) -> None:
         mbs.AddObject(items.ObjectGenericODE2(nodeNumbers=[node], massMatrix=np.diag(a)))
 
 
-def _spring(kind: str) -> Callable[..., Any]:
-    def connect(markers: Any, stiffness: float, damping: float) -> Any:
-        return getattr(items, kind)(markerNumbers=markers, stiffness=stiffness, damping=damping)
+def _law_of(c: Array, k: Array, force: Array) -> Callable[..., list[float]]:
+    """What acts on coordinates, as a function of a system or an item."""
 
-    return connect
+    def law(mbs: Any, t: float, item: int, q: Any, rates: Any) -> list[float]:
+        return [float(x) for x in force - k * np.array(q) - c * np.array(rates)]
 
-
-def _spring_by_function(kind: str) -> Callable[..., Any]:
-    def connect(markers: Any, stiffness: float, damping: float) -> Any:
-        def law(mbs: Any, t: float, item: int, x: float, rate: float, *numbers: Any) -> float:
-            return float(stiffness * x + damping * rate)
-
-        return getattr(items, kind)(markerNumbers=markers, springForceUserFunction=law)
-
-    return connect
+    return law
 
 
 def _generic_by_functions(mbs: Any, node: Any, a: Array, c: Array, k: Array, force: Array) -> None:
-    def of_forces(mbs: Any, t: float, item: int, q: Any, rates: Any) -> list[float]:
-        return [float(x) for x in force - k * np.array(q) - c * np.array(rates)]
-
-    def of_masses(mbs: Any, t: float, item: int, q: Any, rates: Any) -> Any:
-        return np.diag(a)
-
-    mbs.AddObject(
-        items.ObjectGenericODE2(
-            nodeNumbers=[node], forceUserFunction=of_forces, massMatrixUserFunction=of_masses
-        )
-    )
+    given = {
+        "forceUserFunction": _law_of(c, k, force),
+        "massMatrixUserFunction": lambda mbs, t, item, q, rates: np.diag(a),
+    }
+    mbs.AddObject(items.ObjectGenericODE2(nodeNumbers=[node], **given))
 
 
 def _load_by_function(mbs: Any, node: Any, a: Array, c: Array, k: Array, force: Array) -> None:
+    law_of_all = _law_of(c, k, force)
     for link in range(len(a)):
         marker = _coordinate_marker(mbs, node, link)
 
         def law(mbs: Any, t: float, load: float, link: int = link) -> float:
-            q, rates = (mbs.systemData.GetODE2Coordinates(), mbs.systemData.GetODE2Coordinates_t())
-            return float(force[link] - k[link] * q[link] - c[link] * rates[link])
+            data = mbs.systemData
+            return law_of_all(mbs, t, 0, data.GetODE2Coordinates(), data.GetODE2Coordinates_t())[link]
 
         mbs.AddLoad(items.LoadCoordinate(markerNumber=marker, load=0.0, loadUserFunction=law))
     _add_rest(mbs, node, a, 0 * force)
@@ -233,20 +233,45 @@ def _load_by_function(mbs: Any, node: Any, a: Array, c: Array, k: Array, force: 
 
 def _tree_by_function(mbs: Any, node: Any, a: Array, c: Array, k: Array, force: Array) -> None:
     """Give the tree, the first object, a function of its generalised forces."""
-
-    def of_forces(mbs: Any, t: float, item: int, q: Any, rates: Any) -> list[float]:
-        return [float(x) for x in force - k * np.array(q) - c * np.array(rates)]
-
-    mbs.SetObjectParameter(mbs.GetObjectNumber(mbs.GetObject(0)["name"]), "forceUserFunction", of_forces)
+    tree = mbs.GetObjectNumber(mbs.GetObject(0)["name"])
+    mbs.SetObjectParameter(tree, "forceUserFunction", _law_of(c, k, force))
     _add_rest(mbs, node, a, 0 * force)
+
+
+def _usual_tree(mbs: Any, links: Sequence[Any], gravity: Array, rates: Array) -> tuple[Any, Any]:
+    zeros, matrices, vectors = [0.0] * len(links), exudyn.Matrix3DList, exudyn.Vector3DList
+    given = {
+        "referenceCoordinates": zeros,
+        "initialCoordinates": zeros,
+        "initialCoordinates_t": rates.tolist(),
+    }
+    node = mbs.AddNode(items.NodeGenericODE2(**given, numberOfODE2Coordinates=len(links)))
+    tree = items.ObjectKinematicTree(
+        nodeNumber=node,
+        gravity=gravity.tolist(),
+        jointTypes=[link.joint for link in links],
+        linkParents=[link.parent for link in links],
+        jointTransformations=matrices([link.axes_in_parent for link in links]),
+        jointOffsets=vectors([link.offset for link in links]),
+        linkInertiasCOM=matrices([link.inertia for link in links]),
+        linkCOMs=vectors([link.centre for link in links]),
+        linkMasses=[link.mass for link in links],
+    )
+    return node, mbs.AddObject(tree)
+
+
+def _usual_elements(mbs: Any, node: Any, a: Array, c: Array, k: Array, force: Array) -> None:
+    matrices = {"massMatrix": np.diag(a), "dampingMatrix": np.diag(c), "stiffnessMatrix": np.diag(k)}
+    mbs.AddObject(items.ObjectGenericODE2(nodeNumbers=[node], **matrices, forceVector=force))
 
 
 @dataclass(frozen=True)
 class TreeChange:
     """What is done otherwise; as it stands nothing."""
 
-    add_tree: Callable[..., tuple[Any, Any]] | None = None  # of a system, links, gravity and rates
-    add_elements: Callable[..., None] | None = None  # of a system, node, rotors, dampers, springs and forces
+    add_tree: Callable[..., tuple[Any, Any]] = _usual_tree  # of a system, links, gravity and rates
+    # of a system, node, rotors, dampers, springs and forces
+    add_elements: Callable[..., None] = _usual_elements
     matrices: Callable[[Any, Matrices], Matrices] = lambda _, matrices: matrices
     ways: Ways = field(default_factory=dict)
 
@@ -290,37 +315,27 @@ VARIANTS = (
         "kinematicTree.KinematicTree33 kinematicTree.JointTransformMotionSubspace", matrices=_by_vectors
     ),
     _option("kinematicTree.Inertia2T66", _is_serial, matrices=_by_robot),
+    *(_option(names, matrices=_by_step(run)) for names, run in STEPS.items()),
     *(
-        _option(names, matrices=_by_step(run))
-        for names, run in (
-            ("SolveDynamic", _run_by_function),
-            ("MainSystem.SolveDynamic", _run_by_system),
-            (f"DynamicSolverType.ExplicitEuler {SOLVER}.UpdateCurrentTime {SOLVER}.InitializeStep "
-             f"{SOLVER}.Newton {SOLVER}.FinishStep", _run_by_parts("Newton")),
-            (f"{SOLVER}.DiscontinuousIteration", _run_by_parts("DiscontinuousIteration")),
-            (f"{SOLVER}.SolveSteps", _run_by_steps),
-        )
+        _spelling(f"itemInterface.{name} itemInterface.ObjectConnector{name}", _has_elements,
+                  add_elements=_grounded(name))
+        for name in CONNECTORS
+    ),
+    *(
+        _spelling(f"itemInterface.ObjectConnector{name}SpringForceUserFunction", _has_elements,
+                  add_elements=_grounded(name, by_function=True))
+        for name in CONNECTORS
     ),
     *(
         _spelling(names, suits, add_elements=add)
         for names, add, suits in (
-            *(
-                (f"itemInterface.{name} itemInterface.ObjectConnector{name}", _grounded(_spring(name)),
-                 _has_elements)
-                for name in CONNECTORS
-            ),
-            *(
-                (f"itemInterface.ObjectConnector{name}SpringForceUserFunction",
-                 _grounded(_spring_by_function(name)), _has_elements)
-                for name in CONNECTORS
-            ),
             ("itemInterface.ObjectGenericODE2ForceUserFunction "
              "itemInterface.ObjectGenericODE2MassMatrixUserFunction", _generic_by_functions, _has_elements),
             ("itemInterface.ObjectKinematicTreeForceUserFunction", _tree_by_function, _has_elements),
             ("itemInterface.LoadCoordinateLoadUserFunction itemInterface.MarkerNodeCoordinate",
              _load_by_function, _has_elements),
             ("itemInterface.LoadCoordinate itemInterface.NodePointGround",
-             _grounded(_spring("ObjectConnectorCoordinateSpringDamper")), _has_effort),
+             _grounded("ObjectConnectorCoordinateSpringDamper"), _has_effort),
         )
     ),
     *of_ways(_spelling, _is_small, "LoadVectorUserFunction"),
