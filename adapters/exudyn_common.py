@@ -41,11 +41,6 @@ LOADS = ("LoadForceVector", "LoadTorqueVector", "Force", "Torque")
 NEWTON_TOLERANCE = 1e-12  # relative and absolute; at the engine's defaults extrapolation stops at 2e-9
 
 NO_TOLERANCE = 1e30
-NAMES_OF_RUNS = (  # of Exudyn, that all steps are by
-    "MainSystem.SetPostStepUserFunction", "TimeIntegrationSettings", "LinearSolverSettings",
-    "LinearSolverType", "TimeIntegrationSettings.adaptiveStep", "TimeIntegrationSettings.automaticStepSize",
-    "TimeIntegrationSettings.endTime", "TimeIntegrationSettings.numberOfSteps",
-)  # fmt: skip
 
 
 class ExudynAdapter(MetamorphicHooks):

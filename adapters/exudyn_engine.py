@@ -28,7 +28,6 @@ import numpy as np
 import scipy.linalg
 
 from adapters.exudyn_common import (
-    NAMES_OF_RUNS,
     NEWTON_TOLERANCE,
     ExudynAdapter,
     Output,
@@ -49,7 +48,7 @@ from adapters.exudyn_common import (
 from adapters.exudyn_surface import FEW_BODIES, Probes, pose_function
 from adapters.exudyn_variants import VARIANTS, Change, Joint, Piece
 from adapters.pose_functions import add_pose_answers
-from plumbline.engines.variants import names_of_column
+from plumbline.engines.variants import names_of_column, names_of_steps
 from plumbline.model.datatypes import (
     Array,
     Call,
@@ -85,13 +84,7 @@ STEP_SETTINGS = {
     "difference_step": 1e-7 * 1e-2,
 }
 
-NAMES_OF_IMPLICIT = (
-    *NAMES_OF_RUNS, "MainSolverImplicitSecondOrder.SolveSystem", "TimeIntegrationSettings.newton",
-    "TimeIntegrationSettings.generalizedAlpha", "GeneralizedAlphaSettings", "NewtonSettings",
-    "GeneralizedAlphaSettings.computeInitialAccelerations", "NewtonSettings.absoluteTolerance",
-    "NewtonSettings.relativeTolerance", "NewtonSettings.maxIterations", "NewtonSettings.useModifiedNewton",
-    "LinearSolverType.EigenSparse",
-)  # fmt: skip
+NAMES_OF_STEPS = names_of_steps("exudyn")
 
 
 class ExudynChain:
@@ -312,12 +305,7 @@ class Exudyn(ExudynAdapter):
             solver_rtol=NEWTON_TOLERANCE,
             note="TrapezoidalIndex2: implicit trapezoidal rule, constraints on velocities",
             method=ConstrainedMethod(0.5, 0.5, 0.25, 0.5, "velocity", **STEP_SETTINGS),
-            names=(
-                "DynamicSolverType.TrapezoidalIndex2",
-                "GeneralizedAlphaSettings.useIndex2Constraints",
-                *NAMES_OF_IMPLICIT,
-                "GeneralizedAlphaSettings.useNewmark",
-            ),
+            names=NAMES_OF_STEPS["trapezoidal"],
         ),
         Integrator(
             "generalized-alpha",
@@ -327,11 +315,7 @@ class Exudyn(ExudynAdapter):
             solver_rtol=NEWTON_TOLERANCE,
             note="generalized-α with spectral radius 0.9, constraints on positions (index 3)",
             method=generalized_alpha(SPECTRAL_RADIUS, **STEP_SETTINGS),
-            names=(
-                "DynamicSolverType.GeneralizedAlpha",
-                "GeneralizedAlphaSettings.spectralRadius",
-                *NAMES_OF_IMPLICIT,
-            ),
+            names=NAMES_OF_STEPS["generalized-alpha"],
         ),
     )
     variants = VARIANTS
@@ -396,13 +380,18 @@ class Exudyn(ExudynAdapter):
     ) -> Trajectory:
         with silence_engine():
             chain = _chain_that_moves(model, state)
-            samples, clock = self._run_samples(chain, times, integrator, resolution)
+            samples, clock = self._run_samples(chain, times, self._settings(integrator), resolution)
         return _trajectory(model, state, clock, samples, resolution)
 
     def _step(self, model: Model, state: State, times: Array, integrator: Integrator, step: float) -> StepRun:
+        settings = self._settings(integrator)
+        newton = settings.timeIntegration.newton  # full iterations
+        newton.useModifiedNewton = False
+        newton.absoluteTolerance = STEP_SETTINGS["solver_atol"]
+        newton.relativeTolerance = STEP_SETTINGS["solver_rtol"]
         with silence_engine():
             chain = _chain_that_moves(model, state)
-            samples, clock = self._run_samples(chain, times, integrator, step, is_exact=True)
+            samples, clock = self._run_samples(chain, times, settings, step)
         shape = len(times), model.n, -1
         acceleration, multipliers = (np.array([x[i] for x in samples]).reshape(shape) for i in (2, 3))
         return StepRun(_trajectory(model, state, clock, samples, step), acceleration, multipliers)
@@ -411,53 +400,40 @@ class Exudyn(ExudynAdapter):
         self, model: Model, state: State, end: float, integrator: Integrator, resolution: float
     ) -> Trajectory:
         initial, leg = exudyn.ConfigurationType.Initial, np.array([0.0, end])
+        settings = self._settings(integrator)
         with silence_engine():
             chain = _chain_that_moves(model, state)
             data = chain.mbs.systemData
-            there, _ = self._run_samples(chain, leg, integrator, resolution)
+            there, _ = self._run_samples(chain, leg, settings, resolution)
             q, qdot, qddot, _ = there[-1]
             data.SetODE2Coordinates(q, initial)
             data.SetODE2Coordinates_t(-qdot, initial)
             data.SetODE2Coordinates_tt(qddot, initial)  # carried from step to step: a part of its state
             data.SetTime(0.0, initial)
-            back, _ = self._run_samples(
-                chain, leg, integrator, resolution, compute_initial_accelerations=False
-            )
+            settings.timeIntegration.generalizedAlpha.computeInitialAccelerations = False
+            back, _ = self._run_samples(chain, leg, settings, resolution)
         return _trajectory(model, state, np.array([0.0, end, 2 * end]), [*there, back[-1]], resolution)
 
-    def _run_samples(
-        self,
-        chain: ExudynChain,
-        times: Array,
-        integrator: Integrator,
-        step: float,
-        compute_initial_accelerations: bool = True,
-        is_exact: bool = False,
-    ) -> tuple[list[tuple[Array, ...]], Array]:
-        """Return displacements, rates and accelerations (7N,) and multipliers at ``times``; and the clock's.
-
-        Args:
-            is_exact: whether Newton's iterations are full ones to `STEP_SETTINGS`.
-
-        """
-        settings, data = make_settings(), chain.mbs.systemData
+    def _settings(self, integrator: Integrator) -> Any:
+        settings = make_settings()
         set_linear_solver(settings, self.option or self.usual_linear_solver)
         alpha = settings.timeIntegration.generalizedAlpha
-        alpha.computeInitialAccelerations = compute_initial_accelerations
+        alpha.computeInitialAccelerations = True
         if integrator.name == "trapezoidal":
             alpha.useNewmark = alpha.useIndex2Constraints = True
         else:
             alpha.spectralRadius = SPECTRAL_RADIUS
-        if is_exact:
-            newton = settings.timeIntegration.newton
-            newton.useModifiedNewton = False
-            newton.absoluteTolerance = STEP_SETTINGS["solver_atol"]
-            newton.relativeTolerance = STEP_SETTINGS["solver_rtol"]
+        return settings
+
+    @staticmethod
+    def _run_samples(
+        chain: ExudynChain, times: Array, settings: Any, step: float
+    ) -> tuple[list[tuple[Array, ...]], Array]:
+        """Return displacements, rates and accelerations (7N,) and multipliers at ``times``; and the clock."""
+        data, solver = chain.mbs.systemData, exudyn.MainSolverImplicitSecondOrder()
         parts = data.GetODE2Coordinates, data.GetODE2Coordinates_t, data.GetODE2Coordinates_tt
-        return run_solver(
-            exudyn.MainSolverImplicitSecondOrder(), chain.mbs, settings, times, step,
-            lambda: (*(part() for part in parts), chain.multipliers()),
-        )  # fmt: skip
+        read = lambda: (*(part() for part in parts), chain.multipliers())  # noqa: E731
+        return run_solver(solver, chain.mbs, settings, times, step, read)
 
 
 def _chain_that_moves(model: Model, state: State) -> ExudynChain:
@@ -525,13 +501,13 @@ def _evaluate_state(chain: ExudynChain) -> StateQuantities:
     multiplier = x[w * n :]
     joint_rows = [chain.joint_rows(k) for k in range(len(chain.joints))]
     pieces = [chain.first_piece[near] for near in chain.model.body[:, 1]]
-    reaction = [
-        -C[rows, w * i : w * i + 3].T @ multiplier[rows] for i, rows in zip(pieces, joint_rows, strict=True)
-    ]
-    turning = [
-        -C[rows, w * i + 3 : w * i + w].T @ multiplier[rows]
-        for i, rows in zip(pieces, joint_rows, strict=True)
-    ]
+    reaction, turning = (
+        np.array([
+            -C[rows, w * i + start : w * i + end].T @ multiplier[rows]
+            for i, rows in zip(pieces, joint_rows, strict=True)
+        ])
+        for start, end in ((0, 3), (3, w))
+    )  # fmt: skip
     elements = _element_wrenches(chain)
     momentum = (M @ chain.qdot.ravel()).reshape(n, w)  # of θ̇ = B ω′: Bᵀ (…) = J ω′
     p = chain.state.p[chain.body_of_piece]
@@ -544,7 +520,7 @@ def _evaluate_state(chain: ExudynChain) -> StateQuantities:
     return StateQuantities(
         acceleration=chain.body_outputs(Output.Acceleration),
         angular_acceleration=chain.body_outputs(Output.AngularAccelerationLocal),
-        joint_reaction=np.array(reaction) + elements[:, :3],
+        joint_reaction=reaction + elements[:, :3],
         joint_moment=_joint_moments(chain, reaction, turning) + elements[:, 3:],
         kinetic_energy=kinetic,
         # its own PotentialEnergy is always 0, and springs have none
@@ -566,7 +542,7 @@ def _element_wrenches(chain: ExudynChain) -> Array:
     return total
 
 
-def _joint_moments(chain: ExudynChain, force: list[Array], of_p: list[Array]) -> Array:
+def _joint_moments(chain: ExudynChain, force: Array, of_p: Array) -> Array:
     """Return the moments (J, 3) about the near points from the generalised forces on r and θ.
 
     With θ̇ = B ω′, A Bᵀ Q is the moment about the centre of the piece that the body hangs by.
@@ -574,10 +550,10 @@ def _joint_moments(chain: ExudynChain, force: list[Array], of_p: list[Array]) ->
     near = chain.model.body[:, 1]
     A = rotation_matrix(chain.state.p)[near]
     rates = chain.rates[[chain.first_piece[i] for i in near]]
-    about_centre = np.matvec(rates.mT, np.array(of_p))
+    about_centre = np.matvec(rates.mT, of_p)
     centre = np.array([chain.piece_centre[chain.first_piece[i]] for i in near])
     lever = np.matvec(A, chain.model.proximal - centre)
-    return np.asarray(np.matvec(A, about_centre) - cross(lever, np.array(force)))
+    return np.asarray(np.matvec(A, about_centre) - cross(lever, force))
 
 
 def _system_matrices(chain: ExudynChain) -> tuple[Array, Array, Array]:

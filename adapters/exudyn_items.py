@@ -163,7 +163,7 @@ def _add_part_of_items(
     part(_Items(record.found, bodies, anchor))
 
 
-def _gathered(values: Sequence[Array], rows: Sequence[Sequence[int]]) -> Array:
+def _gathered(values: Sequence[Array] | Array, rows: Sequence[Sequence[int]]) -> Array:
     """Vectors of bodies by values of parts, which have these coordinates each: their mean."""
     total = np.zeros((len(values) // len(rows), 3))
     for i, value in enumerate(values):
@@ -293,11 +293,11 @@ def _add_plane_bodies(node_kind: str, body_kind: str, turning: str, sliding: str
         s.add("body_velocity", (*call, MASS), 2 * _gathered(momenta, PLANES) / s.masses)
         spun = np.reshape([momentum[2] for momentum in momenta], (-1, 3))
         s.add("frame_angular_velocity", (*call, MASS), spun / inertia)
-        held, along, across = np.reshape(s.jacobians(joints), (-1, 3, 2)).swapaxes(0, 1)
+        held, first, second = np.reshape(s.jacobians(joints), (-1, 3, 2)).swapaxes(0, 1)
         s.add("frame_velocity", (*_call(turning), by), 2 * _gathered(held, PLANES))
-        slid = np.stack([along[:, 0], across[:, 0]], axis=1)
+        slid = np.stack([first[:, 0], second[:, 0]], axis=1)
         s.add("frame_velocity", (*_call(sliding), by), 2 * _gathered(slid, PLANES))
-        turned = np.reshape(along[:, 1] - across[:, 1], (-1, 3)) / 2
+        turned = np.reshape(first[:, 1] - second[:, 1], (-1, 3)) / 2
         s.add("frame_angular_velocity", (*_call(sliding), by), turned)
 
     return add

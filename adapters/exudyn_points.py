@@ -45,7 +45,6 @@ from plumbline.model.kinematics import (
 from plumbline.model.probe_frames import PROBE_ATTITUDE
 
 AXES = np.eye(3)
-STIFFNESS = 2.0  # N/m
 PULL = 1.0  # 1/s², of the force −m x of points that are pulled back
 TURN = np.array([0.3, -0.2, 0.5])  # rad, of bodies that turn for a second
 TIGHT = 4e-15  # of Newton's residual, relative: a root has rounding then, and the residual's rounding is less

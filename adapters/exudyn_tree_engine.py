@@ -35,7 +35,6 @@ import exudyn
 import numpy as np
 
 from adapters.exudyn_common import (
-    NAMES_OF_RUNS,
     ExudynAdapter,
     Output,
     add_loads,
@@ -52,7 +51,7 @@ from adapters.exudyn_common import (
     written_items,
 )
 from adapters.exudyn_tree_variants import VARIANTS, TreeChange
-from plumbline.engines.variants import names_of_column
+from plumbline.engines.variants import names_of_column, names_of_steps
 from plumbline.model.datatypes import (
     Array,
     Float,
@@ -405,16 +404,7 @@ class ExudynTree(ExudynAdapter):
             (4, 5, 6, 7, 8),
             note="classical Runge-Kutta on joint angles",
             method=classical_runge_kutta("joint angles"),
-            names=(
-                "DynamicSolverType.RK44",
-                "MainSolverExplicit.SolveSystem",
-                "ExplicitIntegrationSettings",
-                "ExplicitIntegrationSettings.computeEndOfStepAccelerations",
-                *NAMES_OF_RUNS,
-                "TimeIntegrationSettings.explicit",
-                "TimeIntegrationSettings.solverType",
-                "DynamicSolverType",
-            ),
+            names=names_of_steps("exudyn-tree")["RK44"],
         ),
         Integrator("ExplicitEuler", "step", **_alone("ExplicitEuler", 1, _EULER, "explicit Euler")),
         Integrator("ExplicitMidpoint", "step", **_alone("ExplicitMidpoint", 2, _MIDPOINT, "midpoint rule")),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 import exudyn
 import numpy as np
@@ -239,7 +239,8 @@ def _tree_by_function(mbs: Any, node: Any, a: Array, c: Array, k: Array, force: 
 
 
 def _usual_tree(mbs: Any, links: Sequence[Any], gravity: Array, rates: Array) -> tuple[Any, Any]:
-    zeros, matrices, vectors = [0.0] * len(links), exudyn.Matrix3DList, exudyn.Vector3DList
+    zeros, module = [0.0] * len(links), cast("Any", exudyn)
+    matrices, vectors = module.Matrix3DList, module.Vector3DList
     given = {
         "referenceCoordinates": zeros,
         "initialCoordinates": zeros,

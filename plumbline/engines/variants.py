@@ -52,9 +52,20 @@ def names_of_column(column: str, mechanisms: Mapping[str, Suits]) -> Sequence[tu
         mechanisms: by word of `adapters/surface/column_names.json` those on which it does; "all" is given.
 
     """
-    text = (ROOT / "adapters" / "surface" / "column_names.json").read_text(encoding="utf-8")
     suits: Mapping[str, Suits] = {"all": lambda _: True, **mechanisms}
-    return [(tuple(names), suits[word]) for word, names in json.loads(text)[column].items()]
+    return [(tuple(names), suits[word]) for word, names in _column_names()[column].items()]
+
+
+def names_of_steps(column: str) -> Mapping[str, Call]:
+    """Read by integrator of a column the names of its engine that steps are by, as `Integrator.names`."""
+    found = _column_names()[f"steps of {column}"]
+    return {integrator: (*names, *found["all"]) for integrator, names in found.items()}
+
+
+def _column_names() -> Mapping[str, Mapping[str, Sequence[str]]]:
+    text = (ROOT / "adapters" / "surface" / "column_names.json").read_text(encoding="utf-8")
+    found: Mapping[str, Mapping[str, Sequence[str]]] = json.loads(text)
+    return found
 
 
 @dataclass(frozen=True)
