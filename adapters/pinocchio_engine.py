@@ -41,7 +41,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import pinocchio as pin
@@ -96,6 +96,9 @@ from plumbline.model.step_methods import JointSpaceMethod, classical_runge_kutta
 from plumbline.model.welding import BodyParts, undivided_bodies
 
 ROD_AXIAL_INERTIA = 1 / 3  # of a rod about its own axis, over the trace of the inertia that it carries
+# Of steps: coordinates of joints, and of free bodies and of gaps of loops.
+ROTATIONS: tuple[Literal["joint rotations"], float] = "joint rotations", ROD_AXIAL_INERTIA
+RIGID: Any = {"free_coordinates": "rigid motion", "gap_correction": STABILISATION}
 # Of constraintDynamics: accuracy, damping (any from 1e-12 to 1e-3 does), largest number of steps.
 PROXIMAL_SETTINGS = 1e-15, 1e-8, 50
 MAX_DENSE_JOINTS = 10  # joints up to which their 3 × 3 blocks are solved faster as one matrix
@@ -129,21 +132,17 @@ class PinocchioChain:
         self.body_joints: list[int] = []  # joint of body k
         self.placements: list[pin.SE3] = []  # of body k's frame in its joint's frame
         for k, (kind, far) in enumerate(zip(model.kinds, model.body[:, 0], strict=True)):
-            joint = self.body_joints[far] if far >= 0 else 0
-            hang = (self.placements[far] if far >= 0 else pin.SE3.Identity()) * translation(model.point[k, 0])
+            joint, hang = self._end(far, model.point[k, 0])
             if kind.holds_no_turn:
                 hang.rotation = np.eye(3)
             if kind.holds_distance:
                 joint = self._add_joint(joint, pin.JointModelSpherical(), hang, f"rod {k}")
-                # Any axial inertia does; this one keeps its place among the others when units change.
-                axial = np.diag([0.0, 0.0, ROD_AXIAL_INERTIA * np.trace(model.inertia[k])])
-                massless = pin.Inertia(0.0, np.zeros(3), axial)
+                massless = pin.Inertia(0.0, np.zeros(3), _axial_inertia(model, k))
                 self.pin_model.appendBodyToJoint(joint, massless, pin.SE3.Identity())
                 hang = translation(np.array([0.0, 0.0, model.length[k]]))
             joint = self._add_body(k, joint, hang)
             append_parts(self.pin_model, joint, parts[k], self.placements[k])
-            centre = self.placements[k].translation
-            add_frame(self.pin_model, f"com {k}", joint, centre)
+            add_frame(self.pin_model, f"com {k}", joint, self.placements[k].translation)
             self.body_joints.append(joint)
         self.pin_model = change.remake(self.pin_model)
         self.com_frames = [self.pin_model.getFrameId(f"com {k}") for k in range(model.n)]
@@ -172,6 +171,11 @@ class PinocchioChain:
         if self.has_constraints:
             init_constraint_dynamics(self.pin_model, self.data, self.welds, self.weld_data)
         self._init_loads()
+
+    def _end(self, body: int, point: Array) -> tuple[int, pin.SE3]:
+        """Return the joint and the place in its frame of a point of a body, or of the world, joint 0."""
+        place = self.placements[body] if body >= 0 else pin.SE3.Identity()
+        return self.body_joints[body] if body >= 0 else 0, place * translation(point)
 
     def _add_joint(self, parent: int, joint: Any, placement: pin.SE3, name: str) -> int:
         return int(self.pin_model.addJoint(parent, joint, placement, name))
@@ -246,14 +250,9 @@ class PinocchioChain:
         varying = np.logical_or(self.has_force, self.has_body_drag)
         varying[model.spring_body[model.spring_body >= 0]] = True
         self.spring_ends = [
-            [
-                (self.body_joints[b], self.placements[b] * translation(at))
-                if b >= 0
-                else (0, translation(at))
-                for b, at in zip(bodies, points, strict=True)
-            ]
+            [self._end(*end) for end in zip(bodies, points, strict=True)]
             for bodies, points in zip(model.spring_body, model.spring_point, strict=True)
-        ]  # joint and place in its frame of each end; joint 0 is the world
+        ]
         self.spring_pulls = [[_pull(place) for _, place in ends] for ends in self.spring_ends]
         self.bodies_with_varying_loads = [int(k) for k in np.flatnonzero(varying)]
         self._add_up_loads()
@@ -265,9 +264,7 @@ class PinocchioChain:
             self.fext[j] = self.fext[j] + load if j in taken else load
             taken.add(j)
 
-    def coordinates(
-        self, state: State
-    ) -> tuple[Float[Array, "quaternion_entries"], Float[Array, "angle_entries"]]:
+    def coordinates(self, state: State) -> tuple[Float[Array, "nq"], Float[Array, "nv"]]:
         """Map a state to Pinocchio's coordinates q and v."""
         q, T = self._motion(state)
         return q, T @ minimal_rates(self.source_model, state)
@@ -343,7 +340,7 @@ class PinocchioChain:
             turn = quaternion_product(quaternion_conjugate(model.turn[k, 1]), turn)
         return turn
 
-    def update_loads(self, q: Float[Array, "quaternion_entries"], v: Float[Array, "angle_entries"]) -> None:
+    def update_loads(self, q: Float[Array, "nq"], v: Float[Array, "nv"]) -> None:
         """Set `fext` to the loads at a state."""
         if not self.bodies_with_varying_loads:
             return
@@ -394,9 +391,7 @@ class PinocchioChain:
             torque[own] -= self.stiffness[own] * stretch
         return torque
 
-    def acceleration(
-        self, q: Float[Array, "quaternion_entries"], v: Float[Array, "angle_entries"]
-    ) -> Float[Array, "angle_entries"]:
+    def acceleration(self, q: Float[Array, "nq"], v: Float[Array, "nv"]) -> Float[Array, "nv"]:
         """Evaluate the accelerations under gravity and loads, by the chosen algorithm."""
         torque = self._load(q, v)
         if self.has_constraints:
@@ -447,10 +442,10 @@ class PinocchioChain:
 
     def exponential_coordinate_rate(
         self,
-        q: Float[Array, "quaternion_entries"],
-        theta: Float[Array, "angle_entries"],
-        v: Float[Array, "angle_entries"],
-    ) -> Float[Array, "angle_entries"]:
+        q: Float[Array, "nq"],
+        theta: Float[Array, "nv"],
+        v: Float[Array, "nv"],
+    ) -> Float[Array, "nv"]:
         """Apply dexp⁻¹ of θ to a velocity, joint by joint.
 
         Args:
@@ -467,9 +462,7 @@ class PinocchioChain:
         blocks = dexp.reshape(self.joint_count, 3, self.joint_count, 3)[each, :, each, :]  # the rest is zero
         return np.linalg.solve(blocks, v.reshape(-1, 3, 1)).ravel()
 
-    def integrate(
-        self, q: Float[Array, "quaternion_entries"], displacement: Float[Array, "angle_entries"]
-    ) -> Float[Array, "quaternion_entries"]:
+    def integrate(self, q: Float[Array, "nq"], displacement: Float[Array, "nv"]) -> Float[Array, "nq"]:
         """Move a configuration along a tangent vector, by the engine's `integrate`.
 
         Args:
@@ -481,13 +474,11 @@ class PinocchioChain:
         """
         return np.asarray(pin.integrate(self.pin_model, q, displacement))
 
-    def configuration_rate(
-        self, q: Float[Array, "quaternion_entries"], v: Float[Array, "angle_entries"]
-    ) -> Float[Array, "quaternion_entries"]:
+    def configuration_rate(self, q: Float[Array, "nq"], v: Float[Array, "nv"]) -> Float[Array, "nq"]:
         """Map a velocity to the rate of the configuration."""
         return configuration_rate(self.pin_model, q, v)
 
-    def normalize(self, q: Float[Array, "quaternion_entries"]) -> Float[Array, "quaternion_entries"]:
+    def normalize(self, q: Float[Array, "nq"]) -> Float[Array, "nq"]:
         """Normalise the quaternions of a configuration; `aba` takes any quaternion for a unit one."""
         return np.asarray(pin.normalize(self.pin_model, q))
 
@@ -504,19 +495,18 @@ class PinocchioChain:
         pin.forwardKinematics(engine, data, q, v, a)
         pin.updateFramePlacements(engine, data)
         acceleration = [point_acceleration(engine, data, f) for f in self.com_frames]
-        bodies = list(zip(self.body_joints, self.placements, strict=True))
+        bodies = zip(self.body_joints, self.placements, strict=True)
         angular = [place.rotation.T @ data.a[j].angular for j, place in bodies]
         turn = [data.oMi[j].rotation.copy() for j in self.body_joints]
         pin.rnea(engine, data, q, v, a, self.fext)
-        wrench = self._joint_wrenches()
-        reaction = [r @ f.linear for r, f in zip(turn, wrench, strict=True)]
-        moment = [r @ f.angular for r, f in zip(turn, wrench, strict=True)]
+        wrenches = [(r @ f.linear, r @ f.angular) for r, f in zip(turn, self._joint_wrenches(), strict=True)]
+        reaction, moment = np.array(wrenches).swapaxes(0, 1)
         rates = self.rate_map(state)
         return StateQuantities(
             acceleration=np.array(acceleration),
             angular_acceleration=np.array(angular),
-            joint_reaction=np.array(reaction),
-            joint_moment=np.array(moment),
+            joint_reaction=reaction,
+            joint_moment=moment,
             **energies_and_momentum(engine, data, q, v, elastic_energy(self.source_model, state)),
             mass_matrix=rates.T @ pin.crba(engine, data, q) @ rates,
         )
@@ -535,8 +525,8 @@ class PinocchioChain:
             for part in own
         ]
         for k in np.flatnonzero(model.rods[: model.n]).tolist():
-            axial = np.diag([0.0, 0.0, ROD_AXIAL_INERTIA * np.trace(model.inertia[k])])
-            masses.append((self.body_joints[k] - 1, (np.eye(3), np.zeros(3)), 0.0, axial))
+            at_joint = _placed(pin.SE3.Identity())
+            masses.append((self.body_joints[k] - 1, at_joint, 0.0, _axial_inertia(model, k)))
         welds = [[bodies[k] for k in pair] for pair in self.ends]
         loads = ("force", "moment", "drag_force", "drag_moment")
         fields = {"gravity": model.gravity, "q": q, "v": v, "armature": engine.armature.copy()}
@@ -589,8 +579,8 @@ class PinocchioChain:
     def trajectory(
         self,
         times: Float[Array, "samples"],
-        q: Float[Array, "samples quaternion_entries"],
-        v: Float[Array, "samples angle_entries"],
+        q: Float[Array, "samples nq"],
+        v: Float[Array, "samples nv"],
         steps: int,
     ) -> Trajectory:
         """Map samples to the bodies' positions, attitudes and rates.
@@ -602,8 +592,7 @@ class PinocchioChain:
             The trajectory in the project's frames.
 
         """
-        shape = (len(times), self.source_model.n, 3)
-        r, rdot, omega = np.empty(shape), np.empty(shape), np.empty(shape)
+        r, rdot, omega = np.empty((3, len(times), self.source_model.n, 3))
         for i in range(len(times)):
             pin.forwardKinematics(self.pin_model, self.data, q[i], v[i])
             for k, (j, centre) in enumerate(zip(self.body_joints, self.placements, strict=True)):
@@ -613,13 +602,11 @@ class PinocchioChain:
                 omega[i, k] = motion.angular
         frames, unit = self._absolute_attitudes(q), np.array([1.0, 0.0, 0.0, 0.0])
         at_rest = np.tile(unit, (len(q), 1))
-        p = np.stack(
-            [
-                quaternion_product(frames[:, row] if row >= 0 else at_rest, self._frame_in_joint(k, unit))
-                for k, row in enumerate(self.body_rows)
-            ],
-            1,
-        )
+        pairs = [
+            (frames[:, row] if row >= 0 else at_rest, self._frame_in_joint(k, unit))
+            for k, row in enumerate(self.body_rows)
+        ]
+        p = np.stack([quaternion_product(*pair) for pair in pairs], 1)
         own = {"coordinates": self._joint_coordinates(q), "velocities": v}
         return Trajectory(t=times, r=r, p=p, v=rdot, pdot=quaternion_rate(p, omega), steps=steps, **own)
 
@@ -691,6 +678,11 @@ def _pull(place: pin.SE3) -> Float[Array, "6 3"]:
     return np.asarray(place.toDualActionMatrix()[:, :3] @ place.rotation.T)
 
 
+def _axial_inertia(model: Model, k: int) -> Float[Array, "3 3"]:
+    """Return that of the rod that carries body k: any does; this one keeps its size when units change."""
+    return np.diag([0.0, 0.0, ROD_AXIAL_INERTIA * np.trace(model.inertia[k])])
+
+
 def _placed(placement: pin.SE3) -> tuple[Array, Array]:
     """Return rotation and translation of a placement."""
     return placement.rotation.copy(), placement.translation.copy()
@@ -756,13 +748,7 @@ class Pinocchio(PinocchioAdapter):
             1,
             error_exponents=(1, 2, 3, 4, 5),
             note="v += h a(q, v) by aba, then q = integrate(q, h v)",
-            method=JointSpaceMethod(
-                "semi-implicit Euler",
-                "joint rotations",
-                ROD_AXIAL_INERTIA,
-                free_coordinates="rigid motion",
-                gap_correction=STABILISATION,
-            ),
+            method=JointSpaceMethod("semi-implicit Euler", *ROTATIONS, **RIGID),
         ),
         Integrator(
             "rkmk4",
@@ -770,12 +756,7 @@ class Pinocchio(PinocchioAdapter):
             4,
             error_exponents=(4, 5, 6, 7, 8),
             note="Munthe-Kaas form of the classical Runge–Kutta method, on aba, integrate and dIntegrate",
-            method=classical_runge_kutta(
-                "joint rotations",
-                ROD_AXIAL_INERTIA,
-                free_coordinates="rigid motion",
-                gap_correction=STABILISATION,
-            ),
+            method=classical_runge_kutta(*ROTATIONS, **RIGID),
         ),
         Integrator("dop853", "tolerance", 8, note="SciPy's DOP853 on (q, v) with crba and the tangent map"),
     )
