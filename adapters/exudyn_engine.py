@@ -501,13 +501,12 @@ def _evaluate_state(chain: ExudynChain) -> StateQuantities:
     multiplier = x[w * n :]
     joint_rows = [chain.joint_rows(k) for k in range(len(chain.joints))]
     pieces = [chain.first_piece[near] for near in chain.model.body[:, 1]]
-    reaction, turning = (
-        np.array([
-            -C[rows, w * i + start : w * i + end].T @ multiplier[rows]
-            for i, rows in zip(pieces, joint_rows, strict=True)
-        ])
-        for start, end in ((0, 3), (3, w))
-    )  # fmt: skip
+
+    def push(start: int, end: int) -> Array:
+        own = [slice(w * i + start, w * i + end) for i in pieces]
+        return np.array([-C[rows, at].T @ multiplier[rows] for at, rows in zip(own, joint_rows, strict=True)])
+
+    reaction, turning = push(0, 3), push(3, w)
     elements = _element_wrenches(chain)
     momentum = (M @ chain.qdot.ravel()).reshape(n, w)  # of θ̇ = B ω′: Bᵀ (…) = J ω′
     p = chain.state.p[chain.body_of_piece]

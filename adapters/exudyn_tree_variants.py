@@ -24,7 +24,7 @@ from adapters.exudyn_common import (
     set_explicit_method,
     set_linear_solver,
 )
-from adapters.exudyn_variants import MANY_BODIES, of_ways
+from adapters.exudyn_variants import MANY_BODIES, of_ways, texts
 from plumbline.engines.variants import variants_of
 from plumbline.model.datatypes import Array, EngineFailure, Float, Model
 
@@ -150,20 +150,25 @@ def _run_by_parts(parts: str) -> Callable[[Any, Any], bool]:
 
 
 EULER: Any = exudyn.DynamicSolverType.ExplicitEuler
+BEGIN, BY_NEWTON = "UpdateCurrentTime InitializeStep", "UpdateCurrentTime InitializeStep Newton FinishStep"
 STEPS: Mapping[str, Callable[[Any, Any], bool]] = {
     "SolveDynamic": lambda mbs, settings: bool(exudyn.SolveDynamic(mbs, settings, solverType=EULER)),
     "MainSystem.SolveDynamic": lambda mbs, settings: bool(mbs.SolveDynamic(settings, solverType=EULER)),
-    f"DynamicSolverType.ExplicitEuler {EXPLICIT}.UpdateCurrentTime {EXPLICIT}.InitializeStep "
-    f"{EXPLICIT}.Newton {EXPLICIT}.FinishStep":
-        _run_by_parts("UpdateCurrentTime InitializeStep Newton FinishStep"),
-    f"{EXPLICIT}.DiscontinuousIteration":
-        _run_by_parts("UpdateCurrentTime InitializeStep DiscontinuousIteration FinishStep"),
+    f"DynamicSolverType.ExplicitEuler {texts(EXPLICIT, *BY_NEWTON.split())}": _run_by_parts(BY_NEWTON),
+    f"{EXPLICIT}.DiscontinuousIteration": _run_by_parts(f"{BEGIN} DiscontinuousIteration FinishStep"),
     f"{EXPLICIT}.SolveSteps": _run_by_parts("SolveSteps"),
-}  # fmt: skip
+}
 
 
 def _coordinate_marker(mbs: Any, node: Any, link: int) -> Any:
     return mbs.AddMarker(items.MarkerNodeCoordinate(nodeNumber=node, coordinate=link))
+
+
+def _spring_law(stiffness: float, damping: float) -> Callable[..., float]:
+    def law(mbs: Any, t: float, item: int, x: float, rate: float, *_: Any) -> float:
+        return stiffness * x + damping * rate
+
+    return law
 
 
 def _grounded(kind: str, by_function: bool = False) -> Callable[..., None]:
@@ -173,19 +178,9 @@ def _grounded(kind: str, by_function: bool = False) -> Callable[..., None]:
         ground = mbs.AddNode(items.NodePointGround())
         fixed = mbs.AddMarker(items.MarkerNodeCoordinate(nodeNumber=ground, coordinate=0))
         for link in np.flatnonzero((c != 0) | (k != 0)):
-            stiffness, damping = float(k[link]), float(c[link])
-
-            def law(
-                mbs: Any, t: float, item: int, x: float, rate: float, *_: Any,
-                k: float = stiffness, c: float = damping,
-            ) -> float:  # fmt: skip
-                return k * x + c * rate
-
-            own = (
-                {"springForceUserFunction": law}
-                if by_function
-                else {"stiffness": stiffness, "damping": damping}
-            )
+            own: Any = {"stiffness": float(k[link]), "damping": float(c[link])}
+            if by_function:
+                own = {"springForceUserFunction": _spring_law(**own)}
             markers = [fixed, _coordinate_marker(mbs, node, int(link))]
             mbs.AddObject(getattr(items, kind)(markerNumbers=markers, **own))
         _add_rest(mbs, node, a, force)

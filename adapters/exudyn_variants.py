@@ -529,7 +529,7 @@ def _is_rod(kind: JointKind) -> bool:
     return kind.holds_distance
 
 
-def _texts(owner: str, *names: str) -> str:
+def texts(owner: str, *names: str) -> str:
     """The names of a class or module."""
     return " ".join(f"{owner}.{name}" for name in names)
 
@@ -564,11 +564,11 @@ VARIANTS = (
         "MainSystem.SetNodeParameter MainSystem.SetObjectParameter", add_body=_set_later(modifies=False)
     ),
     _spelling("MainSystem.ModifyNode MainSystem.ModifyObject", add_body=_set_later(modifies=True)),
-    _option(_texts("MainSystem", *ASSEMBLY, "systemIsConsistent"), assemble=_assemble_by_parts),
+    _option(texts("MainSystem", *ASSEMBLY, "systemIsConsistent"), assemble=_assemble_by_parts),
     _option("SystemData.GetSystemState SystemData.SetSystemState", assemble=_assemble_and_set_state),
     *of_ways(_spelling, _is_open),
     _option(
-        _texts(IMPLICIT, "InitializeSolverPreChecks", *INITIALISATION), initialize=_initialize_by_parts
+        texts(IMPLICIT, "InitializeSolverPreChecks", *INITIALISATION), initialize=_initialize_by_parts
     ),
     _option("MainSolverStatic", solver=lambda: exudyn.MainSolverStatic()),
     _option(

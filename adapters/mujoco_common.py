@@ -130,6 +130,15 @@ def full_mass_matrix(m: Any, d: Any) -> Float[Array, "nv nv"]:
     return M
 
 
+def principal_inertia(J: Float[Array, "3 3"]) -> tuple[Float[Array, "3"], Float[Array, "4"]]:
+    """Return principal inertias and the quaternion of their axes; MuJoCo's own are less accurate."""
+    values, axes = np.linalg.eigh(J)
+    axes[:, 2] *= np.sign(np.linalg.det(axes))
+    q = np.empty(4)
+    mujoco.mju_mat2Quat(q, axes.ravel())
+    return values, q
+
+
 @contextmanager
 def warnings_to(receive: Callable[[str], Any]) -> Iterator[None]:
     """Give MuJoCo's warnings to a function; else they go to a log file in the current folder."""

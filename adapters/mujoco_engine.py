@@ -64,6 +64,7 @@ from adapters.mujoco_common import (
     compiler_of,
     full_mass_matrix,
     member,
+    principal_inertia,
     set_attributes,
     warnings_to,
 )
@@ -139,7 +140,9 @@ MAX_ORDER_ERROR = 0.1
 MIN_SOFTNESS = 1e-9  # a smaller relative effect of R is rounding
 MAX_NOISE = 1e-11  # relative, of differences that grow as R falls: more is too much to extrapolate
 ROD_AXIAL_INERTIA = 0.01  # J_z of a rod over the mean principal inertia of the body that it carries
-IDENTITY_QUATERNION = np.array([1.0, 0.0, 0.0, 0.0])
+UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])
+Run = tuple[Array, Integrator, float]  # times, and by what step
+Turned = tuple[Array, Array]  # a vector, and the quaternion of axes
 # of positions, attitudes, ṙ and ω′: |δp| of a unit quaternion is half the rotation angle
 ERROR_UNITS = np.array([1.0, 2.0, 1.0, 1.0])
 # of the equalities that close loops and hold pitches, in steps
@@ -265,7 +268,7 @@ class Mujoco(MetamorphicHooks):
             raise Unsupported(TENDON_MOTIONS)
         if self.is_soft(model):
             return self._rigid_run(model, state, times, integrator, resolution)
-        return self._sampled_run(_MujocoChain(model), state, times, integrator, resolution)
+        return self._sampled_run(_MujocoChain(model), state, (times, integrator, resolution))
 
     def _step(self, model: Model, state: State, times: Array, integrator: Integrator, step: float) -> StepRun:
         is_soft = is_constrained(model) and not self.option
@@ -287,7 +290,7 @@ class Mujoco(MetamorphicHooks):
         """Run at falling regularisations, extrapolate to none; the last order's change is the uncertainty."""
         runs = list[Trajectory]()
         for soft in self._softened(model, LARGEST_RUN_REGULARISATION):
-            run = self._sampled_run(soft.tree, soft.state(state), times, integrator, resolution)
+            run = self._sampled_run(soft.tree, soft.state(state), (times, integrator, resolution))
             runs.append(soft.cut.source_run(run))
         limit, before = dict[str, Any](), dict[str, Any]()
         for name in ("r", "p", "v", "pdot"):
@@ -307,12 +310,8 @@ class Mujoco(MetamorphicHooks):
         the steps around it: in one step alone both may be off alike by chance.
         """
         softs = [soft for largest in STEP_REGULARISATIONS for soft in self._softened(model, largest)]
-        trees, start, errors = (
-            [soft.tree for soft in softs],
-            softs[0].state(state),
-            [[0.0] * len(ERROR_UNITS)],
-        )
-        first = trees[0]
+        trees, start = [soft.tree for soft in softs], softs[0].state(state)
+        first, errors = trees[0], [[0.0] * len(ERROR_UNITS)]
         for tree in trees:
             tree.prepare(start, integrator, step)
 
@@ -329,15 +328,15 @@ class Mujoco(MetamorphicHooks):
                 samples.append(first.sample())
             errors.append([_largest_norm(x - y) for x, y in zip(*samples, strict=True)])
 
-        run = softs[0].cut.source_run(self._sampled_run(first, start, times, integrator, step, advance))
+        run = softs[0].cut.source_run(self._sampled_run(first, start, (times, integrator, step), advance))
         around = np.pad(errors, ((NEARBY_STEPS, NEARBY_STEPS), (0, 0)), "edge")
         largest = np.max(sliding_window_view(around, 2 * NEARBY_STEPS + 1, axis=0), axis=-1)
         return replace(run, limit_error=3 * ERROR_UNITS * largest)
 
     def _sampled_run(
-        self, chain: _MujocoChain, state: State, times: Array, integrator: Integrator, resolution: float,
-        advance: Callable[[int], None] | None = None,
-    ) -> Trajectory:  # fmt: skip
+        self, chain: _MujocoChain, state: State, run: Run, advance: Callable[[int], None] | None = None
+    ) -> Trajectory:
+        times, integrator, resolution = run
         chain.prepare(state, integrator, resolution)
         counts = np.round(times / resolution).astype(int)
         t, rows = [0.0], [(*chain.sample(), *chain.joint_sample())]
@@ -405,7 +404,7 @@ class _MujocoChain:
             parent, hang = links[far] if far >= 0 else spec.worldbody, model.point[k, 0]
             if kind.holds_distance:
                 axial = np.array([0, 0, ROD_AXIAL_INERTIA * _principal_inertia(model.inertia[k])[0].mean()])
-                parent = self._add_body(parent, hang, 0.0, axial, joint=np.zeros(3))
+                parent = self._add_body(parent, (hang, UNTURNED), 0.0, (axial, UNTURNED), np.zeros(3))
                 hang = np.array([0, 0, -model.length[k]])
             pieces = (parts or undivided_bodies(model))[k]
             links.append(self._add_link(parent, k, hang, pieces))
@@ -448,15 +447,15 @@ class _MujocoChain:
     def _add_link(self, parent: Any, k: int, hang: Array, pieces: tuple[RigidPart, ...]) -> Any:
         """Add a body of one part, or a massless one with its parts welded to it, on its joint."""
         one = pieces[0] if len(pieces) == 1 else RigidPart(0.0, np.zeros(3), np.zeros((3, 3)))
-        kind, near = self.model.kinds[k], self.model.proximal[k]
+        kind, near, inertia = self.model.kinds[k], self.model.proximal[k], _principal_inertia(one.inertia)
         if kind.holds_no_turn:
-            link = self._add_body(parent, hang - near, one.mass, *_principal_inertia(one.inertia), joint=near)
+            link = self._add_body(parent, (hang - near, UNTURNED), one.mass, inertia, near)
         else:
             q_far, q_near = self.model.turn[k]
             quat = kinematics.quaternion_product(q_far, kinematics.quaternion_conjugate(q_near))
             pos = hang - kinematics.rotation_matrix(quat) @ near
-            pos, quat = (np.zeros(3), IDENTITY_QUATERNION) if kind.holds_nothing else (pos, quat)
-            link = self._add_body(parent, pos, one.mass, *_principal_inertia(one.inertia), quat=quat)
+            pose = (np.zeros(3), UNTURNED) if kind.holds_nothing else (pos, quat)
+            link = self._add_body(parent, pose, one.mass, inertia)
             if kind.holds_nothing:
                 for joint in self.change.free_joints:
                     set_attributes(link.add_joint(), **joint)
@@ -465,20 +464,14 @@ class _MujocoChain:
                 set_attributes(link.add_joint(), type=JOINT_TYPES[what], pos=near, axis=along)
         self.link_ids.append(len(self.mass) - 1)
         for piece in pieces if len(pieces) > 1 else ():  # before the next link: ids go depth first
-            self._add_body(link, piece.centre, piece.mass, *_principal_inertia(piece.inertia))
+            self._add_body(link, (piece.centre, UNTURNED), piece.mass, _principal_inertia(piece.inertia))
         return link
 
     def _add_body(
-        self,
-        parent: Any,
-        pos: Array,
-        mass: float,
-        inertia: Array,
-        axes: Array = IDENTITY_QUATERNION,
-        joint: Array | None = None,
-        quat: Array = IDENTITY_QUATERNION,
+        self, parent: Any, pose: Turned, mass: float, inertia: Turned, joint: Array | None = None
     ) -> Any:
-        """Add a body on a ball joint, or on none; of unit mass until ``mass`` and ``inertia`` are set."""
+        """Add a body on a ball joint, or on none; of unit mass until mass and principal inertia are set."""
+        (pos, quat), (moments, axes) = pose, inertia
         body = set_attributes(
             parent.add_body(),
             pos=pos, quat=quat, mass=1.0, inertia=np.ones(3), ipos=np.zeros(3), iquat=axes,
@@ -486,15 +479,15 @@ class _MujocoChain:
         )  # fmt: skip
         if mass and self.change.has_own_inertia:
             turn = kinematics.rotation_matrix(axes)
-            J = turn * inertia @ turn.T
+            J = turn * moments @ turn.T
             full = J[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-            set_attributes(body, mass=mass, inertia=np.zeros(3), iquat=IDENTITY_QUATERNION, fullinertia=full)
+            set_attributes(body, mass=mass, inertia=np.zeros(3), iquat=UNTURNED, fullinertia=full)
         if joint is not None:
             for one in self.change.ball_joints:
                 set_attributes(body.add_joint(), pos=joint, **one)
             self.ball_ids.append(len(self.mass))
         self.mass.append(mass)
-        self.inertia.append(inertia)
+        self.inertia.append(moments)
         return body
 
     def _set_elements(self) -> None:
@@ -870,17 +863,10 @@ def _add_equality(spec: Any, kind: Literal["TENDON", "JOINT", "WELD"], name: str
 
 
 def _principal_inertia(J: Array) -> tuple[Array, Array]:
-    """Return principal inertias (3,) and the quaternion of their axes; a diagonal J is not rounded.
-
-    MuJoCo's own diagonalisation of a full inertia is less accurate.
-    """
+    """Return principal inertias (3,) and the quaternion of their axes; a diagonal J is not rounded."""
     if not np.any(J - np.diag(np.diag(J))):
-        return np.diag(J), IDENTITY_QUATERNION
-    values, axes = np.linalg.eigh(J)
-    axes[:, 2] *= np.sign(np.linalg.det(axes))
-    q = np.empty(4)
-    mujoco.mju_mat2Quat(q, axes.ravel())
-    return values, q
+        return np.diag(J), UNTURNED
+    return principal_inertia(J)
 
 
 def _to_body_frame(xmat: Array, vector: Array) -> Array:

@@ -7,7 +7,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from adapters.mujoco_common import bodies_of, children_of, compiler_of
+from adapters.mujoco_common import bodies_of, children_of, compiler_of, principal_inertia, set_attributes
 from plumbline.model.datatypes import Array, Float
 from plumbline.model.kinematics import quaternion_conjugate, quaternion_product, rotation_matrix
 
@@ -21,25 +21,23 @@ MESH_FACES = np.array([
 
 def of_shapes(spec: Any) -> Any:
     """Make every body with a full inertia of a box, a mesh, an ellipsoid, a ball, a shell and a cylinder."""
+    shell = {"typeinertia": mujoco.mjtGeomInertia.mjINERTIA_SHELL}
     for k, body in enumerate(bodies_of(spec)):
         if np.isnan(body.fullinertia[0]):
             continue
         xx, yy, zz, xy, xz, yz = body.fullinertia
-        moments, axes = np.linalg.eigh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        axes[:, 2] *= np.sign(np.linalg.det(axes))
-        quat = np.empty(4)
-        mujoco.mju_mat2Quat(quat, axes.ravel())
+        moments, quat = principal_inertia(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
         mass, body.explicitinertial, body.fullinertia = body.mass, False, np.full(6, np.nan)
         body.ipos = np.full(3, np.nan)
         round_part = ROUND * (np.sum(moments) - 2 * np.max(moments))
         piece, own = SHARE * mass, round_part / 3
         radius = np.sqrt(own / piece)
-        for kind, size, is_shell in (
-            ("SPHERE", [np.sqrt(5 / 2) * radius, 0, 0], False),
-            ("SPHERE", [np.sqrt(3 / 2) * radius, 0, 0], True),
-            ("CYLINDER", [np.sqrt(2) * radius, np.sqrt(3 / 2) * radius, 0], False),
+        for kind, size, own_kind in (
+            ("SPHERE", [np.sqrt(5 / 2) * radius, 0, 0], {}),
+            ("SPHERE", [np.sqrt(3 / 2) * radius, 0, 0], shell),
+            ("CYLINDER", [np.sqrt(2) * radius, np.sqrt(3 / 2) * radius, 0], {}),
         ):
-            _add_geom(body, kind, piece, size, quat, is_shell)
+            _add_geom(body, kind, piece, size, quat, **own_kind)
         rest = (moments - round_part) / 2  # of the ellipsoid, and of box and mesh
         others = (1 - 3 * SHARE) / 2 * mass
         _add_geom(body, "ELLIPSOID", others, np.sqrt(5) * _half_sizes(rest, others), quat)
@@ -61,21 +59,17 @@ def _half_sizes(moments: Float[Array, "3"], mass: float) -> Float[Array, "3"]:
     return np.sqrt((np.sum(moments) / 2 - moments) / mass)
 
 
-def _add_geom(body: Any, kind: str, mass: float, size: Any, quat: Array, is_shell: bool = False) -> Any:
-    geom = body.add_geom()
-    geom.type = getattr(mujoco.mjtGeom, f"mjGEOM_{kind}")
-    geom.size, geom.mass, geom.quat, geom.contype, geom.conaffinity = size, mass, quat, 0, 0
-    if is_shell:
-        geom.typeinertia = mujoco.mjtGeomInertia.mjINERTIA_SHELL
-    return geom
+def _add_geom(body: Any, kind: str, mass: float, size: Any, quat: Array, **given: Any) -> Any:
+    own = {"type": getattr(mujoco.mjtGeom, f"mjGEOM_{kind}"), "size": size, "mass": mass, "quat": quat}
+    return set_attributes(body.add_geom(), **own, contype=0, conaffinity=0, **given)
 
 
 def _add_mesh(spec: Any, body: Any, name: str, mass: float, half: Array, quat: Array) -> None:
-    mesh = spec.add_mesh()
-    mesh.name, mesh.inertia = name, mujoco.mjtMeshInertia.mjMESH_INERTIA_EXACT
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-    mesh.uservert, mesh.userface = (signs * half).ravel(), MESH_FACES.ravel()
-    _add_geom(body, "MESH", mass, [0, 0, 0], quat).meshname = name
+    exact, faces = mujoco.mjtMeshInertia.mjMESH_INERTIA_EXACT, MESH_FACES.ravel()
+    vertices = (signs * half).ravel()
+    set_attributes(spec.add_mesh(), name=name, inertia=exact, uservert=vertices, userface=faces)
+    _add_geom(body, "MESH", mass, [0, 0, 0], quat, meshname=name)
 
 
 def without_shapes(spec: Any) -> Any:
@@ -114,12 +108,11 @@ def welds_as_points(spec: Any) -> Any:
         for i, place in enumerate((length or 1.0) * np.eye(3)):
             names = [f"point {e} {i} {side}" for side in (1, 2)]
             for body, name in zip(bodies, names, strict=True):
-                site = body.add_site()
-                site.name, site.pos = name, place
+                set_attributes(body.add_site(), name=name, pos=place)
             one = weld if i == 2 else spec.add_equality()
-            one.solref, one.solimp = weld.solref, weld.solimp
-            one.type, one.objtype = mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtObj.mjOBJ_SITE
-            one.name1, one.name2 = names
+            point = {"type": mujoco.mjtEq.mjEQ_CONNECT, "objtype": mujoco.mjtObj.mjOBJ_SITE}
+            given = {"solref": weld.solref, "solimp": weld.solimp, "name1": names[0], "name2": names[1]}
+            set_attributes(one, **point, **given)
     return spec
 
 
