@@ -18,6 +18,7 @@ import scipy.linalg
 from adapters.exudyn_common import Output, items
 from adapters.exudyn_items import add_item_answers
 from adapters.exudyn_points import add_point_answers
+from adapters.pose_functions import turned
 from adapters.surface_record import SurfaceRecord
 from plumbline.engines.missing_names import add_parts
 from plumbline.model.datatypes import Array, Model, State
@@ -41,10 +42,7 @@ def _axes(values: Array) -> Array:
 
 
 def _axes_of_angles(values: Array) -> Array:
-    half = values[..., None] / 2
-    about = np.concatenate([np.cos(half), np.sin(half) * np.eye(3)], axis=-1)  # x, y and z
-    x, y, z = np.moveaxis(rotation_matrix(about), 1, 0)
-    return _axes(x @ y @ z)
+    return _axes(np.array([turned(angles) for angles in values]))
 
 
 def _axes_of_poses(values: Array) -> Array:

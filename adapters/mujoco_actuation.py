@@ -282,17 +282,15 @@ def forward_by_tendons(m: Any, d: Any) -> None:
 
 def with_far_limits(spec: Any) -> Any:
     """Limit joints, controls and forces where nothing reaches, and add motors that are switched off."""
+    limited, far = mujoco.mjtLimited.mjLIMITED_TRUE, [-FAR, FAR]
     for joint in named_joints(spec):
         if joint.type != J.mjJNT_FREE:
-            joint.limited, joint.range = mujoco.mjtLimited.mjLIMITED_TRUE, [-FAR, FAR]
-        if joint.type == J.mjJNT_BALL:
-            joint.range = [0.0, FAR]
+            joint.limited, joint.range = limited, [0.0, FAR] if joint.type == J.mjJNT_BALL else far
         if DOFS[joint.type] == 1:
-            joint.actfrclimited, joint.actfrcrange = mujoco.mjtLimited.mjLIMITED_TRUE, [-FAR, FAR]
+            joint.actfrclimited, joint.actfrcrange = limited, far
         add_actuator(spec, f"off {joint.name}", "JOINT", joint.name, np.eye(6)[0], group=GROUP_OFF)
     for actuator in spec.actuators:
-        actuator.forcelimited = actuator.ctrllimited = mujoco.mjtLimited.mjLIMITED_TRUE
-        actuator.forcerange = actuator.ctrlrange = [-FAR, FAR]
+        set_attributes(actuator, forcelimited=limited, ctrllimited=limited, forcerange=far, ctrlrange=far)
     return spec
 
 

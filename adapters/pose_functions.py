@@ -66,16 +66,18 @@ PROBE = rotation_matrix(PROBE_ATTITUDE)
 def xyz_angles(R: Float[Array, "3 3"]) -> Float[Array, "3"]:
     """Return the angles about x, y, z in turn, intrinsic."""
     first = np.arctan2(-R[1, 2], R[2, 2])
-    rest = _about(0, -first) @ R  # also where the first is arbitrary
+    rest = about(0, -first) @ R  # also where the first is arbitrary
     return np.array([first, np.arctan2(rest[0, 2], rest[2, 2]), np.arctan2(rest[1, 0], rest[1, 1])])
 
 
-def _about(axis: int, angle: float) -> Array:
+def about(axis: int, angle: float) -> Float[Array, "3 3"]:
+    """Return the turn about a coordinate axis."""
     return rotation_matrix(np.append(np.cos(angle / 2), np.sin(angle / 2) * np.eye(3)[axis]))
 
 
-def _turned(angles: Array) -> Array:
-    return _about(0, angles[0]) @ _about(1, angles[1]) @ _about(2, angles[2])
+def turned(angles: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """Return the turn by angles about x, y, z in turn, intrinsic."""
+    return about(0, angles[0]) @ about(1, angles[1]) @ about(2, angles[2])
 
 
 def _mean_of_exponential(generator: Array) -> Array:
@@ -118,6 +120,7 @@ class Pose:
         XI = np.kron(np.eye(2), self.R.T)
         XI[3:, :3] = -self.R.T @ cross_matrix(self.r)
         xi = np.append(np.linalg.solve(_mean_of_exponential(cross_matrix(phi)), self.r), phi)
+        angle = float(np.linalg.norm(phi))
         named: dict[str, Any] = {
             "R": self.R,
             "p": self.p,
@@ -125,19 +128,9 @@ class Pose:
             "phi": phi,
             "xyz": xyz,
         }
-        angle = float(np.linalg.norm(phi))
-        named |= {
-            "r": self.r,
-            "rpy": -xyz_angles(self.R.T),
-            "H": H,
-            "X": X,
-            "XI": XI,
-            "G": G,
-            "xi": xi,
-            "angle": angle,
-        }
-        named |= {"S": cross_matrix(self.r), "axis": phi / angle if angle else np.eye(3)[2]}
         named |= {"r" + form: np.append(self.r, named[form]) for form in ("p", "xyzw", "phi", "xyz")}
+        named |= {"r": self.r, "rpy": -xyz_angles(self.R.T), "H": H, "X": X, "XI": XI, "G": G, "xi": xi}
+        named |= {"S": cross_matrix(self.r), "axis": phi / angle if angle else np.eye(3)[2], "angle": angle}
         return named | dict(zip(("x", "y", "z", "rx", "ry", "rz"), map(float, [*xyz, *self.r]), strict=True))
 
 
@@ -149,23 +142,17 @@ def _beside_velocity(turning: Array, Q: Pose) -> Array:
 def rate_maps(Q: Pose) -> dict[str, Array]:
     """Return matrices at Q from the rates of forms to ω in Q's axes, or to the twist in them."""
     phi, (a, *_), (u, v, _) = (Q.forms[name] for name in ("phi", "xyz", "rpy"))
-    of_xyz = [Q.R.T @ axis for axis in (np.eye(3)[0], _about(0, a)[:, 1], Q.R[:, 2])]
-    of_rpy = [np.eye(3)[0], _about(0, u).T[:, 1], (_about(1, v) @ _about(0, u)).T[:, 2]]
+    of_xyz = [Q.R.T @ axis for axis in (np.eye(3)[0], about(0, a)[:, 1], Q.R[:, 2])]
+    of_rpy = [np.eye(3)[0], about(0, u).T[:, 1], (about(1, v) @ about(0, u)).T[:, 2]]
     xi = Q.forms["xi"]
     generator: Array = np.asarray(np.kron(np.eye(2), cross_matrix(xi[3:])), float)
     generator[:3, 3:] = cross_matrix(xi[:3])
-    maps: dict[str, Array] = {
-        "xyzdot": np.stack(of_xyz, 1),
-        "rpydot": np.stack(of_rpy, 1),
-        "w": Q.R.T,
-        "wl": np.eye(3),
-    }
-    return maps | {
-        "phidot": _mean_of_exponential(-cross_matrix(phi)), "xidot": _mean_of_exponential(-generator),
-        "pdot": np.stack([angular_velocity(Q.p, axis) for axis in np.eye(4)], 1), "t": np.eye(6),
-        "rphidot": _beside_velocity(_mean_of_exponential(-cross_matrix(phi)), Q),
-        "vwl": _beside_velocity(np.eye(3), Q),
-        "2pdot": np.stack([angular_velocity(Q.p, axis) for axis in np.eye(4)], 1) / 2,
+    of_p = np.stack([angular_velocity(Q.p, axis) for axis in np.eye(4)], 1)
+    of_phi = _mean_of_exponential(-cross_matrix(phi))
+    return {
+        "xyzdot": np.stack(of_xyz, 1), "rpydot": np.stack(of_rpy, 1), "w": Q.R.T, "wl": np.eye(3),
+        "phidot": of_phi, "xidot": _mean_of_exponential(-generator), "pdot": of_p, "t": np.eye(6),
+        "rphidot": _beside_velocity(of_phi, Q), "vwl": _beside_velocity(np.eye(3), Q), "2pdot": of_p / 2,
     }  # fmt: skip
 
 
@@ -225,11 +212,11 @@ class _Body:
     def _attitude(self, form: str, value: Array) -> Array | None:
         name = form.removeprefix("-")
         if name in ("Rx", "Ry", "Rz"):
-            turns = [_about(axis, angle) for axis, angle in enumerate(self.pose.forms["xyz"])]
+            turns = [about(axis, angle) for axis, angle in enumerate(self.pose.forms["xyz"])]
             turns["xyz".index(name[1])] = value[:3, :3].T if name != form else value[:3, :3]
             return np.asarray(turns[0] @ turns[1] @ turns[2])
         if name in ("x", "y", "z"):
-            return self._attitude(f"R{name}", _about("xyz".index(name), float(value)))
+            return self._attitude(f"R{name}", about("xyz".index(name), float(value)))
         if name == "axis":
             return _turn(value * self.pose.forms["angle"])
         return ATTITUDES[name](value) if name in ATTITUDES else None
@@ -265,9 +252,9 @@ ATTITUDES = _by_form(
     ("xyzw rxyzw", lambda x: rotation_matrix(np.roll(x[-4:], 1))),
     ("phi xi rphi", lambda x: _turn(x[-3:])),
     ("skew log", lambda x: _turn(_vector_of(x))),
-    ("xyz rxyz", lambda x: _turned(x[-3:])),
-    ("rpy", lambda x: _turned(-x).T),
-    ("zyz", lambda x: _about(2, x[0]) @ _about(1, x[1]) @ _about(2, x[2])),
+    ("xyz rxyz", lambda x: turned(x[-3:])),
+    ("rpy", lambda x: turned(-x).T),
+    ("zyz", lambda x: about(2, x[0]) @ about(1, x[1]) @ about(2, x[2])),
     ("H G", lambda x: x[:3, :3]),
     ("X", lambda x: (x[:3, :3] + x[3:, 3:]) / 2),  # both blocks are the turn
     ("XI", lambda x: (x[:3, :3] + x[3:, 3:]).T / 2),

@@ -56,14 +56,10 @@ class NotesAdapter(MetamorphicHooks):
             raise EngineFailure(f"{self.title}: {error}") from error
 
 
-def notes_state(
-    state: State,
-) -> tuple[
-    Float[Array, "... bodies 3"],
-    Float[Array, "... bodies 4"],
-    Float[Array, "... bodies 3"],
-    Float[Array, "... bodies 4"],
-]:
+Vectors, Quaternions = Float[Array, "... bodies 3"], Float[Array, "... bodies 4"]
+
+
+def notes_state(state: State) -> tuple[Vectors, Quaternions, Vectors, Quaternions]:
     """Convert a state to the notes' variables.
 
     Returns:
