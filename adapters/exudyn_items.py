@@ -391,13 +391,13 @@ def _add_relative_markers(s: _Items) -> None:
 def _add_connectors(s: _Items) -> None:
     """Connectors and joints between the anchor and probe points, and what they say of the distance."""
     turn, shift, fixed = PROBE, s.anchor / 2, s.ground(s.anchor)
-    made = []
+    damping, made = 3 * np.eye(6), []
     for body, one in zip(s.rigid_bodies(), s.bodies, strict=True):
         ends = fixed, s.marker("MarkerBodyRigid", bodyNumber=body, localPosition=one.arm)
         made.append((
             s.object("ObjectConnectorCartesianSpringDamper", *ends, stiffness=[2.0] * 3),
             s.object("ObjectConnectorDistance", *ends, distance=1.0),
-            s.object("ObjectConnectorRigidBodySpringDamper", *ends, damping=3 * np.eye(6), rotationMarker0=turn),
+            s.object("ObjectConnectorRigidBodySpringDamper", *ends, rotationMarker0=turn, damping=damping),
             s.object("ObjectJointGeneric", *ends, rotationMarker0=turn,
                      offsetUserFunction=lambda mbs, t, item, given: [*shift, 0.0, 0.0, 0.0]),
         ))  # fmt: skip

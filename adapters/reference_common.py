@@ -56,7 +56,8 @@ class NotesAdapter(MetamorphicHooks):
             raise EngineFailure(f"{self.title}: {error}") from error
 
 
-Vectors, Quaternions = Float[Array, "... bodies 3"], Float[Array, "... bodies 4"]
+Vectors = Float[Array, "... bodies 3"]
+Quaternions = Float[Array, "... bodies 4"]
 
 
 def notes_state(state: State) -> tuple[Vectors, Quaternions, Vectors, Quaternions]:
