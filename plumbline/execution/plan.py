@@ -100,6 +100,7 @@ class TaskKind(StrEnum):
 
     STATE_TRUTH = "state truth"
     MOTION_TRUTH = "motion truth"
+    RELATION_BOUNDS = "relation bounds"
     STATE = "state"
     STEP = "step"
     RELATIONS = "relations"
@@ -112,9 +113,14 @@ class TaskKind(StrEnum):
 _CPU_TIME_KINDS = {
     TaskKind.STATE_TRUTH: "truth",
     TaskKind.MOTION_TRUTH: "truth",
+    TaskKind.RELATION_BOUNDS: "truth",
     TaskKind.DIAGNOSIS: "diagnosis",
 }
-_TRUTHS = {TaskKind.STATE: TaskKind.STATE_TRUTH, TaskKind.TRAJECTORY: TaskKind.MOTION_TRUTH}
+_TRUTHS = {
+    TaskKind.STATE: TaskKind.STATE_TRUTH,
+    TaskKind.TRAJECTORY: TaskKind.MOTION_TRUTH,
+    TaskKind.RELATIONS: TaskKind.RELATION_BOUNDS,
+}
 
 
 @dataclass(frozen=True)
@@ -131,12 +137,12 @@ class TaskKey:
 
     @property
     def is_truth(self) -> bool:
-        """Whether the task computes a truth."""
+        """Whether the task computes what the answers of engines are judged by."""
         return self.kind in _TRUTHS.values()
 
     @property
     def needed_truth(self) -> TaskKind | None:
-        """The truth that the answer is judged by; None where it is judged without one."""
+        """The task whose result the answer is judged by; None where it is judged without one."""
         return _TRUTHS.get(self.kind)
 
     @property
@@ -180,6 +186,7 @@ def task_keys(
     """
     has_states, has_runs = level in ("state", "random", "all"), level in ("trajectory", "all")
     wanted = [TaskKind.STATE_TRUTH] * has_states + [TaskKind.MOTION_TRUTH] * has_runs
+    wanted += [TaskKind.RELATION_BOUNDS] * (level == "all")
     yield from (TaskKey(kind, scenario) for kind in wanted)
     for name, info in engines.items():
         if info.missing is not None:

@@ -36,10 +36,10 @@ from plumbline.judging.step_level import (
     judge_steps,
 )
 from plumbline.judging.trajectory_level import judge_trajectory
-from plumbline.measurements import relations
 from plumbline.measurements.long_run_study import plan_long_run, run_long_run_study
 from plumbline.measurements.order_and_limit import refinement_resolutions
 from plumbline.measurements.refinement_study import run_refinement_study
+from plumbline.measurements.relations import RelationBounds, check_relations, relation_bounds
 from plumbline.measurements.single_steps import STEP_STATES, run_step_study
 from plumbline.model.datatypes import Integrator, State
 from plumbline.model.invariants import inertia_ratio
@@ -116,7 +116,7 @@ class ScenarioRun:
 
         """
         self.scenario = scenario
-        self.truths: dict[TaskKind, StateTruth | MotionTruth | TruthFailure] = {}
+        self.truths: dict[TaskKind, StateTruth | MotionTruth | RelationBounds | TruthFailure] = {}
         self._plan, self._engines, self._known, self._is_random = plan, engines, known, is_random
         levels = scenario_level(scenario, level or (plan.random_level if is_random else plan.level))
         has_long_runs = plan.long_run_seconds > 0 and not is_random
@@ -138,7 +138,8 @@ class ScenarioRun:
         count = min(count, STATES_PER_RANDOM_SCENARIO) if has_few_states else count
         self._states = self._compared_states(count)  # argument of many tasks
         if scenario.model.has_loops and not self._states.load():
-            self._left_out |= dict.fromkeys((TaskKind.STATE_TRUTH, *_LEVELS), NO_REGULAR_POSE)
+            kinds = TaskKind.STATE_TRUTH, TaskKind.RELATION_BOUNDS, *_LEVELS
+            self._left_out |= dict.fromkeys(kinds, NO_REGULAR_POSE)
         has_other_steps = not is_random and plan.has_other_steps(scenario)
         every = list(task_keys(scenario.name, engines, levels, has_long_runs, has_other_steps))
         self._keys = [key for key in every if key.kind not in self._left_out]
@@ -195,6 +196,8 @@ class ScenarioRun:
         s = self.scenario
         if key.kind == TaskKind.STATE_TRUTH:
             return Task(key, ground_truth.state_truth, (s.model, self._states), self._plan.limits)
+        if key.kind == TaskKind.RELATION_BOUNDS:
+            return Task(key, relation_bounds, (s.model, self._states), self._plan.limits)
         arguments = (s.model, s.state, s.times, exact_samples(s, s.times), *(compiled_bodies or (None,)))
         proof = find_proof(s.model, s.state, s.times)
         arguments += () if proof is None else (proof,)
@@ -425,7 +428,7 @@ class ScenarioRun:
         return [
             f"{levels[kind]} level: {truth.method}"
             for kind, truth in self.truths.items()
-            if not isinstance(truth, TruthFailure)
+            if isinstance(truth, StateTruth | MotionTruth)
         ]
 
     def _context(self, engine: str) -> RowContext:
@@ -458,7 +461,8 @@ class ScenarioRun:
             asked = by_failures[len(self._failures_besides.get(key, ()))]
             return engine_calls.evaluate_states, (s.model, self._states, asked)
         if key.kind == TaskKind.RELATIONS:
-            return relations.check_relations, (s.model, self._states)
+            bounds = self._packed_truths.get(TaskKind.RELATION_BOUNDS)  # without them the cell has failed
+            return check_relations, (s.model, self._states, bounds)
         integrator = self._integrator(key)
         if key.kind == TaskKind.STEP:
             return run_step_study, (integrator, s.model, self._step_states)

@@ -9,8 +9,7 @@ perturbations of the motion grow.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from functools import lru_cache
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -31,10 +30,33 @@ RUN_STEPS = 16  # of a run, one way
 STEPS_PER_RADIAN = 32  # at the fastest rate, so that implicit steps can be solved
 
 
-def check_run_relations(engine: MetamorphicHooks, model: Model, state: State) -> Iterator[RelationResult]:
+def _first_step(model: Model, state: State) -> float:
+    """The step [s] that is tried first."""
+    return float(2.0 ** np.floor(-np.log2(STEPS_PER_RADIAN * fastest_rate(model, state))))
+
+
+def run_growth(model: Model, state: State) -> list[float]:
+    """Compute by how much small perturbations grow in a run with each of the steps, whatever the engine.
+
+    Returns:
+        The largest growth up to the end of the run, for each of `STEP_DIVISORS`.
+
+    """
+    ends = RUN_STEPS * _first_step(model, state) / np.array(STEP_DIVISORS)
+    times = np.unique([0.0, *ends, *ends / 2])
+    growth = perturbation_growth(model, state, times)
+    return [float(np.max(growth[times <= end])) for end in ends]
+
+
+def check_run_relations(
+    engine: MetamorphicHooks, model: Model, state: State, growth: Sequence[float]
+) -> Iterator[RelationResult]:
     """Check the relations of short runs, for every integrator that has one.
 
     Where an implicit integrator fails, a shorter run with a shorter step follows.
+
+    Args:
+        growth: of `run_growth`.
 
     Yields:
         One result per integrator and relation.
@@ -44,32 +66,34 @@ def check_run_relations(engine: MetamorphicHooks, model: Model, state: State) ->
         if reason := engine.unmoved_options.get(option):
             words = f"not compared: {reason}"
             yield RelationResult(f"motions by {option}", None, "", 0, 0, words, "not compared")
-    step = 2.0 ** float(np.floor(-np.log2(STEPS_PER_RADIAN * fastest_rate(model, state))))
+    step = _first_step(model, state)
     for integrator in (one for one in engine.integrators if one.has_motions):
         results: list[RelationResult] = []
-        for divisor in STEP_DIVISORS:
-            results = list(check_integrator_relations(engine, integrator, model, state, step / divisor))
+        for divisor, grown in zip(STEP_DIVISORS, growth, strict=True):
+            shorter = step / divisor
+            results = list(check_integrator_relations(engine, integrator, model, state, shorter, grown))
             if integrator.kind == "tolerance" or all(r.refusal != "failed" for r in results):
                 break
         yield from results
 
 
 def check_integrator_relations(
-    engine: MetamorphicHooks, integrator: Integrator, model: Model, state: State, step: float
+    engine: MetamorphicHooks, integrator: Integrator, model: Model, state: State, step: float, growth: float
 ) -> Iterator[RelationResult]:
     """Check the relations of one integrator's runs.
 
     Args:
         step: step of the runs [s]; with step control it sets only their duration.
+        growth: the largest growth of perturbations in such a run.
 
     Yields:
         One result per relation.
 
     """
     if integrator.is_symmetric and not model.is_dissipative:
-        yield _check_time_reversal(engine, integrator, model, state, step)
+        yield _check_time_reversal(engine, integrator, model, state, step, growth)
     if integrator.kind == "step" and (options := _options_of_runs(engine, integrator, model)):
-        yield from _check_options(engine, options, integrator, model, state, step)
+        yield from _check_options(engine, options, integrator, model, state, step, growth)
 
 
 def _options_of_runs(engine: MetamorphicHooks, integrator: Integrator, model: Model) -> list[str]:
@@ -103,7 +127,7 @@ def _loop_acceleration(model: Model, state: State) -> float:
 
 
 def _check_time_reversal(
-    engine: MetamorphicHooks, integrator: Integrator, model: Model, state: State, step: float
+    engine: MetamorphicHooks, integrator: Integrator, model: Model, state: State, step: float, growth: float
 ) -> RelationResult:
     """Run there and back: the last row must be the first one with opposite rates."""
     resolution = step if integrator.kind == "step" else integrator.min_rtol
@@ -117,7 +141,7 @@ def _check_time_reversal(
         _loop_acceleration(model, state) * end,
     )
     differences = relative_differences(model, *ends, driven)
-    limit = run_tolerance(integrator, model, state, end, run.steps)
+    limit = run_tolerance(integrator, model, state, end, run.steps, growth)
     return worst_difference_result(
         REVERSED_IN_TIME, integrator, differences, limit, run.steps, resolution, end
     )
@@ -130,6 +154,7 @@ def _check_options(
     model: Model,
     state: State,
     step: float,
+    growth: float,
 ) -> Iterator[RelationResult]:
     """Compare the same run with each of the engine's options."""
     end = RUN_STEPS * step
@@ -141,7 +166,7 @@ def _check_options(
             return refusal
 
     usual = simulate(engine)
-    limit = 2 * run_tolerance(integrator, model, state, end, RUN_STEPS)
+    limit = 2 * run_tolerance(integrator, model, state, end, RUN_STEPS, growth)
     driven = _loop_acceleration(model, state) * end
     for option in options:
         name, other = OPTION_PREFIX + option, simulate(engine.with_option(option))
@@ -168,7 +193,9 @@ def refused_result(name: str, integrator: Integrator, refusal: Unsupported | Eng
     return RelationResult(name, None, "", 0, 0, reason, kind, integrator.name, gap=gap)
 
 
-def run_tolerance(integrator: Integrator, model: Model, state: State, end: float, steps: int) -> float:
+def run_tolerance(
+    integrator: Integrator, model: Model, state: State, end: float, steps: int, growth: float
+) -> float:
     """Return by how much the end of a run may be off: rounding and the tolerance of its steps, grown.
 
     On long chains the rounding of accelerations is more than the other rounding of a run: they are off by the
@@ -179,6 +206,7 @@ def run_tolerance(integrator: Integrator, model: Model, state: State, end: float
     Args:
         end: duration of the run, one way [s].
         steps: number of its steps, there and back.
+        growth: the largest growth of perturbations in it.
 
     Returns:
         The tolerance, relative to `characteristic_scales` [–].
@@ -193,13 +221,7 @@ def run_tolerance(integrator: Integrator, model: Model, state: State, end: float
     bound = remembered_rounding_bound(model, state)
     _, spin, speed = characteristic_scales(model, state, driven)
     pushed = end * max(np.max(bound.acceleration) / speed, np.max(bound.angular_acceleration) / spin)
-    return (RUN_ROUNDING + of_step * float(np.sqrt(steps)) + pushed) * _growth(model, state, end)
-
-
-@lru_cache(maxsize=8)  # all integrators of an engine run for the same times
-def _growth(model: Model, state: State, end: float) -> float:
-    """The largest growth of perturbations up to a time [s]."""
-    return float(np.max(perturbation_growth(model, state, np.array([0.0, end / 2, end]))))
+    return (RUN_ROUNDING + of_step * float(np.sqrt(steps)) + pushed) * growth
 
 
 def characteristic_scales(model: Model, state: State, driven: float = 0.0) -> tuple[float, float, float]:

@@ -102,9 +102,8 @@ class Relation:
     name: str
     transform: Callable[[Model, State], tuple[Model, State]] = unchanged
     transform_back: Callable[[StateQuantities], dict[str, Array]] = quantity_values  # of the other answers
-    has_own_terms: bool = (
-        False  # whether the other equations have other terms, so that their bound is another
-    )
+    # whether the other equations have other terms, so that their bound is another, of bodies in other order
+    has_own_terms: bool = False
     # what the other answers are off by where the engine leaves out a term that known_issues.yaml records
     missing_term: Callable[[Model, State], dict[str, Array]] | None = None
 
@@ -262,31 +261,66 @@ STATE_RELATIONS = (
 )
 
 
+@dataclass(frozen=True)
+class StateBounds:
+    """Rounding bounds of the relations at states, the same for every engine."""
+
+    usual: list[RoundingBound]
+    lossless: list[RoundingBound]  # of the mechanism without dampers and drag; empty where it has none
+    others: dict[str, list[RoundingBound]]  # of the other side of relations with terms of their own, by name
+
+
+def state_bounds(model: Model, states: Sequence[State]) -> StateBounds:
+    """Compute the rounding bounds of every relation.
+
+    Args:
+        states: states of it; those are used that `compared_states` takes.
+
+    """
+    states = compared_states(model, states)
+    others = {
+        relation.name: [state_rounding_bound(*relation.transform(model, state)) for state in states]
+        for relation in _redescriptions(model)
+    }
+    if not model.has_loops:  # an adapter may cut bodies where loops close, and weld them there
+        others[WELDED_HALVES] = rounding_bounds(model, states, split_bodies(model))
+    lossless = rounding_bounds(_without_losses(model), states) if model.is_dissipative else []
+    return StateBounds(rounding_bounds(model, states), lossless, others)
+
+
+def compared_states(model: Model, states: Sequence[State]) -> Sequence[State]:
+    """Return the states at which relations are checked: the first few."""
+    return states[: MAX_STATES if model.n <= LONG_CHAIN_BODIES else MAX_STATES // 2]
+
+
+def _without_losses(model: Model) -> Model:
+    off = ("drag_force", "drag_moment", "damping", "spring_damping")
+    return scale_fields(model, **dict.fromkeys(off, 0.0))
+
+
 def check_state_relations(
-    engine: MetamorphicHooks, model: Model, states: Sequence[State]
+    engine: MetamorphicHooks, model: Model, states: Sequence[State], bounds: StateBounds
 ) -> Iterator[RelationResult]:
     """Check every relation on one engine, at each state.
 
     Args:
         states: states of it; the first few are used.
+        bounds: of `state_bounds` for the same states.
 
     Yields:
         One result per relation.
 
     """
-    states = states[: MAX_STATES if model.n <= LONG_CHAIN_BODIES else MAX_STATES // 2]
+    states = compared_states(model, states)
     answers = [evaluate_or_refusal(engine.evaluate, model, state) for state in states]
-    bounds = rounding_bounds(model, states)
     others: list[tuple[Relation, Evaluate]] = [
         (relation, engine.evaluate)
         for relation in (*STATE_RELATIONS, *_redescriptions(model))
         if not (relation is TIME_REVERSED and model.is_dissipative)
     ]
     if model.is_dissipative:
-        off = ("drag_force", "drag_moment", "damping", "spring_damping")
-        lossless = scale_fields(model, **dict.fromkeys(off, 0.0))
+        lossless, limits = _without_losses(model), bounds.lossless
         found = [evaluate_or_refusal(engine.evaluate, lossless, state) for state in states]
-        limits = rounding_bounds(lossless, states)
         yield check_state_relation(TIME_REVERSED, found, engine.evaluate, lossless, states, limits, limits)
     if np.any(np.diff(siblings_reversed(model)) < 0):
         others.append((_permute_siblings(model), engine.evaluate))
@@ -299,18 +333,15 @@ def check_state_relations(
     ]
     if formulation := engine.other_formulation:
         others.append((Relation(OTHER_FORMULATION_PREFIX + formulation), load_adapter(formulation).evaluate))
-    for relation, evaluate in others:
-        yield check_state_relation(relation, answers, evaluate, model, states, bounds, bounds)
 
     def evaluate_welded(model: Model, states: list[State]) -> list[StateQuantities]:
         return engine.with_welded_halves().evaluate(model, states)
 
-    if model.has_loops:  # an adapter may cut bodies where loops close, and weld them there
-        return
-    welded_bounds = rounding_bounds(model, states, split_bodies(model))
-    yield check_state_relation(
-        Relation(WELDED_HALVES), answers, evaluate_welded, model, states, bounds, welded_bounds
-    )
+    if not model.has_loops:
+        others.append((Relation(WELDED_HALVES), evaluate_welded))
+    for relation, evaluate in others:
+        of_others = bounds.others.get(relation.name, bounds.usual)
+        yield check_state_relation(relation, answers, evaluate, model, states, bounds.usual, of_others)
 
 
 def evaluate_or_refusal(evaluate: Evaluate, model: Model, state: State) -> StateQuantities | Unsupported:
@@ -370,7 +401,7 @@ def check_state_relation(
     refused: Unsupported | None = None
     others = [relation.transform(model, state) for state in states]
     answered = _evaluate_together(evaluate_other, others)
-    for index, (state, there, other) in enumerate(zip(states, others, answered, strict=True)):
+    for index, (state, other) in enumerate(zip(states, answered, strict=True)):
         here = answers[index]
         if isinstance(here, Unsupported):
             refused = here
@@ -380,10 +411,9 @@ def check_state_relation(
             continue
         count += 1
         mine, theirs = quantity_values(here), relation.transform_back(other)
-        other_bound = state_rounding_bound(*there) if relation.has_own_terms else other_bounds[index]
         missing = relation.missing_term(model, state) if relation.missing_term else {}
         for q in mine.keys() & theirs.keys():
-            theirs_allowed = np.asarray(other_bound.tolerance(q))
+            theirs_allowed = np.asarray(other_bounds[index].tolerance(q))
             if relation.has_own_terms:  # its bodies may have another order
                 theirs_allowed = np.max(theirs_allowed)
             both = np.asarray(bounds[index].tolerance(q)) + theirs_allowed

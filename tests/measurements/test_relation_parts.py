@@ -9,7 +9,6 @@ from plumbline.engines.registry import load_adapter
 from plumbline.judging.relation_rows import judge_relations
 from plumbline.judging.rows import RowContext
 from plumbline.measurements.relation_result import RelationResult
-from plumbline.measurements.relations import check_relations
 from plumbline.measurements.run_relations import (
     characteristic_scales,
     fastest_rate,
@@ -35,6 +34,7 @@ from plumbline.truth.ground_truth import RUN_ROUNDING
 from plumbline.truth.predictability_horizon import perturbation_growth
 from plumbline.truth.rounding_bound import state_rounding_bound
 from tests.helpers import pendulums
+from tests.helpers.relation_checks import check_relations
 
 MODEL = pendulums.make_model("br")
 STATES = [pendulums.state_from_seed(MODEL, seed=k) for k in range(3)]
@@ -240,10 +240,10 @@ def test_a_run_may_be_off_by_its_rounding_its_solver_and_its_accelerations_grown
     pushed = end * max(max(bound.acceleration) / speed, max(bound.angular_acceleration) / spin)
     grown = max(perturbation_growth(model, at, np.array([0, end / 2, end])))
     assert grown > 1.1
-    limit = run_tolerance(method, model, at, end, steps)
+    limit = run_tolerance(method, model, at, end, steps, grown)
     assert limit == pytest.approx((RUN_ROUNDING + solved + pushed) * grown, rel=1e-12, abs=0)
     bare = replace(method, solver_rtol=0.0, min_rtol=0.0)
-    assert run_tolerance(bare, model, at, end, steps) == pytest.approx(
+    assert run_tolerance(bare, model, at, end, steps, grown) == pytest.approx(
         (RUN_ROUNDING + pushed) * grown, rel=1e-12, abs=0
     )
 

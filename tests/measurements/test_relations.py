@@ -13,12 +13,11 @@ from plumbline.engines.metamorphic_hooks import metamorphic_hooks
 from plumbline.engines.registry import ENGINES, load_adapter
 from plumbline.judging.relation_rows import judge_relations
 from plumbline.judging.rows import RowContext
-from plumbline.measurements.relations import check_relations
 from plumbline.measurements.run_relations import (
     check_integrator_relations,
-    check_run_relations,
     fastest_rate,
     relative_differences,
+    run_growth,
     run_tolerance,
     state_at_sample,
 )
@@ -27,7 +26,6 @@ from plumbline.measurements.state_relations import (
     STATE_RELATIONS,
     WELDED_HALVES,
     check_state_relation,
-    check_state_relations,
 )
 from plumbline.model.datatypes import EngineFailure, Unsupported
 from plumbline.model.welding import split_bodies, split_body
@@ -38,6 +36,7 @@ from tests.helpers.pendulums import JOINT_PATTERNS
 from tests.helpers.planted_defects import STATE_DEFECTS
 from tests.helpers.planting import Defect, answer_change, model_change, number_change, plant
 from tests.helpers.random_chains import random_chain
+from tests.helpers.relation_checks import check_relations, check_run_relations, check_state_relations
 from tests.helpers.shared_answers import sharing
 
 for engine in ("mujoco", "pinocchio", "exudyn"):
@@ -424,7 +423,7 @@ def test_a_solver_with_which_a_run_fails_is_reported():
 
     model = pendulums.make_model(JOINT_PATTERNS["ball"])
     back, *others = check_integrator_relations(
-        Half(), trapezoidal_integrator(), model, pendulums.state_from_seed(model), 1 / 512
+        Half(), trapezoidal_integrator(), model, pendulums.state_from_seed(model), 1 / 512, 1.5
     )
     assert back.ratio < 0.3
     assert [(h.relation, h.integrator, h.refusal_reason, h.refusal) for h in others] == [
@@ -442,7 +441,8 @@ def test_two_solvers_may_both_be_off():
         )
         for way in (exudyn_adapter()(), exudyn_adapter()().with_option("EigenDense"))
     ]
-    limit = 2 * run_tolerance(trapezoidal_integrator(), model, at, found.end_time, 16)
+    grown = run_growth(model, at)[0]
+    limit = 2 * run_tolerance(trapezoidal_integrator(), model, at, found.end_time, 16, grown)
     assert found.ratio > 0
     assert found.ratio == pytest.approx(max(relative_differences(model, *ends).values()) / limit, rel=1e-9), (
         "the same runs"

@@ -11,11 +11,11 @@ from plumbline.engines.metamorphic_hooks import metamorphic_hooks
 from plumbline.engines.registry import ENGINES, load_adapter
 from plumbline.judging.relation_rows import judge_relations
 from plumbline.judging.rows import RowContext
-from plumbline.measurements.relations import check_relations
 from plumbline.measurements.repeatability import check_repeatability
 from plumbline.model.datatypes import EngineFailure, Unsupported
 from tests.helpers import pendulums
 from tests.helpers.pendulums import JOINT_PATTERNS
+from tests.helpers.relation_checks import check_relations
 
 for name in ("mujoco", "pinocchio", "exudyn"):
     pytest.importorskip(name)

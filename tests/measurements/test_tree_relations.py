@@ -13,13 +13,11 @@ from plumbline.engines.registry import load_adapter
 from plumbline.judging.known_issues import KnownIssues, project_known_issues
 from plumbline.judging.relation_rows import judge_relations
 from plumbline.judging.rows import RowContext
-from plumbline.measurements.run_relations import check_run_relations
 from plumbline.measurements.state_relations import (
     MISSING_TERMS,
     REDESCRIPTIONS,
     Relation,
     check_state_relation,
-    check_state_relations,
 )
 from plumbline.model.datatypes import JOINT_ELEMENTS
 from plumbline.model.kinematics import complete_state, quaternion_product
@@ -30,6 +28,7 @@ from plumbline.model.sampling import random_states
 from plumbline.scenario.loader import find_scenario_file, load_scenario
 from plumbline.truth.rounding_bound import state_rounding_bound
 from tests.helpers.random_chains import random_chain
+from tests.helpers.relation_checks import check_run_relations, check_state_relations
 from tests.helpers.shared_answers import sharing
 
 TREE = load_scenario(find_scenario_file("tree-of-seven"))
