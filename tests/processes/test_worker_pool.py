@@ -349,19 +349,19 @@ def test_a_clock_that_is_set_neither_kills_nor_spares(monkeypatch):
     real, off = time.time, [0.0]
     monkeypatch.setattr(time, "time", lambda: real() + off[0])
     with WorkerPool(3) as workers:
-        list(workers.run([Task(k, sleep_for, (1.0,)) for k in range(6)]))  # now all three are there
+        list(workers.run([Task(k, sleep_for, (0.4,)) for k in range(6)]))  # now all three are there
         for step in (3600.0, -3600.0):
             tasks = [
-                Task("nap", sleep_for, (3.0,), Limits(seconds=60)),
-                Task("hang", faults.hang, (), Limits(seconds=4)),
-                Task("go", sleep_for, (1.0,)),
+                Task("nap", sleep_for, (2.0,), Limits(seconds=60)),
+                Task("hang", faults.hang, (), Limits(seconds=2)),
+                Task("go", sleep_for, (0.5,)),
             ]
             found = {}
             for outcome in workers.run(tasks):
                 if outcome.key == "go":
                     off[0] += step  # while the others run
                 found[outcome.key] = outcome
-            assert found["nap"].value == 3.0
+            assert found["nap"].value == 2.0
             assert "timeout" in (found["hang"].failure or "")
 
 

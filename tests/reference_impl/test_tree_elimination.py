@@ -80,16 +80,26 @@ def test_loops_with_rotors_side_by_side_do_not_touch_each_other():
     np.testing.assert_allclose(runs[0].r, runs[1].r, atol=1e-9)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_projection_ends_on_the_constraints(kind):
-    model = random_tree(np.random.default_rng(3), 5, (kind,))
-    before = components(*off_manifold(model, 4, 1e-5))
-    q, qdot = TreeSystem([model]).project(*before)
+def mechanism(what):
+    """A tree on joints of one kind, or a chain by its letters."""
+    rng = np.random.default_rng(3)
+    return random_tree(rng, 5, (what,)) if what in KINDS else random_model(rng, [x == "r" for x in what])
+
+
+@pytest.mark.parametrize("what", [*KINDS, "b", "r", "rbr"])
+def test_projection_ends_on_the_constraints(what):
+    """From 1e-5 off the manifold to rounding; a state on it stays."""
+    model = mechanism(what)
+    system, before = eliminated_system([model]), components(*off_manifold(model, 4, 1e-5))
+    q, qdot = system.project(*before)
     r, p, v, pdot = body_first(q, qdot)
     rows = constraint_rows(model, r, p, v, pdot)
-    assert np.max(np.abs([rows.C, rows.constraint_rate(v, pdot)]), initial=0.0) < 2e-14
-    assert np.max(np.abs(dot(p, p) - 1)) < 1e-15
-    assert np.max(np.abs(q - before[0])) < 1e-3
+    rounding = 2e-14 if what in KINDS else 1e-14
+    assert np.max(np.abs([rows.C, rows.constraint_rate(v, pdot)]), initial=0.0) < rounding
+    assert np.max(np.abs(dot(p, p) - 1)) < 1e-15 and np.max(np.abs(dot(p, pdot))) < 1e-15
+    assert np.max(np.abs(q - before[0])) < 1e-4
+    for moved, was in zip(system.project(q, qdot), (q, qdot), strict=True):
+        assert np.max(np.abs(moved - was)) < 1e-13
 
 
 def test_baumgarte_damps_constraint_errors():
@@ -174,13 +184,16 @@ def test_projection_normalises_far_from_the_constraints():
     np.testing.assert_allclose(q, components(r, p, v, pdot)[0], rtol=1e-15, atol=1e-15)
 
 
-def test_projection_far_off_ends_on_unit_quaternions():
+@pytest.mark.parametrize(("what", "size"), [("hinge", 0.03), ("rbb", 0.05)])
+def test_projection_far_off_ends_on_unit_quaternions(what, size):
     """Newton's steps leave the unit sphere by the square of the gap; the last division returns to it."""
-    model = random_tree(np.random.default_rng(3), 5, ("hinge",))
-    near = TreeSystem([model]).project(*components(*off_manifold(model, 4, 0.03)))
-    _, p, _, pdot = body_first(*near)
-    assert np.max(np.abs(dot(p, p) - 1)) < 1e-15
-    assert np.max(np.abs(dot(p, pdot))) < 1e-13
+    model = mechanism(what)
+    far = off_manifold(model, 4, size)
+    near = body_first(*eliminated_system([model]).project(*components(*far)))
+    _, p, _, pdot = near
+    assert np.max(np.abs(dot(p, p) - 1)) < 1e-15 and np.max(np.abs(dot(p, pdot))) < 1e-15
+    left, before = (np.max(np.abs(constraint_rows(model, *parts).C)) for parts in (near, far))
+    assert left < 0.02 * before
 
 
 @pytest.mark.parametrize("a", [0.0, 3.0])
