@@ -53,6 +53,10 @@ def verdicts(truth, answers):
     return {row.quantity: row.verdict for row in rows}
 
 
+def rows_of_variants(truth, variants):
+    return judge_variants(WHO, truth, Evaluation([], None, None, 0.0, variants=variants))
+
+
 @pytest.fixture(scope="module")
 def few_bodies():
     model, states = mechanism(("rod", "ball"), bodies=2)
@@ -121,7 +125,7 @@ def test_exudyns_ways_for_trees_agree_and_its_tree_of_vectors_gives_slides_the_l
     model = replace(model, **{name: 0 * getattr(model, name) for name in bare})
     truth, adapter = state_truth(model, states), load_adapter("exudyn-tree")
     variants = evaluate_variants(adapter, model, states)
-    rows = judge_variants(WHO, truth, Evaluation([], None, None, 0.0, variants=variants))
+    rows = rows_of_variants(truth, variants)
     wrong = {row.quantity for row in rows if row.verdict != Verdict.AGREES}
     assert wrong == {f"{name}_by_vectors" for name in (
         "acceleration", "angular_acceleration", "kinetic_energy", "mass_matrix",
@@ -139,7 +143,7 @@ def test_variants_of_flat_bodies_and_of_frames_turned_by_quarters_agree():
     states = random_states(model, 3, 1)
     truth = state_truth(model, states)
     variants = evaluate_variants(load_adapter("mujoco"), model, states)
-    rows = judge_variants(WHO, truth, Evaluation([], None, None, 0.0, variants=variants))
+    rows = rows_of_variants(truth, variants)
     assert {row.verdict for row in rows} == {Verdict.AGREES}, [row.reason for row in rows]
 
 
@@ -149,7 +153,7 @@ def test_a_variant_that_fails_or_is_wrong_is_named(tree):
     wrong = [replace(one, acceleration=one.acceleration * 1.001) for one in right]
     variants = {"option": {("a",): right, ("b", "c"): wrong, ("d",): NoAnswer("it crashed", False)}}
     variants["spelling"] = {("e",): NoAnswer("not so", True)}
-    rows = judge_variants(WHO, truth, Evaluation([], None, None, 0.0, variants=variants))
+    rows = rows_of_variants(truth, variants)
     bad = {row.quantity: row for row in rows if row.verdict != Verdict.AGREES}
     assert set(bad) == {"all_by_option", "acceleration_by_option", "all_by_spelling"} and len(rows) > 3
     failed, refused = bad["all_by_option"], bad["all_by_spelling"]
@@ -199,7 +203,7 @@ def test_calls_are_what_findings_are_about_whatever_quantities_they_get_wrong(tr
     wrong = [replace(one, acceleration=one.acceleration * 2, kinetic_energy=one.kinetic_energy * 2)
              for one in right]  # fmt: skip
     variants = {"option": {("a",): right, ("b", "c"): wrong}}
-    rows = judge_variants(WHO, truth, Evaluation([], None, None, 0.0, variants=variants))
+    rows = rows_of_variants(truth, variants)
     masses = dict.fromkeys((("e",), ("d",)), 2 * truth.surface["total_mass"].value)
     rows += judge_surface(WHO, truth, Evaluation([], None, None, 0.0, surface={"total_mass": masses}))
     found = find_findings(rows, {"s": model.n})
