@@ -84,12 +84,11 @@ def pytest_xdist_make_scheduler(config, log):
 def cache_folders(tmp_path_factory):
     """Caches, one for each test: tmp_path_factory would look through all of them to name another.
 
-    The tests of a session share the environments of engines, and what is remembered by its content: parsed
-    files and compiled integrators.
+    All tests share the environments of engines, and what is remembered by its content and the code that made
+    it: parsed files and compiled integrators.
     """
-    engines, base = user_cache_folder() / "engines", tmp_path_factory.getbasetemp()
-    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
-    for path in (engines, shared / "remembered"):
+    engines, remembered = user_cache_folder() / "engines", user_cache_folder() / "tests" / "remembered"
+    for path in (engines, remembered):
         path.mkdir(parents=True, exist_ok=True)
     caches = tmp_path_factory.mktemp("caches")
 
@@ -97,7 +96,7 @@ def cache_folders(tmp_path_factory):
         folder = caches / str(number)
         folder.mkdir()
         (folder / "engines").symlink_to(engines)
-        (folder / "remembered").symlink_to(shared / "remembered")
+        (folder / "remembered").symlink_to(remembered)
         return folder
 
     return map(make, itertools.count())
@@ -117,6 +116,12 @@ def own_cells(cache_folders, monkeypatch):
     folder = next(cache_folders)
     monkeypatch.setenv("PLUMBLINE_CACHE", str(folder))
     return folder / "cells"
+
+
+@pytest.fixture
+def nothing_remembered(own_cells):
+    """A test finds nothing that others have read, compiled or consented to."""
+    (own_cells.parent / "remembered").unlink()
 
 
 @pytest.hookimpl(wrapper=True)

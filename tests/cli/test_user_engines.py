@@ -46,6 +46,7 @@ def test_a_program_is_a_column_and_its_answers_are_kept_until_it_changes(tmp_pat
     assert third.exit_code == 1 and "disagree" in third.stdout, third.output
 
 
+@pytest.mark.usefixtures("nothing_remembered")
 def test_what_the_folder_names_is_started_only_with_consent_to_its_contents(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     marks = tmp_path / "started"

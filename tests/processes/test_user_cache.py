@@ -10,10 +10,7 @@ from plumbline.scenario import loader
 from plumbline.scenario.yaml_reader import read_yaml
 from plumbline.truth import taylor
 
-
-@pytest.fixture(autouse=True)
-def nothing_remembered(own_cells):
-    (own_cells.parent / "remembered").unlink()
+pytestmark = pytest.mark.usefixtures("nothing_remembered")
 
 
 def stored_files(own_cells):
