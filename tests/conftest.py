@@ -42,11 +42,14 @@ ALLOWED_SKIPS = {  # pattern of the skip's reason: why continuous integration ca
 }
 
 LONGEST_FIRST = (  # begun last, one of these would keep one process busy while the others have no work;
-    # dask_cluster and worker_pool mostly wait, so one begins when another ends
-    "report_browser", "dask_cluster", "adapter_contract", "exit_codes", "step_level", "worker_pool",
-    "certificate_proof", "nightly", "environments", "diagnose", "command_line", "planted_defects", "layers",
-    "misbehaving_engines", "relations", "proofs", "integrator_search", "result_cache", "proof_commands",
-    "tree_motion", "planted_joints", "sweep", "protocol", "scripts", "conformance", "isolation",
+    # dask_cluster, worker_pool, protocol and resume mostly wait, so one begins when another ends
+    "report_browser", "dask_cluster", "step_level", "adapter_contract", "exit_codes", "worker_pool",
+    "scenario_verdicts", "mechanisms", "certificate_proof", "planted_edits", "integrator_search", "protocol",
+    "every_step", "planted_defects", "diagnose", "command_line", "tree_motions", "resume", "planted_joints",
+    "wheel", "hostile_folder", "needs", "any_difference", "sweep", "smallest_detectable_mistake", "scripts",
+    "coverage_table", "honest_engines", "action", "conformance", "storage_faults", "layers",
+    "immovable_loops", "mechanism_of_file", "exudyn_engine", "selftest", "misbehaving_engines", "docs",
+    "definition", "nightly", "damaged_files", "environments", "relations",
 )  # fmt: skip
 LAST = ("matrix",)  # scenario by scenario it fills what is left
 
