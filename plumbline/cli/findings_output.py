@@ -138,8 +138,9 @@ def explain(
         ratio = "" if row.ratio is None else f"  {row.ratio:.3g} tolerances"
         yield f"  {row.style.glyph} {row.key}{ratio}"
     smallest = finding.rows[0]
-    yield ""
-    yield from wrap(f"In {smallest.scenario}: {smallest.reason}", width, "")
+    if smallest.reason != finding.sentence:
+        yield ""
+        yield from wrap(f"In {smallest.scenario}: {smallest.reason}", width, "")
     if smallest.diagnosis and smallest.diagnosis != finding.sentence:
         yield from wrap(smallest.diagnosis, width, "")
     yield ""
