@@ -276,12 +276,10 @@ def _vector_of(matrix: Array) -> Array:
     return np.array([matrix[2, 1], matrix[0, 2], matrix[1, 0]])
 
 
-@cache
-def pose_table(engine: str) -> Mapping[str, str]:
-    """By name of an engine's functions what each is given and returns."""
-    text = (ROOT / "adapters" / "surface" / "pose_functions.json").read_text(encoding="utf-8")
-    found: dict[str, dict[str, str]] = json.loads(text)
-    return found[engine]
+# By engine and name of its functions what each is given and returns.
+POSE_TABLES: Mapping[str, Mapping[str, str]] = json.loads(
+    (ROOT / "adapters" / "surface" / "pose_functions.json").read_text(encoding="utf-8")
+)
 
 
 def add_pose_answers(
@@ -299,25 +297,29 @@ def add_pose_answers(
 
     """
     for answer, state in zip(answers, states[:POSE_STATES], strict=False):
-        turns = rotation_matrix(state.p)
-        bodies = [_Body(state, k, turns[k] @ state.omega[k]) for k in range(len(state.p))]
+        bodies = cache(partial(_bodies, state))
         add_parts(
             answer,
-            *(partial(_add_pose_answer, answer, one, call, bodies) for one in pose_table(engine).items()),
+            *(partial(_add_pose_answer, answer, one, call, bodies) for one in POSE_TABLES[engine].items()),
         )
+
+
+def _bodies(state: State) -> list[_Body]:
+    turns = rotation_matrix(state.p)
+    return [_Body(state, k, turns[k] @ state.omega[k]) for k in range(len(state.p))]
 
 
 def _add_pose_answer(
     answer: dict[str, dict[Call, Array]],
     function: tuple[str, str],
     call: Callable[[str, Sequence[Any], Sequence[str]], Sequence[Any]],
-    bodies: Sequence[_Body],
+    bodies: Callable[[], Sequence[_Body]],
 ) -> None:
     """Call a function, whose name and forms are given, on all bodies."""
     rows: dict[str, list[Array]] = {}
     name, text = function
     given, _, returned = text.partition(" -> ")
-    for body in bodies:
+    for body in bodies():
         forms = returned.split()
         results = call(name, [body.given(one) for one in given.split()], forms)
         if forms[0].startswith("@"):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from contextvars import ContextVar
 from types import ModuleType
 
@@ -17,6 +17,8 @@ from plumbline.processes.isolation import EndedEarly, call_in_fork
 MISSING_NAMES, FAILED_PARTS = "missing names", "failed parts"
 # Whether each part has a process of its own, that a crash ends alone.
 IS_APART = ContextVar("IS_APART", default=False)
+# The labels of the parts that run; None: all of them do.
+WANTED_PARTS = ContextVar[Container[str] | None]("WANTED_PARTS", default=None)
 BASE_REQUIREMENTS = ("numpy", "scipy", "packaging", "pydantic")  # imported by adapters and core in workers
 # What every environment has: what is missing there is a mistake of this project or of the environment.
 OWN_PACKAGES = {"plumbline", "adapters", "reference_impl", *BASE_REQUIREMENTS, ""}
@@ -51,7 +53,10 @@ def add_parts(found: dict[str, dict[Call, Array]], *parts: Callable[[], object])
     `MemoryError` and `Unsupported` pass through.
 
     """
+    wanted = WANTED_PARTS.get()
     for part in parts:
+        if wanted is not None and _label(part) not in wanted:
+            continue
         try:
             if IS_APART.get():
                 found |= call_in_fork(lambda: _add_part(found, part))  # noqa: B023

@@ -68,6 +68,10 @@ def _receive_frame(stream: IO[bytes]) -> Any:
 @cache
 def _child_process(python: str) -> subprocess.Popen[bytes]:
     """The child of this process for an environment's interpreter, started at first use."""
+    return _new_child(python)
+
+
+def _new_child(python: str) -> subprocess.Popen[bytes]:
     environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
     folder = str(ROOT) if IS_INSTALLED else ""
     if not IS_INSTALLED:
@@ -95,12 +99,29 @@ def call_remote(python: str, function: Callable[..., Any], *arguments: Any) -> A
 
     """
     process = _child_process(python)
+    try:
+        return _ask(process, function, arguments)
+    except RemoteCrash:
+        _child_process.cache_clear()
+        raise
+
+
+def call_fresh(python: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    """Call a function in a new child, which has imported nothing yet; else as `call_remote`."""
+    process = _new_child(python)
+    try:
+        return _ask(process, function, arguments)
+    finally:
+        process.kill()
+        process.wait()
+
+
+def _ask(process: subprocess.Popen[bytes], function: Callable[..., Any], arguments: Any) -> Any:
     assert process.stdin is not None and process.stdout is not None
     try:
         _send_frame(process.stdin, (function.__module__, function.__qualname__, arguments))
         raised, value = _receive_frame(process.stdout)
     except (EOFError, BrokenPipeError):
-        _child_process.cache_clear()
         raise RemoteCrash(describe_exit(process.wait())) from None
     if raised:
         raise RemoteError(value) if value else MemoryError

@@ -16,6 +16,7 @@ from plumbline.measurements.state_relations import WELDED_HALVES
 from plumbline.model.datatypes import Integrator, Model, State, StateQuantities
 from plumbline.model.loops import determinate_projectors, wrench_length
 from plumbline.processes.remote_python import call_remote
+from plumbline.reproduce.surface_source import variant_named
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ class EngineClient:
         Args:
             state: a state on its constraint manifold.
             variant: name of the relation whose second answer is wanted ("by cholesky", "two welded
-                halves"); empty for the engine's usual answer.
+                halves"), or the names of one of the adapter's variants; empty for the engine's usual answer.
 
         Returns:
             The engine's quantities at that state.
@@ -95,6 +96,8 @@ def _set_to_variant(engine: str, variant: str) -> MetamorphicHooks:
     adapter = metamorphic_hooks(load_adapter(engine))
     if variant == WELDED_HALVES:
         return adapter.with_welded_halves()
+    if own := variant_named(adapter, variant):
+        return adapter.with_variant(own)
     return adapter.with_option({OPTION_PREFIX + x: x for x in adapter.ways}[variant]) if variant else adapter
 
 

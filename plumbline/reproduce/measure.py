@@ -20,6 +20,7 @@ from plumbline.engines.registry import load_adapter
 from plumbline.judging.invariant_drift import invariant_rows
 from plumbline.judging.refinement_analysis import RefinementAnalysis
 from plumbline.judging.rows import Row, RowContext, Verdict
+from plumbline.judging.state_level import VARIANT_QUANTITIES
 from plumbline.judging.trajectory_level import FINEST_RUN_SHOWN, trajectory_rows
 from plumbline.measurements.relation_result import OTHER_FORMULATIONS
 from plumbline.measurements.state_relations import (
@@ -35,9 +36,10 @@ from plumbline.model.step_methods import JointSpaceMethod, describe_method
 from plumbline.model.welding import split_bodies
 from plumbline.reproduce.engine_client import EngineClient
 from plumbline.reproduce.shrink import ReproductionCase, smallest_case
+from plumbline.reproduce.surface_source import surface_source, surface_value
 from plumbline.truth import TruthUnavailable
 from plumbline.truth.certified_state import certify_state
-from plumbline.truth.ground_truth import MotionTruth, motion_truth
+from plumbline.truth.ground_truth import MotionTruth, motion_truth, state_truth
 from plumbline.truth.rounding_bound import state_rounding_bound
 from plumbline.truth.step_comparison import FormulaSteps
 
@@ -82,6 +84,18 @@ class StateEvidence(Evidence):
 
 
 @dataclass(frozen=True, eq=False)
+class SurfaceEvidence(Evidence):
+    """A state at which one call of an engine is wrong about a quantity of the surface."""
+
+    call: str = field(kw_only=True)  # its names, or those of a variant
+
+    def written(self, engine: EngineClient) -> dict[str, Any]:
+        """Write what the adapter does for the quantity."""
+        (quantity,), case = self.expected, self.case
+        return {"source": engine.call(surface_source, case.model, case.state, quantity, self.call)}
+
+
+@dataclass(frozen=True, eq=False)
 class StepEvidence(Evidence):
     """A few steps that are not those of the declared formula."""
 
@@ -114,6 +128,7 @@ class Disagreement:
     case: ReproductionCase
     ratio: float  # the largest ratio of the rows
     seconds: float  # for shrinking [s]
+    call: str = ""  # of a row of the surface, the names of what is wrong
 
     def measure(self, case: ReproductionCase) -> Evidence | None:
         """Measure by how much a case shows this disagreement.
@@ -128,6 +143,8 @@ class Disagreement:
     def _measure(self) -> Callable[[ReproductionCase], Evidence | None]:
         if self.level == "state":
             return StateMeasure(self.engine, self.quantities)
+        if self.level == "surface":
+            return SurfaceMeasure(self.engine, self.quantities[0], self.call)
         if self.level == "relations":
             return RelationMeasure(self.engine, self.quantities[0])
         if self.level == "step":
@@ -200,6 +217,33 @@ class StateMeasure:
         bound = {q: np.asarray(allowed.tolerance(q), float) + uncertain.get(q, 0.0) for q in offered}
         ratio = _largest_ratio(found, right, bound)
         return StateEvidence(case, ratio, self.engine.name, right, bound, certified, variant=self.variant)
+
+
+@dataclass(frozen=True)
+class SurfaceMeasure:
+    """Error of what one call of an engine says of a quantity of the surface, over its bound."""
+
+    engine: EngineClient
+    quantity: str
+    call: str  # its names, or those of a variant
+
+    def __call__(self, case: ReproductionCase) -> SurfaceEvidence | None:
+        """Measure a case; None where the engine, the truth or the bound refuses it."""
+        model, state, name = case.model, case.state, self.quantity
+        if usual := VARIANT_QUANTITIES.get(name):
+            evidence = StateMeasure(self.engine, (usual,), self.call)(case)
+            if evidence is None or not evidence.expected:
+                return None
+            right, bound, ratio = evidence.expected[usual], evidence.bound[usual], evidence.ratio
+        else:
+            try:
+                value = self.engine.call(surface_value, model, state, name, self.call)
+                truth = state_truth(model, [state]).surface[name]
+                right, bound = truth.value[0], truth.tolerance[0]
+                ratio = _largest_ratio({name: value}, {name: right}, {name: bound})
+            except Exception:
+                return None
+        return SurfaceEvidence(case, ratio, self.engine.name, {name: right}, {name: bound}, call=self.call)
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,9 @@ from plumbline.reproduce.measure import (
     MotionEvidence,
     StateEvidence,
     StepEvidence,
+    SurfaceEvidence,
 )
+from plumbline.reproduce.surface_source import given
 from plumbline.truth.step_comparison import CONSTRAINED_QUANTITIES, RUN_QUANTITIES
 
 TEMPLATES = Path(__file__).parent / "templates"
@@ -111,7 +113,7 @@ def render_script(row: dict[str, Any], evidence: Evidence, system: dict[str, Any
     context = {
         "system": system,
         "comments": FIELD_COMMENTS,
-        "fields": {**vars(model), "r": state.r, "p": state.p, **system["fields"]},
+        "fields": {**vars(model), "r": state.r, "p": state.p, **system.get("fields", {})},
         "row": row,
         "evidence": evidence,
         "shows": shows,  # the template of what is compared
@@ -125,6 +127,11 @@ def render_script(row: dict[str, Any], evidence: Evidence, system: dict[str, Any
         "margin": ORDER_MARGIN,
         "older": lambda than: version < Version(than),
     }
+    if isinstance(evidence, SurfaceEvidence):
+        source = system["source"]
+        context["source"] = source
+        context["given"] = [("model", source.model, given(model)), ("state", source.state, given(state))]
+        return template_environment().get_template("surface.py.j2").render(context)
     return _space_functions(_template(evidence.engine).render(context))
 
 
@@ -162,8 +169,6 @@ def no_script_reason(engine: str, row: dict[str, Any]) -> str:
     for name in (engine, other or engine):
         if not declared_attribute(name, "reproduction_template"):
             return f"engine {name} has no template of scripts"
-    if row["level"] == "surface":
-        return "rows of the surface have no script: their reason names the call that is wrong"
     if row["level"] == "step" and row["quantity"] in CONSTRAINED_QUANTITIES:
         return "rows of single steps with constraints have no script"
     if row["level"] == "step" and row["quantity"] in RUN_QUANTITIES:
@@ -182,7 +187,9 @@ def no_script_reason(engine: str, row: dict[str, Any]) -> str:
     return "" if is_known else f"scripts of {engine} cannot show {relation!r}"
 
 
-_KINDS: dict[type, str] = {StateEvidence: "state", MotionEvidence: "motion", StepEvidence: "step"}
+_KINDS: dict[type, str] = {
+    StateEvidence: "state", MotionEvidence: "motion", StepEvidence: "step", SurfaceEvidence: "surface",
+}  # fmt: skip
 
 
 def _template(engine: str) -> Template:

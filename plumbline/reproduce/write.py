@@ -15,7 +15,7 @@ import numpy as np
 
 from plumbline.engines import environments
 from plumbline.judging.known_issues import project_known_issues
-from plumbline.judging.rows import Verdict
+from plumbline.judging.rows import WRONG_CALL, Verdict
 from plumbline.measurements.order_and_limit import STEP_EXPONENTS
 from plumbline.model.datatypes import BadInput, Model, State, Unsupported
 from plumbline.model.invariants import LONG_RUN_QUANTITIES
@@ -224,7 +224,8 @@ def find_disagreement(document: dict[str, Any], rows: list[StoredRow], seconds: 
             h = float(row["extra"]["step"])
             case = replace(case, until=h * row["extra"]["steps"], steps=(h,))
     quantities = tuple(row["quantity"] for row in rows)
-    return Disagreement(engine, row["level"], quantities, row["integrator"], case, ratio, seconds)
+    call = row["extra"].get(WRONG_CALL, "")
+    return Disagreement(engine, row["level"], quantities, row["integrator"], case, ratio, seconds, call)
 
 
 def _disagreements(document: dict[str, Any]) -> list[StoredRow]:
@@ -279,8 +280,8 @@ def _largest_printed_ratio(printed: str) -> float:
 
 
 def _cell(row: StoredRow) -> tuple[str, ...]:
-    """Return what rows share a script: scenario, engine, level and integrator, or relation."""
-    relation = (row["quantity"],) if row["level"] == "relations" else ()
+    """Return what rows share a script: scenario, engine, level and integrator, or one relation or call."""
+    relation = (row["quantity"],) if row["level"] in ("relations", "surface") else ()
     if row["quantity"] in LONG_RUN_QUANTITIES:
         relation = ("long run",)
     return row["scenario"], row["engine"], row["level"], row["integrator"], *relation
