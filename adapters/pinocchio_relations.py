@@ -158,7 +158,7 @@ def _add_momenta(s: Probed) -> None:
         ("", (by, "Data.dFda"), pin.Force(of_rate @ v)),
         ("", ("crba", "Data.Fcrb"),
          sum((_root_momentum(s, composite, j) for j in roots), pin.Force.Zero())),
-        ("_rate", (by, "Data.of"), derived.of[0]),
+        ("_rate_by_derivative", (by, "Data.of"), derived.of[0]),
         ("_rate_by_derivative", (by, "Data.dFdv"), rate),
         ("_rate_by_derivative", (by, "Data.dHdq"), turned),
     ):  # fmt: skip

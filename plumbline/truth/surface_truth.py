@@ -11,6 +11,7 @@ in `Rounded` vectors, which carry with each value a bound of what an engine's ro
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -81,7 +82,7 @@ class Motion:
         A = self.attitude = rotation_matrix(state.p)
         self.mass, self.inertia = model.mass, np.asarray(model.inertia)
         self.inertia_norm = norm(self.inertia, axis=(1, 2))
-        self.exact = np.zeros(model.n)
+        self.exact = self.spin_roundings = np.zeros(model.n)
         spin = rotate_vectors(A, state.omega)
         scale = bound.scale
 
@@ -139,7 +140,16 @@ class Motion:
 
     def spin_momentum_rate(self) -> Rounded:
         """A (J ω̇′ + ω′ × J ω′) of each body."""
-        return self._of_inertia(self.alpha).plus(self.w.cross(self.spin_momentum()))
+        rate = self._of_inertia(self.alpha).plus(self.w.cross(self.spin_momentum()))
+        return rate._replace(size=rate.size + self.spin_roundings)
+
+    def through_origin(self) -> Motion:
+        """The same for algorithms by spatial vectors at the world's origin, whose terms cancel."""
+        other, far = copy(self), np.linalg.norm(self.r.value, axis=-1)
+        swing = far * (self.w.size**2 + np.linalg.norm(self.alpha.value, axis=-1))
+        other.a = self.a._replace(size=self.a.size + swing)
+        other.spin_roundings = self.mass * far * swing
+        return other
 
     def _of_inertia(self, vectors: Rounded) -> Rounded:
         turned = self.attitude @ self.inertia @ self.attitude.mT
@@ -407,9 +417,18 @@ _BY_ALGORITHM = {
         "inverse_dynamics", "momentum_through_inverse", "frame_acceleration", "frame_angular_acceleration",
     ),
 }  # fmt: skip
+_THROUGH_ORIGIN = ("by_derivative", "by_map_rate", "by_coriolis_matrix")  # but for those of frames
+
+
+def _by_algorithm(name: str, by: str) -> tuple[str, Callable[[Motion], Rounded]]:
+    unit, formula = _FORMULAS[name]
+    is_moved = by in _THROUGH_ORIGIN and not name.startswith("frame_")
+    return unit, (lambda m: formula(m.through_origin())) if is_moved else formula
+
+
 SURFACE_QUANTITIES: Mapping[str, tuple[str, Callable[[Motion], Rounded]]] = {
     **_FORMULAS,
-    **{f"{name}_{by}": _FORMULAS[name] for by, names in _BY_ALGORITHM.items() for name in names},
+    **{f"{name}_{by}": _by_algorithm(name, by) for by, names in _BY_ALGORITHM.items() for name in names},
 }
 
 
