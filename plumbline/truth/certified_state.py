@@ -93,6 +93,8 @@ def certify_state(
     )
     if model.has_loops:
         found = determinate_part(model, state, found)
+        if not model.has_joint_moments:  # as of trees
+            found = replace(found, joint_moment=None)
     elif mass_matrix:
         found = replace(found, mass_matrix=middle["mass_matrix"])
     return CertifiedQuantities(found, radius, bits)
