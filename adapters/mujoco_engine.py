@@ -124,7 +124,8 @@ MAX_IMPEDANCE = 0.9999  # of soft constraints: the largest that MuJoCo accepts
 # of MuJoCo's own R, which is made for the tree at its reference pose: the largest (the next where answers are
 # not yet linear in it), how they fall, and how many
 LARGEST_REGULARISATIONS, RATIO, REGULARISATIONS = (0.027, 2.7e-4, 2.7e-6), 3.0, 4
-SEQUENCES = (1.0, 1.3, 1.7, 1.15, 1.5)  # of them: factors of the largest; three are compared
+# Of them: factors of the largest.  Three are compared, of options all: iterative solvers err alike in some.
+SEQUENCES = (1.0, 1.3, 1.7, 1.15, 1.5)
 # Of motions: the error of smaller ones is rounding, and as 1/R what steps leave of gaps in dependent rows.
 LARGEST_RUN_REGULARISATION, RUN_REGULARISATIONS = 2.7e-4, 3
 # Of welds: MuJoCo divides by the impedance and by its square, and multiplies the stiffness by it again.
@@ -727,12 +728,12 @@ def _rigid_limit(soft: _SoftMechanism, state: State) -> StateQuantities:
     """Evaluate at falling regularisations R, check order 1, and extrapolate to none.
 
     Rounding of the forces grows with 1/R.  The limit's uncertainty, by rounding and by what is left of R, is
-    three times the largest difference between the extrapolations of three sequences.
+    three times the largest difference between the extrapolations of several sequences.
     """
     there = soft.state(state)
     for largest in LARGEST_REGULARISATIONS:
         try:
-            limits = _three_limits(soft, state, there, largest)
+            limits = _limits(soft, state, there, largest)
             break
         except EngineFailure:
             if largest == LARGEST_REGULARISATIONS[-1]:
@@ -754,19 +755,22 @@ def _usable_regularisation(soft: _SoftMechanism, state: State, there: State) -> 
     raise Unsupported("no regularisation of MuJoCo's constraints can be extrapolated from")
 
 
-def _three_limits(soft: _SoftMechanism, state: State, there: State, largest: float) -> list[dict[str, Array]]:
-    """Extrapolate three sequences: rounding can spoil one, and is another in the next."""
+def _limits(soft: _SoftMechanism, state: State, there: State, largest: float) -> list[dict[str, Array]]:
+    """Extrapolate three sequences or more: rounding can spoil one, and is another in the next."""
     found, refusals = list[dict[str, Array]](), list[Unsupported | EngineFailure]()
     # An option's solver may lose digits in one sequence; of MuJoCo's own way a wrong order is a failure.
-    lost = Unsupported if soft.tree.change == Change() else (Unsupported, EngineFailure)
+    is_usual = soft.tree.change == Change()
+    lost = Unsupported if is_usual else (Unsupported, EngineFailure)
     for factor in SEQUENCES:
         try:
             found.append(_extrapolated(soft, state, there, factor * largest))
         except lost as refusal:
             refusals.append(refusal)
-        if len(found) == 3:
-            return found
-    raise refusals[0]
+        if is_usual and len(found) == 3:
+            break
+    if len(found) < 3:
+        raise refusals[0]
+    return found
 
 
 def _largest_norm(difference: Array) -> float:
