@@ -14,7 +14,7 @@ from plumbline.engines.surface import (
     exercised_rows,
     installed_names,
 )
-from plumbline.engines.surface_page import surface_pages
+from plumbline.studies.surface_page import surface_pages
 from plumbline.execution.runner import compare_surfaces
 from plumbline.model.datatypes import EngineFailure
 from plumbline.processes.worker_pool import WorkerPool
@@ -74,7 +74,7 @@ def test_a_wrong_declaration_is_refused(places, message, tmp_path, monkeypatch):
 @pytest.mark.parametrize("path", sorted(surface_pages()))
 def test_the_pages_are_up_to_date(path):
     written = (ROOT / "docs" / path).read_text(encoding="utf-8")
-    assert written == surface_pages()[path], "run: python -m plumbline.engines.surface_page"
+    assert written == surface_pages()[path], "run: python -m plumbline.studies.surface_page"
 
 
 @pytest.mark.parametrize("engine", SURFACES)

@@ -1,6 +1,6 @@
 """The tables of docs/surface.md and docs/surface/ENGINE.md, written from the files of adapters/surface.
 
-python -m plumbline.engines.surface_page
+python -m plumbline.studies.surface_page
 """
 
 from __future__ import annotations
