@@ -359,7 +359,12 @@ class _Entry(_Selector):
     since: str = _field("The first version that shows it, as '4.1.0' or '3.3.1 or earlier'.", "")
     evidence: str = _field("A measurement, a script, a document.")
     reason: str = _field("The cause.")
-    rows: list[_Selector] = _field("Rows that it covers; none: those of the entry's own patterns.", [])
+    script: str = _field("A file of docs/surface that shows it.", "")
+    rows: list[_Selector] | None = _field(
+        "Rows that it covers, by default those of the entry's own patterns; an empty list: none, because the "
+        "adapter goes around it.",
+        None,
+    )
 
     @field_validator("id")
     @classmethod
@@ -398,23 +403,33 @@ class _Entry(_Selector):
 
     @model_validator(mode="after")
     def _check_rows(self) -> _Entry:
-        for selector in self.rows or [self]:
+        for selector in self._selectors:
             cause = self.cause.kind if self.cause else "unexplained" if self.needs is not None else ""
             selector.check(self.engine, self.mechanism, cause)
         return self
 
+    @property
+    def _selectors(self) -> Sequence[_Selector]:
+        return [self] if self.rows is None else self.rows
+
+    @property
+    def is_wrong(self) -> bool:
+        """Whether the engine is wrong, in rows that disagree or where no row shows it."""
+        return not self._selectors or any(one.verdict == "disagrees" for one in self._selectors)
+
     def every_issue(self) -> Iterator[KnownIssue]:
         """Make the issues of all rows."""
         common = {
-            name: getattr(self, name) for name in _Entry.model_fields.keys() - {"rows", "cause", "needs"}
+            name: getattr(self, name)
+            for name in _Entry.model_fields.keys() - {"rows", "cause", "needs", "script"}
         }
         cause = {} if self.cause is None else self.cause.model_dump()
         common["cause"] = {name: value for name, value in cause.items() if value}
         common["needs"] = None if self.needs is None else tuple(self.needs)
         common["entry"] = self.id
-        for number, selector in enumerate(self.rows, 1):
+        for number, selector in enumerate(self.rows or (), 1):
             yield from selector.issues(f"{self.id} ({number})", common)
-        if not self.rows:
+        if self.rows is None:
             yield from _Selector.issues(self, self.id, common)
 
 
@@ -437,6 +452,12 @@ def load_known_issues(
         ScenarioError: the file is not valid; its problems have file, line and column.
 
     """
+    return [issue for entry in _load_entries(path, other_scenarios, places) for issue in entry.every_issue()]
+
+
+def _load_entries(
+    path: Path, other_scenarios: Iterable[str] = (), places: dict[str, str] | None = None
+) -> list[_Entry]:
     try:
         source = read_yaml(path)
     except ScenarioError as error:
@@ -458,7 +479,28 @@ def load_known_issues(
     problems += _name_problems(source, entries, {*other_scenarios, *beside})
     if problems:
         raise ScenarioError(problems)
-    return [issue for entry in entries for issue in entry.every_issue()]
+    return entries
+
+
+@dataclass(frozen=True)
+class RecordedMistake:
+    """What the project's file says of a mistake of an engine."""
+
+    name: str  # id of the entry
+    engine: str  # name or pattern of columns
+    since: str
+    versions: str
+    reason: str
+    script: str  # file of docs/surface; empty: none
+
+
+def recorded_mistakes() -> list[RecordedMistake]:
+    """Read the engines' mistakes that the project's own file records, those that no row shows included."""
+    return [
+        RecordedMistake(one.id, one.engine, one.since, one.versions, one.reason, one.script)
+        for one in _load_entries(KNOWN_ISSUES_FILE)
+        if one.is_wrong
+    ]
 
 
 @cache
@@ -503,7 +545,7 @@ def _name_problems(source: YamlSource, entries: Sequence[_Entry], others: set[st
     }
     for number, entry in enumerate(entries):
         places: list[tuple[tuple[PathKey, ...], _Selector]] = [((number,), entry)]
-        places += [((number, "rows", i), selector) for i, selector in enumerate(entry.rows)]
+        places += [((number, "rows", i), selector) for i, selector in enumerate(entry.rows or ())]
         for (at, selector), (name, words) in product(places, known.items()):
             given = getattr(selector, name)
             for place, pattern in enumerate(given if isinstance(given, list) else [given]):

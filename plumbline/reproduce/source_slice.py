@@ -108,9 +108,9 @@ class _Module:
         return (self.starts[node.lineno - 1] + node.col_offset,
                 self.starts[node.end_lineno - 1] + node.end_col_offset)  # fmt: skip
 
-    def is_executed(self, node: ast.AST) -> bool:
+    def is_executed(self, node: Any) -> bool:
         """Whether a line of a statement, or of the body of a function, was executed."""
-        parts = node.body if isinstance(node, ast.FunctionDef | ast.ClassDef) else [node]
+        parts: list[Any] = node.body if isinstance(node, ast.FunctionDef | ast.ClassDef) else [node]
         return any(line in self.lines for x in parts for line in range(x.lineno, x.end_lineno + 1))
 
 
@@ -340,10 +340,10 @@ class _Cut:
         if isinstance(node, ast.AnnAssign):
             self._drop_annotation(node)
         if isinstance(node, ast.Call) and _is_generic(node.func):  # dict[str, Any]()
-            _, start = self._module.span(node.func.value)
-            self._edits.append((start, self._module.span(node.func)[1], ""))
+            generic: Any = node.func
+            self._edits.append((self._module.span(generic.value)[1], self._module.span(generic)[1], ""))
         if isinstance(node, ast.ClassDef):
-            named = [x for x in node.body if self._is_only_named(x)]
+            named: list[Any] = [x for x in node.body if self._is_only_named(x)]
             for method in named:
                 self._edits.append((*self._module.span(method), f"{method.name} = not_called"))
             self._removed.update(map(id, named))

@@ -43,8 +43,8 @@ class _AllParts:
     def __init__(self) -> None:
         self.labels: dict[str, None] = {}
 
-    def __contains__(self, label: str) -> bool:
-        self.labels[label] = None
+    def __contains__(self, label: object) -> bool:
+        self.labels[str(label)] = None
         return True
 
 
@@ -105,8 +105,10 @@ def given(one: Model | State) -> dict[str, Any]:
     return {name: x for name, x in fields.items() if np.size(x)}
 
 
-def _value_of_given(engine: str, model: dict[str, Any], state: dict[str, Any], *more: Any) -> Array:
-    return surface_value(engine, Model(**model), State(**state), *more)
+def _value_of_given(
+    engine: str, model: dict[str, Any], state: dict[str, Any], quantity: str, call: str, parts: list[str]
+) -> Array:
+    return surface_value(engine, Model(**model), State(**state), quantity, call, parts)
 
 
 def _evaluation(model: Model) -> str:
@@ -118,9 +120,9 @@ def _state_quantity(quantity: str) -> str:
     return quantity.partition("_by_")[0]
 
 
-def _needed_parts(*given: Any) -> list[str]:
+def _needed_parts(engine: str, model: Model, state: State, quantity: str, call: str) -> list[str]:
     """The labels of few parts that a value needs, found by leaving out halves, quarters and so on."""
-    every, value = _AllParts(), partial(surface_value, *given)
+    every, value = _AllParts(), partial(surface_value, engine, model, state, quantity, call)
     value(every)
     left, size = [*every.labels], len(every.labels)
     while size:

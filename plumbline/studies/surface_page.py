@@ -5,6 +5,7 @@ python -m plumbline.studies.surface_page
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 
 from plumbline.engines.surface import (
@@ -19,6 +20,7 @@ from plumbline.engines.surface import (
     declared_surface,
     exercised_rows,
 )
+from plumbline.judging.known_issues import recorded_mistakes
 from plumbline.layout import ROOT, generated_page
 
 _TITLES = {COMPARED: "Compared", NOT_YET: "Not compared yet", OUTSIDE_STATUS: "Outside"}
@@ -47,7 +49,16 @@ def _engine_tables(surface: Surface) -> Iterator[str]:
     places: dict[str, list[SurfaceName]] = {}
     for one in surface.names:
         places.setdefault(one.place, []).append(one)
-    yield f"## Places\n\nThe names are those of version {surface.version}.\n"
+    yield "## Wrong so far\n"
+    for wrong in recorded_mistakes():
+        if wrong.engine.partition("-")[0] == surface.engine:
+            script = f" ([script]({wrong.script}))" if wrong.script else ""
+            since = f", since {wrong.since}" if wrong.since else ""
+            text = f"- {wrong.name}: {wrong.reason} Versions {wrong.versions}{since}{script}."
+            yield textwrap.fill(
+                text, 110, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False
+            )
+    yield f"\n## Places\n\nThe names are those of version {surface.version}.\n"
     yield "| names | compared | not yet | outside | not about motion |\n|---|---|---|---|---|"
     for place, names in places.items():
         counts = [sum(one.status == status for one in names) for status in

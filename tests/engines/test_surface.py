@@ -14,10 +14,11 @@ from plumbline.engines.surface import (
     exercised_rows,
     installed_names,
 )
-from plumbline.studies.surface_page import surface_pages
 from plumbline.execution.runner import compare_surfaces
+from plumbline.judging.known_issues import recorded_mistakes
 from plumbline.model.datatypes import EngineFailure
 from plumbline.processes.worker_pool import WorkerPool
+from plumbline.studies.surface_page import surface_pages
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -75,6 +76,11 @@ def test_a_wrong_declaration_is_refused(places, message, tmp_path, monkeypatch):
 def test_the_pages_are_up_to_date(path):
     written = (ROOT / "docs" / path).read_text(encoding="utf-8")
     assert written == surface_pages()[path], "run: python -m plumbline.studies.surface_page"
+
+
+def test_the_scripts_of_mistakes_are_those_that_are_recorded():
+    written = {path.name for path in (ROOT / "docs" / "surface").glob("*.py")}
+    assert written == {one.script for one in recorded_mistakes() if one.script}
 
 
 @pytest.mark.parametrize("engine", SURFACES)

@@ -153,10 +153,11 @@ def defective(lines: str):
     """The engines' modules after these lines; as they were afterwards."""
     import exudyn
     import exudyn.itemInterface
+    import exudyn.rigidBodyUtilities
     import mujoco
     import pinocchio
 
-    places = (exudyn, exudyn.itemInterface, mujoco, pinocchio)
+    places = (exudyn, exudyn.itemInterface, exudyn.rigidBodyUtilities, mujoco, pinocchio)
     before = [dict(vars(place)) for place in places]
     try:
         exec(lines, {})

@@ -130,6 +130,64 @@ def test_a_defect_in_an_engine_is_shown_by_its_script(engine, level, integrator,
     assert max(execute(script)[0]) < 1, "without the defect all is right"
 
 
+FAST_SITES = """import mujoco
+real = mujoco.mj_objectVelocity
+def fast(m, d, kind, number, found, is_local):
+    real(m, d, kind, number, found, is_local)
+    found[3:] *= 1.0001
+mujoco.mj_objectVelocity = fast
+"""
+HEAVY_REGRESSOR = """import pinocchio
+real = pinocchio.computeJointTorqueRegressor
+pinocchio.computeJointTorqueRegressor = lambda *all: 1.0001 * real(*all)
+"""
+LONG_LINKS = """import exudyn.rigidBodyUtilities as utilities
+real = utilities.HTtranslateZ
+utilities.HTtranslateZ = lambda z: real(1.0001 * z)
+"""
+HEAVY_STEP = """import mujoco
+real = mujoco.mj_step2
+def heavy(m, d):
+    d.qfrc_applied += 1e-3
+    real(m, d)
+mujoco.mj_step2 = heavy
+"""
+SURFACE_DEFECTS = [  # engine, scenario, quantity, call, the defect; none: one of the engine itself, on record
+    ("mujoco", "furuta", "frame_velocity", "mj_objectVelocity, mjtObj.mjOBJ_SITE", FAST_SITES),
+    ("pinocchio", "furuta", "inverse_dynamics",
+     "computeJointTorqueRegressor, Data.jointTorqueRegressor", HEAVY_REGRESSOR),
+    ("exudyn", "furuta", "body_position", "rigidBodyUtilities.HTtranslateZ", LONG_LINKS),
+    ("pinocchio", "universal-pendulum", "frame_acceleration_by_jacobian_rate",
+     "frameJacobianTimeVariation, ReferenceFrame.LOCAL_WORLD_ALIGNED", ""),
+    ("exudyn-tree", "light-cart-pole", "mass_matrix_by_vectors",
+     "kinematicTree.KinematicTree33, kinematicTree.JointTransformMotionSubspace", ""),
+    pytest.param("mujoco", "furuta", "acceleration_by_option", "mj_step2", HEAVY_STEP, marks=FULL),
+    pytest.param("exudyn", "furuta", "body_velocity_by_tangent_operator", "lieGroupBasics.TExpSE3", "",
+                 marks=FULL),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("engine", "scenario", "quantity", "call", "lines"),
+    SURFACE_DEFECTS,
+    ids=lambda value: "" if "\n" in value else value,
+)
+def test_a_defect_of_the_surface_is_shown_by_the_source_of_its_adapter(
+    engine, scenario, quantity, call, lines, tmp_path
+):
+    """The script is run in a process of its own; without a planted defect the same script finds nothing."""
+    s = load_scenario(find_scenario_file(scenario))
+    case = ReproductionCase(s.model, s.state)
+    found = disagreement(engine, (quantity,), case, level="surface", call=call, seconds=0.0)
+    with defective(lines):
+        script, reason = make_script(found, stored_row(engine, level="surface"))
+    assert script, reason
+    assert not re.search("^(import|from) (plumbline|adapters|reference_impl)", script, re.M)
+    assert max(run_alone(script, tmp_path, before=lines)) > 1
+    if lines:
+        assert max(execute(script)[0]) < 1
+
+
 # --- shrinking ------------------------------------------------------------------------------------------
 
 

@@ -66,7 +66,7 @@ def test_every_template_renders_to_what_ruff_accepts(engine, tmp_path):
 
 
 def test_every_template_is_used():
-    frame = {"script", "state", "step", "motion", "invariants", "exudyn-common", "model-file"}
+    frame = {"script", "state", "step", "motion", "invariants", "exudyn-common", "model-file", "surface"}
     names = {path.name.removesuffix(".py.j2") for path in TEMPLATES.iterdir()} - frame
     assert names == {
         name for name in REGISTERED if not no_script_reason(name, {"level": "state", "quantity": "energy"})
