@@ -18,7 +18,7 @@ from plumbline.engines.adapter import Adapter
 from plumbline.engines.missing_names import WANTED_PARTS
 from plumbline.engines.registry import load_adapter
 from plumbline.engines.variants import Variant
-from plumbline.model.datatypes import Array, Model, State
+from plumbline.model.datatypes import Array, Float, Model, State
 from plumbline.processes.remote_python import call_fresh
 from plumbline.reproduce.source_slice import SourceSlice, executed_lines
 
@@ -55,7 +55,7 @@ def variant_named(adapter: Adapter, names: str) -> Variant | None:
 
 def surface_value(
     engine: str, model: Model, state: State, quantity: str, call: str, parts: Container[str] | None = None
-) -> Array:
+) -> Float[Array, "..."]:
     """Return what a call says of a quantity at a state.
 
     Args:
