@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib import metadata
 from io import StringIO
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from plumbline.engines.adapter import Adapter, EngineInfo
 from plumbline.engines.environments import declared_attribute
 from plumbline.engines.missing_names import FAILED_PARTS, IS_APART, MISSING_NAMES, OWN_PACKAGES
 from plumbline.engines.registry import load_adapter
-from plumbline.engines.variants import NoAnswer, Variant, VariantKind
+from plumbline.engines.variants import NoAnswer, VariantKind
 from plumbline.model.datatypes import (
     Array,
     Call,
@@ -37,6 +38,7 @@ from plumbline.model.datatypes import (
 from plumbline.processes.exceptions import describe_exception
 from plumbline.processes.isolation import EndedEarly, call_in_fork
 
+T = TypeVar("T")
 BESIDES = ("surface", "variants")  # what an engine is asked for after the state quantities
 APART = "apart"  # the same, each part and variant in a process of its own
 SURFACE_STATES = 8  # of a scenario, at which what engines report besides the state quantities is compared
@@ -141,10 +143,27 @@ def describe_missing(name: str, error: ModuleNotFoundError | AttributeError, sub
     return EngineInfo(name, name, version, (), f"the {subject} cannot use version {version}: {error}")
 
 
+def attempt(call: Callable[..., T], *arguments: Any) -> T | NoAnswer:
+    """Call an engine; what it raises, which may be anything, becomes a reason for the results.
+
+    Raises:
+        MemoryError: the worker reached its memory limit, which the pool reports.
+
+    """
+    try:
+        return call(*arguments)
+    except Unsupported as refusal:
+        return NoAnswer(describe_exception(refusal), True, refusal.gap, refusal.missing)
+    except MemoryError:
+        raise
+    except Exception as error:
+        return NoAnswer(describe_exception(error), is_refusal=False)
+
+
 def evaluate_states(
     engine: str, model: Model, states: Sequence[State], besides: Sequence[str] = BESIDES
 ) -> Evaluation:
-    """Evaluate the state quantities of one engine; what the engine raises becomes a reason.
+    """Evaluate the state quantities of one engine; errors are those of `attempt`.
 
     Args:
         besides: which of `BESIDES` to ask for, too, and `APART` where an engine has crashed by them.
@@ -152,42 +171,39 @@ def evaluate_states(
     Returns:
         The quantities at each state, or the reason why there are none.
 
-    Raises:
-        MemoryError: the worker reached its memory limit, which the pool reports.
-
     """
     begin = time.process_time()
-    quantities: list[StateQuantities] = []
-    unsupported, failure, gap, declared = None, None, "", tuple[str, ...]()
-    try:
-        adapter = load_adapter(engine)
-        declared = (*adapter.unsupported, *adapter.gaps)
-        quantities = adapter.evaluate(model, states)
-        for name in adapter.unsupported:
-            if any(getattr(answer, name, None) is not None for answer in quantities):
-                failure = f"{engine} returns the {name} that its adapter declares as unsupported"
-    except Unsupported as refusal:
-        unsupported, gap = describe_exception(refusal), refusal.gap
-    except MemoryError:
-        raise
-    except Exception as error:  # an engine may raise anything: its message belongs in the results
-        failure = describe_exception(error)
+    adapter = attempt(load_adapter, engine)
+    if isinstance(adapter, NoAnswer):
+        return _no_evaluation(adapter, begin, ())
+    declared = (*adapter.unsupported, *adapter.gaps)
+    found = attempt(adapter.evaluate, model, states)
+    if isinstance(found, NoAnswer):
+        return _no_evaluation(found, begin, declared)
+    surplus = [name for name in adapter.unsupported for one in found if getattr(one, name, None) is not None]
     surface, surface_failure = dict[str, dict[Call, Array]](), ""
     variants: dict[VariantKind, dict[Call, list[StateQuantities] | NoAnswer]] = {}
     IS_APART.set(APART in besides)
-    if quantities and not failure and "surface" in besides:
-        try:
-            surface = stack_answers(adapter.surface(model, states[:SURFACE_STATES]))
-        except Unsupported as refusal:  # the adapter offers nothing of the mechanism, or lacks a name
-            surface = {MISSING_NAMES: {(refusal.missing,): np.zeros((1, 1, 1))}} if refusal.missing else {}
-        except MemoryError:
-            raise
-        except Exception as error:  # as above
-            surface_failure = describe_exception(error)
-    if quantities and not failure and "variants" in besides:
+    if found and not surplus and "surface" in besides:
+        stacked = attempt(lambda: stack_answers(adapter.surface(model, states[:SURFACE_STATES])))
+        if not isinstance(stacked, NoAnswer):
+            surface = stacked
+        elif not stacked.is_refusal:
+            surface_failure = stacked.message
+        elif stacked.missing:  # else the adapter offers nothing of the mechanism
+            surface = {MISSING_NAMES: {(stacked.missing,): np.zeros((1, 1, 1))}}
+    if found and not surplus and "variants" in besides:
         variants = evaluate_variants(adapter, model, states[:SURFACE_STATES])
-    cpu_time, more = time.process_time() - begin, (surface, surface_failure, variants)
-    return Evaluation(quantities, unsupported, failure, cpu_time, gap, declared, *more)
+    failure = (
+        f"{engine} returns the {surplus[-1]} that its adapter declares as unsupported" if surplus else None
+    )
+    cpu_time = time.process_time() - begin
+    return Evaluation(found, None, failure, cpu_time, "", declared, surface, surface_failure, variants)
+
+
+def _no_evaluation(answer: NoAnswer, begin: float, declared: tuple[str, ...]) -> Evaluation:
+    unsupported, failure = (answer.message, None) if answer.is_refusal else (None, answer.message)
+    return Evaluation([], unsupported, failure, time.process_time() - begin, answer.gap, declared)
 
 
 def evaluate_variants(
@@ -203,25 +219,12 @@ def evaluate_variants(
     for variant in adapter.variants:
         if variant.suits(model):
             by_names = found.setdefault(variant.kind, {})
-            ask = partial(_variant_answer, adapter, variant, model, states)
+            ask = partial(attempt, adapter.with_variant(variant).evaluate, model, states)
             try:
                 by_names[variant.names] = call_in_fork(ask) if IS_APART.get() else ask()
             except EndedEarly as error:
                 by_names[variant.names] = NoAnswer(str(error), is_refusal=False)
     return found
-
-
-def _variant_answer(
-    adapter: Adapter, variant: Variant, model: Model, states: Sequence[State]
-) -> list[StateQuantities] | NoAnswer:
-    try:
-        return adapter.with_variant(variant).evaluate(model, states)
-    except Unsupported as refusal:
-        return NoAnswer(str(refusal), is_refusal=True)
-    except MemoryError:
-        raise
-    except Exception as error:  # as above
-        return NoAnswer(describe_exception(error), is_refusal=False)
 
 
 def stack_answers(answers: Sequence[SurfaceAnswer]) -> dict[str, dict[Call, Array]]:
@@ -251,7 +254,7 @@ def run_refinement(
     resolutions: Sequence[float],
     is_enough: Callable[[Model, Integrator, Sequence[RefinementRun]], bool] | None = None,
 ) -> RefinementStudy:
-    """Simulate the same motion at each resolution; a run that fails is kept with its reason.
+    """Simulate the same motion at each resolution; a run that fails is kept with its reason, as of `attempt`.
 
     Args:
         times: sample times [s].
@@ -261,23 +264,15 @@ def run_refinement(
     Returns:
         The runs; up to the first refusal where the engine does not support the motion.
 
-    Raises:
-        MemoryError: the worker reached its memory limit, which the pool reports.
-
     """
     adapter = load_adapter(engine)
     runs: list[RefinementRun] = []
     for resolution in resolutions:
         begin = time.process_time()
-        trajectory, failure = None, None
-        try:
-            trajectory = adapter.simulate(model, state, times, integrator, resolution)
-        except Unsupported as refusal:
-            return RefinementStudy(runs, describe_exception(refusal), refusal.gap)
-        except MemoryError:
-            raise
-        except Exception as error:  # as above
-            failure = describe_exception(error)
+        found = attempt(adapter.simulate, model, state, times, integrator, resolution)
+        if isinstance(found, NoAnswer) and found.is_refusal:
+            return RefinementStudy(runs, found.message, found.gap)
+        trajectory, failure = (None, found.message) if isinstance(found, NoAnswer) else (found, None)
         runs.append(RefinementRun(resolution, trajectory, failure, time.process_time() - begin))
         if is_enough is not None and is_enough(model, adapter.integrator(integrator), runs):
             break
@@ -292,34 +287,29 @@ def run_steps(
     steps: Sequence[Sequence[float]],
     counts: Sequence[int],
 ) -> StepEvaluation:
-    """Take a few steps of each size from each state; what the engine raises becomes a reason.
+    """Take a few steps of each size from each state; errors are those of `attempt`.
 
     Args:
         steps: steps [s] from each state.
         counts: numbers of steps, ascending; where the engine refuses the largest or fails, the next
             smaller is tried: angles may become singular on the way, and an explicit method unstable.
 
-    Raises:
-        MemoryError: the worker reached its memory limit, which the pool reports.
-
     """
     begin = time.process_time()
     adapter, attempts = load_adapter(engine), []
     for index, (state, sizes) in enumerate(zip(states, steps, strict=True)):
         for step in sizes:
-            attempt = StepAttempt(index, step)
+            record = StepAttempt(index, step)
             for count in reversed(counts):
-                try:
-                    attempt = replace(attempt, run=adapter.step(model, state, integrator, step, count))
+                found = attempt(adapter.step, model, state, integrator, step, count)
+                if not isinstance(found, NoAnswer):
+                    record = replace(record, run=found)
                     break
-                except Unsupported as refusal:
-                    if not attempt.refusal:
-                        attempt = replace(attempt, refusal=describe_exception(refusal), gap=refusal.gap)
-                except MemoryError:
-                    raise
-                except Exception as error:  # as above
-                    attempt = replace(attempt, failure=attempt.failure or describe_exception(error))
-            attempts.append(attempt)
+                if not found.is_refusal:
+                    record = replace(record, failure=record.failure or found.message)
+                elif not record.refusal:
+                    record = replace(record, refusal=found.message, gap=found.gap)
+            attempts.append(record)
     return StepEvaluation(attempts, time.process_time() - begin)
 
 

@@ -9,12 +9,12 @@ from collections.abc import Mapping, Sequence
 
 from plumbline.engines.adapter import EngineInfo
 from plumbline.engines.answers import check_numbers, check_version, describe_value
-from plumbline.engines.engine_calls import describe_missing
+from plumbline.engines.engine_calls import attempt, describe_missing
 from plumbline.engines.registry import load_importer
+from plumbline.engines.variants import NoAnswer
 from plumbline.importers.importer import ModelFile, Reading
 from plumbline.importers.neutral_model import CanonicalState, ModelQuantities
 from plumbline.model.datatypes import EngineFailure
-from plumbline.processes.exceptions import describe_exception
 
 _FIELDS = {  # shapes, as of `plumbline.engines.answers.FIELDS`; V velocities
     "mass_matrix": "V V",
@@ -50,21 +50,14 @@ def read_model_file(name: str, file: ModelFile) -> Reading:
     """Have an importer read a file; what it raises is its refusal.
 
     Returns:
-        The engine's reading, or its refusal.
-
-    Raises:
-        MemoryError: the worker reached its memory limit, which the pool reports.
+        The engine's reading, or its refusal; errors are those of `attempt`.
 
     """
     importer = load_importer(name)
     if file.format not in importer.formats:
         return Reading(importer.version(), refusal=f"{importer.title} reads no {file.format.upper()} files")
-    try:
-        return importer.read(file)
-    except MemoryError:
-        raise
-    except Exception as error:  # an importer may raise anything: its message is the answer
-        return Reading(importer.version(), refusal=describe_exception(error))
+    found = attempt(importer.read, file)
+    return Reading(importer.version(), refusal=found.message) if isinstance(found, NoAnswer) else found
 
 
 def read_model_files(name: str, files: Mapping[str, ModelFile]) -> dict[str, Reading]:

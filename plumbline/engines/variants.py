@@ -70,7 +70,9 @@ def _column_names() -> Mapping[str, Mapping[str, Sequence[str]]]:
 
 @dataclass(frozen=True)
 class NoAnswer:
-    """What an engine did by a variant in place of an answer."""
+    """What an engine did in place of an answer."""
 
     message: str
     is_refusal: bool  # by the engine or its adapter; else a failure
+    gap: str = ""  # the declared gap that the refusal follows from
+    missing: str = ""  # name that the installed version lacks, where that is the reason
