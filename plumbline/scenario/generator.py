@@ -36,9 +36,8 @@ MAX_MOTION_BODIES = 3
 MOTION_MOMENT = 0.02  # moments of loads and drag in a random motion, over those of other random scenarios
 MOTION_PREFIX = "random-motion-"
 MECHANISM_PREFIX = "random-mechanism-"
-PLACES = [
-    Place(kind, role) for role in ROLES for kind in KINDS if (kind, role) != (FREE, "closing")
-]  # of joints in random mechanisms
+# of joints in random mechanisms
+PLACES = [Place(kind, role) for role in ROLES for kind in KINDS if (kind, role) != (FREE, "closing")]
 MAX_PLACES = 12  # of a random mechanism; it has a few joints more
 MAX_LOOP_BODIES = 8  # of random mechanisms with loops
 SPECIAL_INDICES = (0, 2)  # modulo 5: of scenarios with special values

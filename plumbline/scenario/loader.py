@@ -5,10 +5,11 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
@@ -52,19 +53,6 @@ from plumbline.scenario.schema import (
 from plumbline.scenario.validation_messages import problems_from_validation
 from plumbline.scenario.yaml_reader import is_file, read_yaml
 from plumbline.scenario.yaml_source import PathKey, YamlSource
-
-__all__ = [
-    "Problem",
-    "Scenario",
-    "ScenarioError",
-    "catalogue",
-    "find_scenario_file",
-    "json_schema",
-    "load_scenario",
-    "load_scenario_text",
-    "load_scenarios",
-    "scenario_from_dict",
-]
 
 CATALOGUE_FOLDER = ROOT / "scenarios"
 LOOP_TOLERANCE = 1e-9  # of a loop's gap at t = 0 [m, rad], and of its rate over the largest speed
@@ -121,10 +109,8 @@ class Scenario:
     @property
     def times(self) -> Float[Array, "samples"]:
         """(T,) s, the sample times from 0 to the duration."""
-        return (
-            np.arange(round(self.duration / self.sample_interval) + 1, dtype=np.float64)
-            * self.sample_interval
-        )
+        count = round(self.duration / self.sample_interval) + 1
+        return np.arange(count, dtype=np.float64) * self.sample_interval
 
 
 def load_scenario(path: str | Path) -> Scenario:
@@ -196,23 +182,19 @@ def load_scenarios(
 
 
 @cache
-def _catalogue() -> dict[str, Path]:
-    files = (
-        path
-        for family in FAMILIES
-        for path in sorted((CATALOGUE_FOLDER / family).glob("*.yaml"), key=lambda path: path.stem)
-    )
-    return {path.stem: path for path in files}
-
-
-def catalogue() -> dict[str, Path]:
+def catalogue() -> Mapping[str, Path]:
     """List the scenarios that come with the project, as they were when this process first asked.
 
     Returns:
         Name → file, family by family.
 
     """
-    return dict(_catalogue())
+    files = (
+        path
+        for family in FAMILIES
+        for path in sorted((CATALOGUE_FOLDER / family).glob("*.yaml"), key=lambda path: path.stem)
+    )
+    return MappingProxyType({path.stem: path for path in files})
 
 
 def find_scenario_file(name: str | Path) -> Path:
@@ -282,35 +264,28 @@ def build_scenario(source: YamlSource, path: Path) -> Scenario:
         )
     if problems or document is None:
         raise ScenarioError(problems)
-    bodies = list(_expand_repeats(document))
-    far = _resolve_parents(source, document, [body for body, _ in bodies])
-    springs = _resolve_springs(source, document, [body for body, _ in bodies])
-    closed = _resolve_closes(source, document, [body for body, _ in bodies])
+    places, bodies, turns = map(list, zip(*_expand_repeats(document), strict=True))
+    far = _resolve_parents(source, places, bodies)
+    springs = _resolve_springs(source, document, bodies)
+    closed = _resolve_closes(source, document, bodies)
     if len(bodies) > MAX_BODIES:
         raise source.fatal_error(
             f"has {len(bodies)} bodies", f"at most {MAX_BODIES}", source.value_positions[("bodies",)]
         )
     with np.errstate(all="ignore"):
-        tree = _build_model(document, [body for body, _ in bodies], far, springs)
+        tree = _build_model(document, bodies, far, springs)
         model = _add_closing_joints(tree, document, closed)
-        state = state_from_minimal(model, *_minimal_coordinates(bodies, model.columns))
-        state = _closed_state(source, model, state, [body for body, _ in bodies])
+        state = state_from_minimal(model, *_minimal_coordinates(bodies, turns, model.columns))
+        state = _closed_state(source, model, state, bodies)
         distances = np.linalg.norm(spring_vectors(model, state.r, state.p), axis=-1)
     for k in np.flatnonzero(distances <= INPUT_ROUNDING * np.max(np.abs(model.spring_point), initial=0.0)):
         place = source.value_positions[("springs", int(k))]
-        raise source.fatal_error(
-            f"has spring {k + 1} between two points that coincide at t = 0, where it has no direction",
-            "points that are apart",
-            place,
-        )
+        what = f"has spring {k + 1} between two points that coincide at t = 0, where it has no direction"
+        raise source.fatal_error(what, "points that are apart", place)
     for name, array in {**model.fields, **vars(state)}.items():
         if name != "kind" and not np.all(np.abs(array) <= MAX_MAGNITUDE):
-            raise source.fatal_error(
-                f"has numbers that make {name} larger than {MAX_MAGNITUDE:g}",
-                "SI numbers of a pendulum",
-                (1, 1),
-            )
-    places = list(_written_places(document))
+            what = f"has numbers that make {name} larger than {MAX_MAGNITUDE:g}"
+            raise source.fatal_error(what, "SI numbers of a pendulum", (1, 1))
     sizes = np.linalg.norm(model.inertia, axis=(1, 2))
     for body in np.flatnonzero((sizes > 0) & (sizes < MIN_INERTIA)):
         raise source.fatal_error(
@@ -331,7 +306,7 @@ def build_scenario(source: YamlSource, path: Path) -> Scenario:
     canonical = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=True)
     digest = hashlib.sha256(canonical.encode()).hexdigest()
     if model.has_loops:  # rates that the file does not give follow from the others
-        for (given, _), at in zip(bodies, places, strict=True):
+        for given, at in zip(bodies, places, strict=True):
             if "angular_velocity" not in given.model_fields_set:
                 written: Any = content
                 for key in at:
@@ -349,7 +324,7 @@ def build_scenario(source: YamlSource, path: Path) -> Scenario:
         sample_interval=document.sample,
         closed_form=document.exact,
         level=document.level,
-        body_names=tuple(body.name or f"body {k + 1}" for k, (body, _) in enumerate(bodies)),
+        body_names=tuple(body.name or f"body {k + 1}" for k, body in enumerate(bodies)),
         path=path,
         digest=digest,
         seed=document.seed or digest,
@@ -381,25 +356,16 @@ def _missing_distal_problems(source: YamlSource) -> Iterator[Problem]:
             yield source.problem((*path, "distal"), "is missing: a body follows", valid)
 
 
-def _expand_repeats(document: Document) -> Iterator[tuple[Body, Array]]:
-    """Every body of the chain with the quaternion (4,) it is turned by, runs written out."""
-    for item in document.bodies:
-        if isinstance(item, Body):
-            yield item, np.array([1.0, 0.0, 0.0, 0.0])
-            continue
-        for j in range(item.repeat):
-            turn = item.turn.quaternion(j) if item.turn and j else np.array([1.0, 0.0, 0.0, 0.0])
-            yield item.cycle[j % len(item.cycle)], turn
-
-
-def _written_places(document: Document) -> Iterator[tuple[PathKey, ...]]:
-    """Where the file has each body of the chain."""
+def _expand_repeats(document: Document) -> Iterator[tuple[tuple[PathKey, ...], Body, Array]]:
+    """Every body of the chain: where the file has it, and the quaternion (4,) that it is turned by."""
     for index, item in enumerate(document.bodies):
         if isinstance(item, Body):
-            yield "bodies", index
-        else:
-            for j in range(item.repeat):
-                yield "bodies", index, "cycle", j % len(item.cycle)
+            yield ("bodies", index), item, np.array([1.0, 0.0, 0.0, 0.0])
+            continue
+        for j in range(item.repeat):
+            k = j % len(item.cycle)
+            turn = item.turn.quaternion(j) if item.turn and j else np.array([1.0, 0.0, 0.0, 0.0])
+            yield ("bodies", index, "cycle", k), item.cycle[k], turn
 
 
 def _is_free(item: dict[str, Any]) -> bool:
@@ -407,9 +373,8 @@ def _is_free(item: dict[str, Any]) -> bool:
     return isinstance(joint, dict) and joint.get("kind") == FREE
 
 
-def _resolve_parents(source: YamlSource, document: Document, bodies: list[Body]) -> list[int]:
+def _resolve_parents(source: YamlSource, paths: list[tuple[PathKey, ...]], bodies: list[Body]) -> list[int]:
     """The far body of each body, −1 the world; refuses parents that do not exist or come too late."""
-    paths = list(_written_places(document))
     far: list[int] = []
     problems: list[Problem] = []
     for k, body in enumerate(bodies):
@@ -448,12 +413,8 @@ def _parent_of(bodies: list[Body], k: int, far: list[int]) -> tuple[int, str, st
             valid = f"this body inside the branch of {given}: the bodies of a branch follow each other"
             return -1, "parent", f"is {given}, whose branch ended above", valid
     if KINDS[body.joint.kind].is_rigid and parent < 0:
-        return (
-            parent,
-            "joint",
-            "welds a body to the world, where it never moves",
-            "another joint, or a parent",
-        )
+        message = "welds a body to the world, where it never moves"
+        return parent, "joint", message, "another joint, or a parent"
     return parent, "", "", ""
 
 
@@ -539,10 +500,8 @@ def _closed_state(source: YamlSource, model: Model, state: State, bodies: list[B
     gaps = loop_gaps(model, state)[0]
     found = assembled(model, state, movable)
     rates = loop_gaps(model, found)[1] / max(1.0, float(np.max(np.abs(found.v))))
-    for sizes, what in (
-        (gaps, "does not close: points or axes are apart"),
-        (rates, "opens: rates differ"),
-    ):
+    reasons = {"does not close: points or axes are apart": gaps, "opens: rates differ": rates}
+    for what, sizes in reasons.items():
         for k in np.flatnonzero(~(sizes <= LOOP_TOLERANCE)):
             place = source.position(("closes", int(k)))
             valid = f"a state at t = 0 that fits the joint within {LOOP_TOLERANCE:g} (m, rad, m/s, rad/s)"
@@ -613,12 +572,12 @@ def _build_model(
     )
 
 
-def _minimal_coordinates(bodies: list[tuple[Body, Array]], columns: int) -> tuple[Array, ...]:
+def _minimal_coordinates(bodies: list[Body], turns: list[Array], columns: int) -> tuple[Array, ...]:
     """p, omega, u, udot, x, xdot, r, v: unit and perpendicular to rounding."""
     n = len(bodies)
     p, u, udot, r, v = np.empty((n, 4)), *np.zeros((4, n, 3))
     x, xdot = np.zeros((2, n, columns))
-    for k, (body, turn) in enumerate(bodies):
+    for k, (body, turn) in enumerate(zip(bodies, turns, strict=True)):
         if body.attitude is None:
             p[k] = 1.0, 0.0, 0.0, 0.0
             assert isinstance(body.joint, Articulated)
@@ -639,5 +598,5 @@ def _minimal_coordinates(bodies: list[tuple[Body, Array]], columns: int) -> tupl
         if isinstance(body.joint, Free):
             r[k] = np.array(body.joint.position) - rotation_matrix(p[k]) @ np.array(body.proximal)
             v[k] = body.joint.velocity
-    omega = np.array([body.angular_velocity for body, _ in bodies], dtype=float)
+    omega = np.array([body.angular_velocity for body in bodies], dtype=float)
     return p, omega, u, udot, x, xdot, r, v

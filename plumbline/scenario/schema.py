@@ -137,6 +137,11 @@ def _field(description: str, unit: str = "", default: Any = ..., **limits: Any) 
     )
 
 
+def _optional(description: str, unit: str = "", **limits: Any) -> Any:
+    """Declare a field that may be absent."""
+    return _field(description, unit, None, **limits)
+
+
 class SchemaModel(BaseModel):
     """Base of all parts of a scenario file: strict types, no unknown fields, no NaN or infinity."""
 
@@ -149,6 +154,7 @@ class SchemaModel(BaseModel):
         defer_build=True,
     )
     alternatives: ClassVar[tuple[str, ...]] = ()  # fields of which exactly one must be given
+    omitted: ClassVar[tuple[str, ...]] = ()  # fields that are left out where they have their default
 
     @model_validator(mode="after")
     def _check_alternatives(self) -> Self:
@@ -159,6 +165,13 @@ class SchemaModel(BaseModel):
             raise invalid_value_error(what, f"exactly one of {names}")
         return self
 
+    @model_serializer(mode="wrap")
+    def _omit_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out what is absent: a scenario's digest depends on its content alone."""
+        data: dict[str, Any] = handler(self)
+        fields = type(self).model_fields
+        return {k: v for k, v in data.items() if k not in self.omitted or v != fields[k].default}
+
 
 Vector = Annotated[list[float], Len(3, 3)]
 
@@ -168,8 +181,8 @@ class AxisAngle(SchemaModel):
 
     alternatives = ("angle", "degrees")
     axis: Vector = _field("The axis, world frame; any length but 0.", examples=[[0, 1, 0]])
-    angle: float | None = _field("The angle; or give `degrees`.", "rad", None)
-    degrees: float | None = _field("The angle; or give `angle`.", "°", None)
+    angle: float | None = _optional("The angle; or give `degrees`.", "rad")
+    degrees: float | None = _optional("The angle; or give `angle`.", "°")
 
     _axis = field_validator("axis")(_require_nonzero)
 
@@ -199,21 +212,20 @@ class Euler(SchemaModel):
         pattern="^(intrinsic|extrinsic) (xyx|xyz|xzx|xzy|yxy|yxz|yzx|yzy|zxy|zxz|zyx|zyz)$",
         examples=["intrinsic zxz"],
     )
-    angles: Vector | None = _field("The angles in the order of the axes; or give `degrees`.", "rad", None)
-    degrees: Vector | None = _field("The angles in the order of the axes; or give `angles`.", "°", None)
+    angles: Vector | None = _optional("The angles in the order of the axes; or give `degrees`.", "rad")
+    degrees: Vector | None = _optional("The angles in the order of the axes; or give `angles`.", "°")
 
 
 class Attitude(SchemaModel):
     """An attitude: exactly one of the three."""
 
     alternatives = ("quaternion", "axis_angle", "euler")
-    quaternion: Annotated[list[float], Len(4, 4)] | None = _field(
+    quaternion: Annotated[list[float], Len(4, 4)] | None = _optional(
         "Quaternion (w, x, y, z), scalar first, body → world. Of any length but 0: it is normalised.",
-        default=None,
         examples=[[0.5, 0.5, 0.5, 0.5]],
     )
-    axis_angle: AxisAngle | None = _field("A rotation from the world's axes about one axis.", default=None)
-    euler: Euler | None = _field("Three rotations with a named convention.", default=None)
+    axis_angle: AxisAngle | None = _optional("A rotation from the world's axes about one axis.")
+    euler: Euler | None = _optional("Three rotations with a named convention.")
 
     _quaternion = field_validator("quaternion")(_require_nonzero)
 
@@ -222,19 +234,17 @@ class Inertia(SchemaModel):
     """Inertia about the centre of mass, body frame: exactly one of principal, six, matrix."""
 
     alternatives = ("principal", "six", "matrix")
-    principal: Vector | None = _field("The three principal moments.", "kg m²", None)
-    axes: Attitude | None = _field(
+    principal: Vector | None = _optional("The three principal moments.", "kg m²")
+    axes: Attitude | None = _optional(
         "With `principal`: the attitude of the principal axes in the body's frame (where `axis` and "
-        "`extrinsic` mean the body's axes). Absent: along the body's axes.",
-        default=None,
+        "`extrinsic` mean the body's axes). Absent: along the body's axes."
     )
-    six: Annotated[list[float], Len(6, 6)] | None = _field(
+    six: Annotated[list[float], Len(6, 6)] | None = _optional(
         "xx, yy, zz, xy, xz, yz of the matrix; off the diagonal with the matrix's own sign, "
         "J_xy = −∫ x y dm.",
         "kg m²",
-        None,
     )
-    matrix: Annotated[list[Vector], Len(3, 3)] | None = _field("The symmetric 3 × 3 matrix.", "kg m²", None)
+    matrix: Annotated[list[Vector], Len(3, 3)] | None = _optional("The symmetric 3 × 3 matrix.", "kg m²")
 
     @field_validator("principal", "six", "matrix")
     @classmethod
@@ -269,15 +279,11 @@ def _require_physical_inertia(matrix: Array) -> None:
     values = np.linalg.eigvalsh(matrix)
     shown = ", ".join(f"{value:.6g}" for value in values)
     if values[0] < -INPUT_ROUNDING * abs(values[2]):
-        raise invalid_value_error(
-            f"has the principal moments {shown}, one of them negative",
-            "three principal moments that are not negative",
-        )
+        message = f"has the principal moments {shown}, one of them negative"
+        raise invalid_value_error(message, "three principal moments that are not negative")
     if values[0] + values[1] < values[2] * (1 - INPUT_ROUNDING):
-        raise invalid_value_error(
-            f"is not a physical inertia: its principal moments {shown} violate the triangle inequality",
-            "principal moments of which none exceeds the sum of the other two",
-        )
+        message = f"is not a physical inertia: its principal moments {shown} violate the triangle inequality"
+        raise invalid_value_error(message, "principal moments of which none exceeds the sum of the other two")
 
 
 def _listed(value: Any) -> Any:
@@ -298,21 +304,19 @@ def _require_not_negative(values: list[float] | None) -> list[float] | None:
 class JointElements(SchemaModel):
     """Passive elements of a joint."""
 
+    omitted = JOINT_ELEMENTS
     kind: str
-    armature: PerCoordinate | None = _field(
+    armature: PerCoordinate | None = _optional(
         "Inertia a of rotors that turn with the rate φ̇ of the joint's coordinate, ½ a φ̇² (kg m², or kg of a "
         "slide). One number, or a list of one per coordinate of the joint. Absent: 0.",
-        default=None,
         examples=[0.01],
     )
-    damping: PerCoordinate | None = _field(
-        "Coefficient c of a damper, −c φ̇ (N m s, or N s/m of a slide). As many numbers. Absent: 0.",
-        default=None,
+    damping: PerCoordinate | None = _optional(
+        "Coefficient c of a damper, −c φ̇ (N m s, or N s/m of a slide). As many numbers. Absent: 0."
     )
-    stiffness: PerCoordinate | None = _field(
+    stiffness: PerCoordinate | None = _optional(
         "Stiffness k of a spring, −k (φ − φ₀) (N m, or N/m of a slide); angles count on beyond π. As many "
-        "numbers. Absent: 0.",
-        default=None,
+        "numbers. Absent: 0."
     )
 
     _not_negative = field_validator("armature", "damping", "stiffness")(_require_not_negative)
@@ -331,12 +335,6 @@ class JointElements(SchemaModel):
             given = f"has {len(value)} {'number' if len(value) == 1 else 'numbers'}"
             raise invalid_value_error(given, f"{count} for a {kind} joint")
         return value
-
-    @model_serializer(mode="wrap")
-    def _omit_absent_elements(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out what is absent: a scenario's digest depends on its content alone."""
-        data: dict[str, Any] = handler(self)
-        return {k: v for k, v in data.items() if v is not None or k not in JOINT_ELEMENTS}
 
 
 class Ball(JointElements):
@@ -360,17 +358,15 @@ class Rod(SchemaModel):
         "it is normalised.",
         examples=[[0, 0.6, -0.8]],
     )
-    rate: Vector | None = _field(
+    rate: Vector | None = _optional(
         "Rate of change of the (unit) direction at t = 0, world frame, perpendicular to it. Or give "
         "`angular_velocity`; absent: 0.",
         "1/s",
-        None,
     )
-    angular_velocity: Vector | None = _field(
+    angular_velocity: Vector | None = _optional(
         "Angular velocity w of the rod at t = 0, world frame: the rate is w × direction, so the part along "
         "the rod has no effect. Or give `rate`.",
         "rad/s",
-        None,
     )
 
     @field_validator("length")
@@ -414,41 +410,35 @@ class Articulated(JointElements):
     kind: AxesKind = _field(
         "; ".join(f"`{kind}`: {KINDS[kind].description}" for kind in get_args(AxesKind)) + "."
     )
-    axis: Vector | None = _field(
+    axis: Vector | None = _optional(
         "z of the joint's axes in the parent's frame, parallel to the body's at coordinates 0. Of any length "
         "but 0. Or give `frame`; not for a universal joint or a weld.",
-        default=None,
         examples=[[0, 1, 0]],
     )
-    pitch: float | None = _field(
+    pitch: float | None = _optional(
         "How far the body moves along z per angle that it turns; negative: a left-hand screw. Of a helical "
         "joint, and needed there. Not 0.",
         "m/rad",
-        None,
         examples=[0.02],
     )
-    frame: Attitude | None = _field(
-        "Attitude of the joint's axes in the parent's frame. Absent: parallel.", default=None
+    frame: Attitude | None = _optional(
+        "Attitude of the joint's axes in the parent's frame. Absent: parallel."
     )
-    body_frame: Attitude | None = _field(
-        "Attitude of the joint's axes in the body's frame. Absent: as in the parent's.", default=None
+    body_frame: Attitude | None = _optional(
+        "Attitude of the joint's axes in the body's frame. Absent: as in the parent's."
     )
-    coordinates: list[float] | None = _field(
-        "At t = 0, in the order of the motions: angles [rad] of turns, shifts [m] of slides. Absent: 0.",
-        default=None,
+    coordinates: list[float] | None = _optional(
+        "At t = 0, in the order of the motions: angles [rad] of turns, shifts [m] of slides. Absent: 0."
     )
-    rates: list[float] | None = _field(
-        "Their rates at t = 0 [rad/s, m/s]. Absent: 0, in a loop what the rates that are given require.",
-        default=None,
+    rates: list[float] | None = _optional(
+        "Their rates at t = 0 [rad/s, m/s]. Absent: 0, in a loop what the rates that are given require."
     )
-    rest: PerCoordinate | None = _field(
-        "Coordinates φ₀ at which the springs are unloaded [rad, m]. With `stiffness` only. Absent: 0.",
-        default=None,
+    rest: PerCoordinate | None = _optional(
+        "Coordinates φ₀ at which the springs are unloaded [rad, m]. With `stiffness` only. Absent: 0."
     )
-    effort: PerCoordinate | None = _field(
+    effort: PerCoordinate | None = _optional(
         "Constant torques [N m] or forces [N] along the coordinates on this body, the opposite on its parent."
-        " Absent: 0.",
-        default=None,
+        " Absent: 0."
     )
 
     _axis = field_validator("axis")(_require_nonzero)
@@ -462,25 +452,17 @@ class Articulated(JointElements):
         return value
 
     @model_validator(mode="after")
-    def _check_axes(self) -> Articulated:
+    def _check_fields(self) -> Articulated:
         if self.axis is not None and (self.frame is not None or self.body_frame is not None):
             raise invalid_value_error("gives axis and a frame", "one of them")
         if self.axis is not None and not KINDS[self.kind].is_about_z:
             raise invalid_value_error(f"gives an axis to a {self.kind} joint", "`frame` and `body_frame`")
-        return self
-
-    @model_validator(mode="after")
-    def _check_pitch(self) -> Articulated:
         if (self.pitch is not None) != KINDS[self.kind].has_pitch:
             given = "no pitch" if self.pitch is None else "a pitch"
             valid = "a pitch where the joint is helical, and only there"
             raise invalid_value_error(f"gives {given} to a {self.kind} joint", valid)
         if self.pitch == 0:
             raise invalid_value_error("gives a pitch of 0", "another pitch, or a hinge")
-        return self
-
-    @model_validator(mode="after")
-    def _check_rest(self) -> Articulated:
         if self.rest is not None and self.stiffness is None:
             raise invalid_value_error("gives rest without stiffness", "both, or neither")
         return self
@@ -513,36 +495,33 @@ class Drag(SchemaModel):
 class Body(SchemaModel):
     """One rigid body; it hangs from its parent: the body before it, or another one, or the world."""
 
-    name: str | None = _field(
-        "A name for readers; absent: its place in the chain.", default=None, max_length=80, examples=["bob"]
+    omitted = ("parent", "anchor")
+    name: str | None = _optional(
+        "A name for readers; absent: its place in the chain.", max_length=80, examples=["bob"]
     )
     mass: float = _field("Mass, greater than 0.", "kg", gt=0)
     inertia: Inertia = _field("Inertia about the centre of mass, body frame.")
     joint: Annotated[Ball | Rod | Articulated | Free, Discriminator("kind")] = _field("How the body hangs.")
-    parent: str | None = _field(
+    parent: str | None = _optional(
         "The name of the body that this one hangs from, above it in the file, or `world`. Absent: the body "
-        "before it, for the first the world. The bodies of a branch follow each other.",
-        default=None,
+        "before it, for the first the world. The bodies of a branch follow each other."
     )
-    anchor: Vector | None = _field(
+    anchor: Vector | None = _optional(
         "The point of the parent from which this body hangs, in the parent's frame. Absent: the parent's "
         "`distal`, the origin of the world.",
         "m",
-        None,
     )
     proximal: Vector = _field(
         "The point of this body by which it hangs, body frame (the notes' s_1, s_3).", "m"
     )
-    distal: Vector | None = _field(
+    distal: Vector | None = _optional(
         "The point of this body from which the next one hangs, body frame (the notes' s_2). Needed where a "
         "body follows that has no `anchor`.",
         "m",
-        None,
     )
-    attitude: Attitude | None = _field(
+    attitude: Attitude | None = _optional(
         "Attitude at t = 0, body → world. Required on rods and balls and for free bodies; on other joints it "
         "follows from the joint's coordinates.",
-        default=None,
         validate_default=True,
     )
     angular_velocity: Vector = _field(
@@ -581,12 +560,6 @@ class Body(SchemaModel):
             raise invalid_value_error("is given for a free body", "no parent, or `world`")
         return value
 
-    @model_serializer(mode="wrap")
-    def _omit_absent_parent(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out what chains do not have: a scenario's digest depends on its content alone."""
-        data: dict[str, Any] = handler(self)
-        return {k: v for k, v in data.items() if v is not None or k not in ("parent", "anchor")}
-
 
 class BodySequence(SchemaModel):
     """Repeated bodies: body j = 0, 1, 2 … of them copies the bodies of `cycle` in turn.
@@ -599,9 +572,7 @@ class BodySequence(SchemaModel):
     cycle: list[Body] = _field(
         "The bodies that are copied, one after the other; none has a `parent`.", min_length=1
     )
-    turn: AxisAngle | None = _field(
-        "The rotation that body j is turned by, j times. Absent: none.", default=None
-    )
+    turn: AxisAngle | None = _optional("The rotation that body j is turned by, j times. Absent: none.")
 
     @field_validator("cycle")
     @classmethod
@@ -680,11 +651,11 @@ class ClosingJoint(SchemaModel):
 class Document(SchemaModel):
     """A scenario file: one open chain of rigid bodies, its initial state, its loads."""
 
+    omitted = ("level", "springs", "closes", "seed")
     schema_version: Literal[1] = _field("Version of this format: 1.")
-    name: str | None = _field(
+    name: str | None = _optional(
         "The name in results and of the files made for it, so without `/` and `\\` and no dot at its start; "
         "absent: the file's name.",
-        default=None,
         min_length=1,
         max_length=80,
     )
@@ -699,10 +670,9 @@ class Document(SchemaModel):
     purpose: str = _field(
         "Which mistakes this scenario reveals, in a sentence.", min_length=1, max_length=1000
     )
-    exact: ClosedForm | None = _field(
+    exact: ClosedForm | None = _optional(
         "The closed-form solution that this scenario has, if any. `small-double` and `small-chain` are "
-        "asymptotic: their error shrinks with the square of the amplitude.",
-        default=None,
+        "asymptotic: their error shrinks with the square of the amplitude."
     )
     duration: float = _field(
         "Length of the motion that is compared; a whole number of samples.", "s", 2.0, gt=0
@@ -726,10 +696,9 @@ class Document(SchemaModel):
 
     springs: list[Spring] = _field("Springs and dampers between points.", default=[])
     closes: list[ClosingJoint] = _field("Joints that close loops.", default=[])
-    seed: str | None = _field(
+    seed: str | None = _optional(
         "Words that the random states are drawn from. Absent: the digest of the file's content, texts "
         "included; the digest of before keeps the states where only a text changes.",
-        default=None,
         min_length=1,
         max_length=80,
     )
@@ -762,14 +731,6 @@ class Document(SchemaModel):
             valid = "a duration that is a whole number of samples"
             raise invalid_value_error(message, valid, "duration")
         return value
-
-    @model_serializer(mode="wrap")
-    def _omit_absent(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out absent springs, loops and seed: a scenario's digest depends on its content alone."""
-        data: dict[str, Any] = handler(self)
-        if self.level == "all":
-            del data["level"]
-        return {k: v for k, v in data.items() if v or k not in ("springs", "closes", "seed")}
 
 
 def attitude_quaternion(attitude: Attitude) -> Float[Array, "4"]:

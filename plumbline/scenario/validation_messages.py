@@ -162,13 +162,8 @@ def _places_phrase(
     words = []
     for fields in dict.fromkeys(fields for fields, _ in places if here or len(fields) == nearest):
         kinds = [tag for where, model in places if where == fields for tag in _kinds(model)]
-        of_all = {
-            tag
-            for some in _places(root).values()
-            for at, model in some
-            if at == fields
-            for tag in _kinds(model)
-        }
+        every = [model for some in _places(root).values() for at, model in some if at == fields]
+        of_all = {tag for model in every for tag in _kinds(model)}
         is_shown = len(kinds) < len(of_all) and (fields == here or len(kinds) == 1)
         shown = fields[-1:] if fields == here else fields
         words.append(f"`{'.'.join(shown)}:`" if fields else "the file's top level")
@@ -188,9 +183,8 @@ def _message_and_valid(error: ErrorDetails, at: _Location, root: type[BaseModel]
             words = _unknown_field(str(error["loc"][-1]), at, root)
             return f"unknown field. {words}".strip(" ."), "one of " + ", ".join(_fields(at.model))
         case "literal_error" if error["loc"][-1:] == ("schema_version",):
-            return f"is {_quote(given)}; this version of Plumbline reads {SCHEMA_VERSION}", str(
-                SCHEMA_VERSION
-            )
+            words = f"is {_quote(given)}; this version of Plumbline reads {SCHEMA_VERSION}"
+            return words, str(SCHEMA_VERSION)
         case "literal_error":
             options = [str(o) for o in _literals(info.annotation if info else None)]
             hint = did_you_mean(str(given), options)
@@ -216,12 +210,8 @@ def _message_and_valid(error: ErrorDetails, at: _Location, root: type[BaseModel]
             return f"is {_describe_value(given)}", "a mapping that starts with schema_version: 1"
         case "too_short" | "too_long":
             bound = context.get("min_length", context.get("max_length"))
-            fixed = isinstance(given, list) and bound in (
-                2,
-                3,
-                4,
-                6,
-            )  # pairs, vectors, quaternions, six, matrix
+            # pairs, vectors, quaternions, six, matrix
+            fixed = isinstance(given, list) and bound in (2, 3, 4, 6)
             few = "exactly" if fixed else "at least" if kind == "too_short" else "at most"
             return f"has {context.get('actual_length')} entries", f"{few} {bound}"
         case "string_too_short" | "string_too_long":
@@ -285,7 +275,6 @@ def _field_description(info: FieldInfo | None, kind: str = "") -> str:
     if info is None:
         return ""
     sentence = (info.description or "").partition(". ")[0].rstrip(".")
-    shape = {"list_type": "a list: ", "string_type": "text: "}.get(
-        kind, "a mapping: " if "model" in kind else ""
-    )
+    shapes = {"list_type": "a list: ", "string_type": "text: "}
+    shape = shapes.get(kind, "a mapping: " if "model" in kind else "")
     return shape + sentence[:1].lower() + sentence[1:] + _unit_suffix(info)
