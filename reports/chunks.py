@@ -175,10 +175,8 @@ class ChunkBuilder:
             return {"$lists": [self.add(counts), self._column([y for x in given for y in x])]}
         if not types <= {int, float, bool} or any(isinstance(x, int) and abs(x) >= 10**DIGITS for x in given):
             return [None if isinstance(x, float) and not np.isfinite(x) else x for x in values]
-        found = (
-            np.full(len(values), NO_NUMBER, np.int16),
-            np.zeros(len(values), np.int16),
-        )  # of doubles: −326 … 306
+        # digits and exponent: of doubles −326 … 306
+        found = np.full(len(values), NO_NUMBER, np.int16), np.zeros(len(values), np.int16)
         for i, x in enumerate(values):
             if x is not None and np.isfinite(x):
                 first, _, exponent = f"{x:.{DIGITS - 1}e}".partition("e")

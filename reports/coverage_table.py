@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from reports.stored_results import Record, Results
+from reports.stored_results import Record, study_records
 
 
 def coverage_tables(folder: Path) -> Record | None:
@@ -15,12 +15,10 @@ def coverage_tables(folder: Path) -> Record | None:
         where nothing can be seen the reasons; None where the folder has no coverage.parquet.
 
     """
-    table = Results(folder, {}, {}, {}, []).table("coverage")
-    if not table or not len(table["level"]):
+    records = study_records(folder, "coverage")
+    if not records:
         return None
-    columns = {name: values.tolist() for name, values in table.items()}
-    records = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
-    levels, kinds = (list(dict.fromkeys(columns[name])) for name in ("level", "kind"))
+    levels, kinds = (list(dict.fromkeys(record[name] for record in records)) for name in ("level", "kind"))
     scenarios: dict[str, dict[tuple[str, str], Record]] = {}
     total: dict[tuple[str, str], Record] = {}
     proofs: dict[tuple[str, str, str], dict[str, None]] = {}
@@ -45,10 +43,10 @@ def coverage_tables(folder: Path) -> Record | None:
 
 
 def _add(cells: dict[tuple[str, str], Record], cell: tuple[str, str], smallest: float | None) -> None:
-    """Count an entry; a smallest mistake that is not a number, or None, is one that is not seen."""
+    """Count an entry; a smallest mistake that is None is one that is not seen."""
     found = cells.setdefault(cell, {"least": None, "most": None, "seen": 0, "count": 0})
     found["count"] += 1
-    if smallest is None or smallest != smallest:
+    if smallest is None:
         return
     found["seen"] += 1
     found["least"] = smallest if found["least"] is None else min(found["least"], smallest)

@@ -6,11 +6,8 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-
 from plumbline.judging.rows import RUN_FAMILY
 from plumbline.model.datatypes import Model
-from plumbline.model.kinematics import state_from_minimal
 from reports import robot_drawing
 from reports.earlier_runs import History
 from reports.stored_results import Record, Results
@@ -65,12 +62,7 @@ def _drawing(scenario: Record, row: Record) -> Record | None:
     if scenario["family"] == RUN_FAMILY or scenario["model"] is None or scenario["state"] is None:
         return None
     model = Model.from_fields(scenario["model"])
-    state = scenario["state"]
-    if "r" in state:
-        origins = state["r"]
-    else:
-        given = {name: np.array(value, float) for name, value in state.items()}
-        origins = state_from_minimal(model, **given).r.tolist()
+    origins = scenario["state"]["r"]
     names = [f"body {k + 1}" for k in range(model.n)]
     parents = [names[far] if far >= 0 else "" for far in model.body[: model.n, 0].tolist()]
     bodies = [

@@ -99,43 +99,37 @@ def _scenarios_to_show(results: Results) -> set[str]:
 def _render_template(
     results: Results, shown: Results, history: History, chunks: dict[str, str], points: int
 ) -> str:
-    script, style = bundle_script(), stylesheet()
     findings = findings_for_page(results, history)
     attention = [finding for finding in findings if finding["known_issue"] is None]
     unshown = results.scenarios.keys() - shown.scenarios.keys()
-    return (
-        template_environment()
-        .get_template("report.html")
-        .render(
-            run=results.run,
-            headline=_headline(results, attention, len(findings) - len(attention)),
-            policy=content_security_policy(style, script),
-            script=Markup(script),
-            css=Markup(style),
-            chunks=chunks,
-            counts=count_all_verdicts(results),
-            compared=_has_compared(results),
-            total=count_all_verdicts(results).total(),
-            random_batch=_random_scenario_summary(results),
-            engines=results.engines,
-            families=_matrix_by_family(shown),
-            unshown=len(unshown),
-            unshown_fine=not any(needs_attention(r) for r in results.rows if r["scenario"] in unshown),
-            attention=attention[:MAX_FINDINGS],
-            unlisted=len(attention) - MAX_FINDINGS,
-            recorded=[finding for finding in findings if finding["known_issue"] is not None],
-            gaps=declared_gaps(results),
-            link=_row_link,
-            comparison=_changes_since_last_passed(results, history),
-            damaged=history.unreadable,
-            nights=len(history.nights),
-            coverage=coverage_table.coverage_tables(results.folder),
-            drifts=reference_tables.drift_table(results.folder),
-            benchmarks=reference_tables.benchmark_table(results.folder),
-            decimated=points,
-            notice=(REPORTS_FOLDER / "assets" / "vendor" / "uPlot.LICENSE").read_text(encoding="utf-8"),
-            rendered=time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),
-        )
+    return render_page(
+        "report.html",
+        bundle_script(),
+        run=results.run,
+        headline=_headline(results, attention, len(findings) - len(attention)),
+        chunks=chunks,
+        counts=count_all_verdicts(results),
+        compared=_has_compared(results),
+        total=count_all_verdicts(results).total(),
+        random_batch=_random_scenario_summary(results),
+        engines=results.engines,
+        families=_matrix_by_family(shown),
+        unshown=len(unshown),
+        unshown_fine=not any(needs_attention(r) for r in results.rows if r["scenario"] in unshown),
+        attention=attention[:MAX_FINDINGS],
+        unlisted=len(attention) - MAX_FINDINGS,
+        recorded=[finding for finding in findings if finding["known_issue"] is not None],
+        gaps=declared_gaps(results),
+        link=_row_link,
+        comparison=_changes_since_last_passed(results, history),
+        damaged=history.unreadable,
+        nights=len(history.nights),
+        coverage=coverage_table.coverage_tables(results.folder),
+        drifts=reference_tables.drift_table(results.folder),
+        benchmarks=reference_tables.benchmark_table(results.folder),
+        decimated=points,
+        notice=(REPORTS_FOLDER / "assets" / "vendor" / "uPlot.LICENSE").read_text(encoding="utf-8"),
+        rendered=time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),
     )
 
 
@@ -276,18 +270,21 @@ def template_environment() -> Environment:
     return made
 
 
-def content_security_policy(style: str, script: str | None = None) -> str:
-    """Return the Content-Security-Policy of a page: no request, and no style or script but its own.
+def render_page(template: str, script: str = "", **values: Any) -> str:
+    """Render a page that makes no request, and takes no style or script but its own.
 
     Args:
-        style: content of the style element.
-        script: content of the script element; None for none.
+        template: file name of the template.
+        script: content of the script element; empty for none.
+        values: what the template shows.
 
     """
-    sources = ["default-src 'none'", f"style-src {_csp_hash(style)}", "img-src data:"]
-    if script is not None:
-        sources.insert(1, f"script-src {_csp_hash(script)}")
-    return "; ".join([*sources, "base-uri 'none'", "form-action 'none'"])
+    style = stylesheet()
+    scripts = [f"script-src {_csp_hash(script)}"] if script else []
+    sources = ["default-src 'none'", *scripts, f"style-src {_csp_hash(style)}", "img-src data:"]
+    policy = "; ".join([*sources, "base-uri 'none'", "form-action 'none'"])
+    page = template_environment().get_template(template)
+    return page.render(policy=policy, css=Markup(style), script=Markup(script), **values)
 
 
 def stylesheet() -> str:

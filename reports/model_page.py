@@ -10,8 +10,6 @@ import xml.etree.ElementTree as ET
 from collections import Counter
 from pathlib import Path
 
-from markupsafe import Markup
-
 from plumbline.storage.results_store import write_atomically
 from reports import html_report, junit, robot_drawing
 from reports.sarif import sarif
@@ -65,21 +63,15 @@ def render(document: Record) -> str:
                 "counts_ambiguous": Counter(feature["what"] for feature in file["ambiguous"]),
             }
         )
-    style = html_report.stylesheet()
-    return (
-        html_report.template_environment()
-        .get_template("model.html")
-        .render(
-            policy=html_report.content_security_policy(style),
-            css=Markup(style),
-            sentence=_sentence(document),
-            engines=document["engines"],
-            made=[(name, document[key]) for name, key in MADE.items() if document.get(key)],
-            problems=document["problems"],
-            files=files,
-            counts=count_verdicts(row for file in document["files"] for row in file["rows"]),
-            is_state_given=document["options"]["at"] is not None,
-        )
+    return html_report.render_page(
+        "model.html",
+        sentence=_sentence(document),
+        engines=document["engines"],
+        made=[(name, document[key]) for name, key in MADE.items() if document.get(key)],
+        problems=document["problems"],
+        files=files,
+        counts=count_verdicts(row for file in document["files"] for row in file["rows"]),
+        is_state_given=document["options"]["at"] is not None,
     )
 
 

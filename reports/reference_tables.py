@@ -10,7 +10,7 @@ import json
 from pathlib import Path
 
 from plumbline.storage.results_schema import DamagedResults
-from reports.stored_results import Record, Results, replace_unprintable
+from reports.stored_results import Record, replace_unprintable, study_records
 
 STORED_RESULTS = Path(__file__).parent.parent / "bench" / "results"
 DRIFT_COLUMNS = {  # column: title, unit
@@ -39,10 +39,7 @@ def drift_table(folder: Path, stored: Path = STORED_RESULTS) -> Record | None:
     place = _first_folder_with("drift.parquet", folder, stored)
     if place is None:
         return None
-    table = Results(place, {}, {}, {}, []).table("drift")
-    records = [
-        dict(zip(table, row, strict=True)) for row in zip(*(c.tolist() for c in table.values()), strict=True)
-    ]
+    records = study_records(place, "drift")
     times = sorted({record["time"] for record in records})
     blocks: dict[tuple[str, float], dict[str, Record]] = {}
     for record in records:

@@ -11,9 +11,14 @@ from typing import Any
 import numpy as np
 
 from plumbline.judging.rows import RUN_FAMILY, SHOWN_STYLES
-from plumbline.model.datatypes import Array, Float, Model, State
+from plumbline.model.datatypes import Array, Model, State
 from plumbline.model.invariants import DEPARTURE, LONG_RUN_QUANTITIES, first_departure
-from plumbline.model.kinematics import quaternion_conjugate, quaternion_product, rotation_matrix
+from plumbline.model.kinematics import (
+    quaternion_conjugate,
+    quaternion_product,
+    rotation_matrix,
+    rotation_vector,
+)
 from plumbline.model.loops import cut_open, determinate_projectors, singular_values
 from plumbline.storage.results_schema import DamagedResults
 from reports.chunks import COARSE, ChunkBuilder, decimate, decimate_times, log_scale_codes
@@ -331,7 +336,9 @@ def _motion_frames(
         r, p, times = _run_poses(poses, runs[key], n)
         if len(times) != len(t) or np.any(np.abs(times - t) > 1e-9 * max(1.0, t[-1])):
             continue
-        difference = np.concatenate([r - r0, rotation_vector(p, p0)], -1)[pick]
+        difference = np.concatenate(
+            [r - r0, rotation_vector(quaternion_product(p, quaternion_conjugate(p0)))], -1
+        )[pick]
         usable = np.isfinite(difference).all((1, 2))
         scale = np.abs(np.where(usable[:, None, None], difference, 0)).max((1, 2))
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -355,11 +362,10 @@ def _few_levels(x: Array, most: int, levels: int) -> Array:
 
 
 def _still(scenario: Record, packer: ChunkBuilder) -> Record | None:
-    """Encode the initial state as a motion of one frame; None where the results do not hold its positions."""
-    state = scenario.get("state") or {}
-    if "r" not in state:  # of a chain
+    """Encode the initial state as a motion of one frame; None where the results do not hold it."""
+    if scenario["state"] is None:
         return None
-    r, p = (np.array(state[name], float) for name in ("r", "p"))
+    r, p = (np.array(scenario["state"][name], float) for name in ("r", "p"))
     span = float(np.max(np.abs(r))) or 1.0
     none = {"scale": packer.add(np.zeros(1, np.float32)), "d": packer.add(np.zeros(6 * len(r), np.int8))}
     return {
@@ -377,7 +383,7 @@ def _still(scenario: Record, packer: ChunkBuilder) -> Record | None:
 def _loop_facts(scenario: Record) -> Record | None:
     """Count the rows that close loops, and what they leave determinate of each joint's wrench."""
     model = None if scenario["model"] is None else Model.from_fields(scenario["model"])
-    if model is None or not model.has_loops or "r" not in (scenario.get("state") or {}):
+    if model is None or not model.has_loops or scenario["state"] is None:
         return None
     state = State(**{name: np.array(value, float) for name, value in scenario["state"].items()})
     cut = cut_open(model)
@@ -402,25 +408,6 @@ def _run_poses(poses: Columns, rows: np.ndarray, n: int) -> tuple[Array, Array, 
     p = np.stack([poses[k][order] for k in ("p0", "p1", "p2", "p3")], -1).reshape(-1, n, 4).astype(float)
     with np.errstate(invalid="ignore", divide="ignore"):
         return r, p / np.linalg.norm(p, axis=-1, keepdims=True), poses["t"][order][::n].astype(float)
-
-
-def rotation_vector(p: Float[Array, "... 4"], p0: Float[Array, "... 4"]) -> Float[Array, "... 3"]:
-    """Return the rotation between two attitudes, exact for tiny angles.
-
-    Args:
-        p: unit quaternions, body to world.
-        p0: unit quaternions from which the rotation starts.
-
-    Returns:
-        Rotation vectors in the world frame [rad]: p = exp(vector / 2) p0.
-
-    """
-    q = quaternion_product(p, quaternion_conjugate(p0))
-    q = np.where(q[..., :1] < 0, -q, q)
-    size = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        factor = np.where(size > 1e-12, 2 * np.arctan2(size, q[..., :1]) / size, 2.0)
-    return np.asarray(factor * q[..., 1:])
 
 
 def _body_shapes(scenario: Record) -> list[Record]:

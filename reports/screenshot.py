@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 BROWSER_NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "msedge")
+WIDTH, HEIGHT = 1400, 1000  # px, of the window
 
 
 def find_chromium() -> str | None:
@@ -19,15 +20,11 @@ def find_chromium() -> str | None:
     return next((found for name in BROWSER_NAMES if (found := shutil.which(name))), None)
 
 
-def take_screenshot(
-    report: Path, image_path: Path, view: str = "", width: int = 1400, height: int = 1000
-) -> Path:
+def take_screenshot(report: Path, image_path: Path, view: str = "") -> Path:
     """Open the report in Chromium and save the visible part as PNG.
 
     Args:
         view: the part of the address after the file, for example "#scenario=…&engine=…"; "" for the matrix.
-        width: of the window [px].
-        height: of the window [px].
 
     Returns:
         ``image_path``.
@@ -43,7 +40,7 @@ def take_screenshot(
         raise RuntimeError(f"no Chromium here: none of {', '.join(BROWSER_NAMES)} is on the path")
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=found, args=["--no-sandbox"])
-        page = browser.new_page(viewport={"width": width, "height": height}, color_scheme="light")
+        page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT}, color_scheme="light")
         page.goto(report.resolve().as_uri() + view)
         page.wait_for_selector("html[data-shown]")
         page.wait_for_timeout(300)  # the plots take their size in the next frames

@@ -87,12 +87,9 @@ class Results:
             DamagedResults: the file is damaged.
 
         """
-        try:
-            table = read_table(self.folder, name)
-        except FileNotFoundError:
-            return {}
+        table = _table_if_any(self.folder, name)
         columns: Columns = {}
-        for column in table.column_names:
+        for column in table.column_names if table else ():
             values = table[column].to_numpy(zero_copy_only=False)
             columns[column] = _clean_texts(values) if values.dtype == object else values
         return columns
@@ -148,6 +145,25 @@ class Results:
             for key, name in read_script_index(self.folder).items()
             if (folder / name).is_file()
         }
+
+
+def study_records(folder: Path, name: str) -> list[Record]:
+    """Read the table of a study, "drift" or "coverage", as records; none where the file is missing.
+
+    Raises:
+        DamagedResults: the file is damaged.
+
+    """
+    table = _table_if_any(folder, name)
+    records: list[Record] = replace_unprintable(table.to_pylist() if table else [])
+    return records
+
+
+def _table_if_any(folder: Path, name: str) -> Any:
+    try:
+        return read_table(folder, name)
+    except FileNotFoundError:
+        return None
 
 
 def _clean_texts(values: np.ndarray) -> np.ndarray:

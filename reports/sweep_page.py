@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow.parquet as pq
-from markupsafe import Markup
 
 from plumbline.storage.results_store import write_atomically
 from reports import html_report
@@ -95,26 +94,20 @@ def render(parameters: Sequence[str], rows: Sequence[Record], sweep_info: Record
     poor = [row for row in rows if row["verdict"] not in ("agrees", "not installed")]
     cells = len({row["cell"] for row in rows})
     counts = Counter((row["implementation"], row["verdict"]) for row in rows)
-    style = html_report.stylesheet()
-    return (
-        html_report.template_environment()
-        .get_template("sweep.html")
-        .render(
-            policy=html_report.content_security_policy(style),
-            css=Markup(style),
-            sentence=f"{cells} cells: "
-            + "; ".join(f"{name} {verdict} {k}" for (name, verdict), k in counts.items()),
-            scenario=sweep_info.get("scenario", ""),
-            about=sweep_info,
-            across=across,
-            down=down,
-            folded=varied[2:],
-            maps=maps,
-            poor=poor[:MAX_LISTED_ROWS],
-            unlisted=len(poor) - MAX_LISTED_ROWS,
-            parameters=parameters,
-            shades=SHADE_COUNT,
-        )
+    return html_report.render_page(
+        "sweep.html",
+        sentence=f"{cells} cells: "
+        + "; ".join(f"{name} {verdict} {k}" for (name, verdict), k in counts.items()),
+        scenario=sweep_info.get("scenario", ""),
+        about=sweep_info,
+        across=across,
+        down=down,
+        folded=varied[2:],
+        maps=maps,
+        poor=poor[:MAX_LISTED_ROWS],
+        unlisted=len(poor) - MAX_LISTED_ROWS,
+        parameters=parameters,
+        shades=SHADE_COUNT,
     )
 
 

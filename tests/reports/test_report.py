@@ -28,7 +28,7 @@ from rich.markup import render
 from plumbline.cli import verdict_matrix
 from plumbline.cli.main import main
 from plumbline.judging.rows import VERDICT_STYLES, Row, Verdict
-from plumbline.model.kinematics import quaternion_product
+from plumbline.model.kinematics import quaternion_conjugate, quaternion_product, rotation_vector
 from reports import chunks, html_report, junit, report_data, sarif, step_summary
 from reports.earlier_runs import History
 from reports.findings_list import declared_gaps, findings_for_page
@@ -346,7 +346,10 @@ def test_rotation_vectors_are_exact_for_tiny_and_large_angles():
         turned = quaternion_product(np.array([np.cos(angle / 2), *(np.sin(angle / 2) * axis)]), base)
         for sign in (1, -1):
             assert np.allclose(
-                report_data.rotation_vector(sign * turned, base), angle * axis, rtol=1e-6, atol=2e-16
+                rotation_vector(quaternion_product(sign * turned, quaternion_conjugate(base))),
+                angle * axis,
+                rtol=1e-6,
+                atol=2e-16,
             )
 
 
@@ -501,6 +504,7 @@ def test_a_finding_has_its_mechanism_with_the_worst_body_marked_a_plot_and_its_n
     row["extra"] = {"body": 1.0}
     scenario = results.scenarios[row["scenario"]]
     start = {"p": [1.0, 0, 0, 0], "omega": [0.0] * 3, "u": [0.0, 0, 1], "udot": [0.0] * 3}
+    start["r"] = [0.0, 0, -1]
     scenario["state"] = {name: [x] * scenario["bodies"] for name, x in start.items()}
     found = findings_for_page(results, History())
     assert [f["name"] for f in found] == [f["name"] for f in results.findings]
