@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args, get_type_hints
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model, model_validator
 
-from plumbline.judging.rows import Level
+from plumbline.judging.rows import Row
 from plumbline.model.datatypes import (
     JOINT_ELEMENTS,
     JOINT_FIELDS,
@@ -208,34 +208,12 @@ class _Cause(_Part):
     occurrence: _Occurrence | None = None
 
 
-class _Row(_Part):
-    key: str
-    scenario: str
-    family: str
-    engine: str
-    engine_version: str
-    level: Level
-    integrator: str
-    quantity: str
-    unit: str
-    value: float | None
-    tolerance: float | None
-    ratio: float | None
-    verdict: _VerdictWord
-    reason: str
-    derivation: str
-    uncertainty: float | None
-    compared_until: float | None
-    order: float | None
-    declared_order: _Count | None
-    alias_of: str | None
-    known_issue: str | None
-    is_declared: bool
-    diagnosis: str | None
-    causes: list[_Cause]
-    user_rtol: float | None
-    cpu_time: _Duration
-    extra: dict[str, float | str | None]
+_ROW_TYPES = get_type_hints(Row) | {
+    "key": str, "verdict": _VerdictWord, "declared_order": _Count | None, "causes": list[_Cause],
+    "cpu_time": _Duration, "extra": dict[str, float | str | None],
+}  # fmt: skip
+_ROW_FIELDS: dict[str, Any] = {name: (kind, ...) for name, kind in _ROW_TYPES.items()}
+_Row: Any = create_model("_Row", __base__=_Part, **_ROW_FIELDS)
 
 
 class _Finding(_Part):
