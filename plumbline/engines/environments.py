@@ -116,11 +116,14 @@ def declared_attribute(engine: str, attribute: str) -> Any:
 def declared_importer_attribute(importer: str, attribute: str) -> Any:
     """Read a literal class attribute of an importer column without importing it.
 
+    Args:
+        importer: its name, with or without a version.
+
     Returns:
         Its value; None where no class declares it.
 
     """
-    module, _, class_name = IMPORTERS[importer].partition(":")
+    module, _, class_name = IMPORTERS[split_version(importer)[0]].partition(":")
     return _read_attribute(module, class_name, attribute)
 
 

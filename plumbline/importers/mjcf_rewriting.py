@@ -19,7 +19,12 @@ from plumbline.importers.mjcf import DefaultClasses, body_elements, joint_elemen
 from plumbline.importers.neutral_model import NeutralBody
 from plumbline.importers.xml_tree import Element
 from plumbline.model.datatypes import Array
-from plumbline.model.kinematics import quaternion_product, rotation_matrix
+from plumbline.model.kinematics import (
+    quaternion_exponential,
+    quaternion_of,
+    quaternion_product,
+    rotation_matrix,
+)
 
 RENAMED = "renamed_"  # before every name of the rewriting with other names
 DENSITY = 1000.0  # kg/m³, of geoms without mass or density
@@ -333,8 +338,7 @@ class _Compiler:
 
 
 def _about(axis: Array, angle: float) -> Array:
-    unit = axis / np.linalg.norm(axis)
-    return np.array([math.cos(angle / 2), *(math.sin(angle / 2) * unit)])
+    return quaternion_exponential(angle / 2 * axis / np.linalg.norm(axis))
 
 
 def _turn_z_to(direction: Array) -> Array:
@@ -346,12 +350,10 @@ def _turn_z_to(direction: Array) -> Array:
 
 
 def _turn_of_axes(x: Array, y: Array) -> Array:
-    """The rotation whose first two columns are x and y, made orthogonal: z to its place, then about it."""
-    x = x / np.linalg.norm(x)
-    z = np.cross(x, y - x * (x @ y))
-    first = _turn_z_to(z)
-    seen = rotation_matrix(first).T @ x
-    return quaternion_product(first, _about(np.eye(3)[2], math.atan2(seen[1], seen[0])))
+    """The rotation whose first two columns are x and y, made orthogonal."""
+    x, z = x / np.linalg.norm(x), np.cross(x, y)
+    z = z / np.linalg.norm(z)
+    return quaternion_of(np.column_stack([x, np.cross(z, x), z]))
 
 
 def _numbers(element: Element, name: str) -> Array:

@@ -28,6 +28,7 @@ from typing import Literal
 import numpy as np
 
 from plumbline.model.datatypes import Array, Float
+from plumbline.scenario.line_and_column_errors import Problem
 
 MAX_MAGNITUDE = 1e30  # of a file's SI numbers: beyond it products leave the range where engines can compute
 MIN_INERTIA = 1e-100  # kg, kg m²: below it products lose digits, or vanish
@@ -50,6 +51,10 @@ class Source:
     def __str__(self) -> str:
         """Write as ``file:line``."""
         return f"{self.file}:{self.line}" if self.line else self.file
+
+    def problem(self, message: str, valid: str = "", hint: str = "", field: str = "") -> Problem:
+        """Make a problem at this place, see `Problem`."""
+        return Problem(self.file, self.line, self.column, field, message, valid, hint)
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,16 +211,11 @@ def zero_directions(model: NeutralModel) -> Iterator[tuple[str, float, str, Sour
         As `extreme_numbers`: the parameter, its length, what would be valid, and where the file says it.
 
     """
-    for body in model.bodies:
-        found = [("attitude", f"body {body.name}", body.attitude, body.fields.get("attitude", body.source))]
-        found += [
-            ("axis", f"joint {joint.name}", joint.axis, joint.fields.get("axis", joint.source))
-            for joint in body.joints
-            if joint.kind in ("hinge", "slide")
-        ]
-        for name, owner, values, place in found:
-            if not 0.5 < (length := float(np.linalg.norm(values))) < 2:
-                yield f"the normalised {name} of {owner}", length, "numbers whose squares are in range", place
+    moving = {f"joint {joint.name}" for joint in model.joints if joint.kind in ("hinge", "slide")}
+    for name, owner, values, place in _parameters(model):
+        is_direction = name == "attitude" or (name == "axis" and owner in moving)
+        if is_direction and not 0.5 < (length := float(np.linalg.norm(values))) < 2:
+            yield f"the normalised {name} of {owner}", length, "numbers whose squares are in range", place
 
 
 def extreme_numbers(model: NeutralModel) -> Iterator[tuple[str, float, str, Source]]:
@@ -228,23 +228,21 @@ def extreme_numbers(model: NeutralModel) -> Iterator[tuple[str, float, str, Sour
         The parameter with its owner in words, the number, what would be valid, and where the file says it.
 
     """
-    large, small = f"a number up to {MAX_MAGNITUDE:g}", f"0, or at least {MIN_INERTIA:g}"
-    if not (worst := _largest(model.gravity)) <= MAX_MAGNITUDE:
-        yield "gravity of the model", worst, large, model.gravity_source
+    for name, owner, values, place in _parameters(model):
+        worst = float(np.max(np.abs(values)))
+        if not worst <= MAX_MAGNITUDE:
+            yield f"{name} of {owner}", worst, f"a number up to {MAX_MAGNITUDE:g}", place
+        elif name in ("mass", "inertia") and 0 < worst < MIN_INERTIA:
+            yield f"{name} of {owner}", worst, f"0, or at least {MIN_INERTIA:g}", place
+
+
+def _parameters(model: NeutralModel) -> Iterator[tuple[str, str, Array | float, Source]]:
+    """Every parameter: its name, its owner in words, its numbers, and where the file says it."""
+    yield "gravity", "the model", model.gravity, model.gravity_source
     for body in model.bodies:
         for name in ("position", "attitude", "mass", "center", "inertia"):
-            worst, place = _largest(getattr(body, name)), body.fields.get(name, body.source)
-            what = f"{name} of body {body.name}"
-            if not worst <= MAX_MAGNITUDE:
-                yield what, worst, large, place
-            elif name in ("mass", "inertia") and 0 < worst < MIN_INERTIA:
-                yield what, worst, small, place
+            yield name, f"body {body.name}", getattr(body, name), body.fields.get(name, body.source)
         for joint in body.joints:
             for name in _JOINT_NUMBERS:
-                if not (worst := _largest(getattr(joint, name))) <= MAX_MAGNITUDE:
-                    words = f"{name.replace('_', ' ')} of joint {joint.name}"
-                    yield words, worst, large, joint.fields.get(name, joint.source)
-
-
-def _largest(values: Array | float) -> float:
-    return float(np.max(np.abs(values)))
+                place = joint.fields.get(name, joint.source)
+                yield name.replace("_", " "), f"joint {joint.name}", getattr(joint, name), place

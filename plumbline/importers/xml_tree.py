@@ -80,15 +80,7 @@ class Element:
         """
         name = self.attributes.get("name")
         where = f"<{self.tag} name={shorten(repr(name))}>" if name is not None else f"<{self.tag}>"
-        return Problem(
-            self.source.file,
-            self.source.line,
-            self.source.column,
-            f"{where} {attribute}".strip(),
-            message,
-            valid,
-            hint,
-        )
+        return self.source.problem(message, valid, hint, f"{where} {attribute}".strip())
 
 
 def parse_numbers(

@@ -87,7 +87,6 @@ class Explanation:
     """What explains an importer's difference."""
 
     causes: tuple[Cause, ...] = ()
-    remaining: float = 0.0  # largest ratio of error and tolerance that the causes leave
     differences: tuple[Change, ...] = ()  # of the descriptions, where no cause is proved
     is_proved: bool = False
 
@@ -151,9 +150,8 @@ def _explain(
         found = trial.smallest(differences(moved, reading))
     if found is None:
         return Explanation(differences=(*structure, *changes))
-    remaining = trial.remaining(found, len(answers))
-    causes = _causes(title, [*structure, *found], remaining)
-    return Explanation(causes, remaining, is_proved=True)
+    causes = _causes(title, [*structure, *found], trial.remaining(found, len(answers)))
+    return Explanation(causes, is_proved=True)
 
 
 def _finer(changes: Sequence[Change], all_: Sequence[Change]) -> list[Change]:

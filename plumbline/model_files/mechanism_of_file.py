@@ -33,7 +33,7 @@ from plumbline.model.sampling import derive_seed
 from plumbline.model_files.prepared_file import MJCF_READER, BaseChoice, PreparedFile, prepare_file
 from plumbline.processes.isolation import ScratchFolder
 from plumbline.processes.worker_pool import Limits, Scheduler, Task, WorkerPool
-from plumbline.scenario.line_and_column_errors import Problem, shorten
+from plumbline.scenario.line_and_column_errors import shorten
 from plumbline.scenario.loader import Scenario, build_scenario
 from plumbline.scenario.schema import MIN_INERTIA
 from plumbline.scenario.yaml_source import YamlSource
@@ -171,17 +171,16 @@ def mechanism_of_model(model: NeutralModel, connections: Sequence[Connection], s
     name = Path(shown).stem
     lumped = lump_fixed_bodies(model)
     problems = [
-        Problem(
-            (s := body.fields.get("mass", body.source)).file, s.line, s.column, "",
-            f"body {body.name!r} moves and has no mass", "a mass above 0 of it or of what is fixed to it",
+        body.fields.get("mass", body.source).problem(
+            f"body {body.name!r} moves and has no mass", "a mass above 0 of it or of what is fixed to it"
         )
         for body in lumped.bodies
         if body.mass < MIN_INERTIA
-    ]  # fmt: skip
+    ]
     if not lumped.bodies:
         is_urdf = Path(shown).suffix == ".urdf"
         hint = "--base free lets the root link of a URDF move" if is_urdf else ""
-        problems.append(Problem(shown, 1, 1, "", "nothing in it moves", "at least one joint", hint))
+        problems.append(Source(shown, 1).problem("nothing in it moves", "at least one joint", hint))
     if problems:
         raise ModelFileError(problems)
     writer = _Writer(lumped, np.random.default_rng(derive_seed("model file", name)))

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from plumbline.engines.adapter import EngineInfo
-from plumbline.engines.environments import declared_importer_attribute, split_version
+from plumbline.engines.environments import declared_importer_attribute
 from plumbline.importers.importer import Reading
 from plumbline.importers.mjcf_rewriting import names_as_written
 from plumbline.importers.neutral_model import (
@@ -283,13 +283,13 @@ def judge_importer(
     name, info, answer = column
     context = RowContext(shown, MODEL_FAMILY, name, info.title, info.version)
     if answer.reading is None and not answer.failure:
-        formats = declared_importer_attribute(split_version(name)[0], "formats")
+        formats = declared_importer_attribute(name, "formats")
         reason = f"{info.title} reads {' and '.join(formats).upper()} files only"
         return [_row(context, "all", Verdict.INFORMATION, reason)], None
     if info.missing is not None:
         verdict = Verdict.FAILED if info.has_failed else Verdict.NOT_INSTALLED
         return [_row(context, "all", verdict, info.missing)], None
-    unsupported = declared_importer_attribute(split_version(name)[0], "unsupported") or {}
+    unsupported = declared_importer_attribute(name, "unsupported") or {}
     applies = "passive_force" not in unsupported
     judged = (model, truth.states) if applies else (without_passive_forces(model), truth.without_passive)
     found = judge_answer(context, *judged, answer, unsupported)

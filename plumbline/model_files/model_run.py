@@ -190,7 +190,7 @@ class FileRun:
             self._task("read", name, read_model_file, file)
             for name, info in self.engines.items()
             if info.missing is None
-            and file.format in declared_formats(name)
+            and file.format in (declared_importer_attribute(name, "formats") or ())
             and (name in plan.importers or file.format == "mjcf")
         ]
         if file.format == "urdf":
@@ -332,13 +332,3 @@ class FileRun:
         if outcome.is_overdue or outcome.is_out_of_memory:
             return Verdict.UNRESOLVED, f"not judged: {self._failure(outcome, what)}"
         return Verdict.HARNESS_FAILED, f"the judging failed: {outcome.failure}"
-
-
-def declared_formats(name: str) -> tuple[str, ...]:
-    """Read which formats an importer reads, without importing it.
-
-    Args:
-        name: its name, with or without a version.
-
-    """
-    return tuple(declared_importer_attribute(split_version(name)[0], "formats") or ())

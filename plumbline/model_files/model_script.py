@@ -52,9 +52,7 @@ NEUTRAL = {
     "mujoco": {"free": (0, 0, 0, 1, 0, 0, 0), "ball": (1, 0, 0, 0)},
     "drake": {"free": (1, 0, 0, 0, 0, 0, 0), "ball": (0, 0, 0)},
 }
-PRINTED_PRECISION = (
-    1e-9  # relative: a script that prints another number than the comparison is not handed out
-)
+PRINTED_PRECISION = 1e-9  # relative: a script that prints another number is not handed out
 
 
 def stored_differences(document: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:

@@ -16,7 +16,7 @@ from plumbline.importers.mjcf_rewriting import rewritings
 from plumbline.importers.neutral_model import NeutralModel, Source, extreme_numbers, zero_directions
 from plumbline.importers.urdf import read_urdf
 from plumbline.importers.xml_tree import Element, ModelFileError, read_xml, write_xml, write_xml_in_place
-from plumbline.scenario.line_and_column_errors import Problem, shorten
+from plumbline.scenario.line_and_column_errors import shorten
 from plumbline.scenario.yaml_reader import is_file
 
 BaseChoice = Literal["fixed", "free", "auto"]
@@ -57,12 +57,12 @@ class PreparedFile:
             place = self.place_of(reading.refusal) if reading else Source(self.shown, 1)
             words = f"refuses it: {self.in_users_words(reading.refusal)}" if reading else failure
             message = f"MuJoCo, which defines MJCF, {shorten(words, 400)}"
-            raise ModelFileError([Problem(place.file, place.line, place.column, "", message)])
+            raise ModelFileError([place.problem(message)])
         if model is None:
             assert reading is not None and reading.model is not None
             model = mjcf.with_sources(reading.model, self.tree)
         problems = [
-            Problem(place.file, place.line, place.column, "", f"{what} is {value:g}", valid)
+            place.problem(f"{what} is {value:g}", valid)
             for what, value, valid, place in [*extreme_numbers(model)] or [*zero_directions(model)]
         ]
         if problems:
@@ -142,13 +142,12 @@ def prepare_file(
     kind = _format_of(tree, shown)
     folder = (root or package_folder(path)).resolve()
     if mjcf.resolve_inside(path, folder) is None:
-        raise ModelFileError([Problem(shown, 0, 0, "", f"is outside the root folder {folder}")])
+        raise ModelFileError([Source(shown, 0).problem(f"is outside the root folder {folder}")])
     chosen: Base = "fixed" if base == "auto" else base
     if kind == "mjcf" and base != "auto":
         hint = "leave --base out, or add or remove the <freejoint> in the file"
-        raise ModelFileError(
-            [Problem(shown, 1, 1, "", "an MJCF file says itself whether its base moves", hint=hint)]
-        )
+        message = "an MJCF file says itself whether its base moves"
+        raise ModelFileError([Source(shown, 1).problem(message, hint=hint)])
     is_copied = strip
     if kind == "mjcf":
         count = sum(1 for element in tree.walk() if element.tag == "include")
@@ -190,7 +189,7 @@ def _format_of(tree: Element, shown: str) -> Format:
     names = [n for element in tree.walk() for n in (element.tag, *element.attributes)]
     if any(name.startswith(("xacro:", "xmlns:xacro")) and not name.startswith("xmlns") for name in names):
         hint = f"expand it first: xacro {shown} > robot.urdf"
-        raise ModelFileError([Problem(shown, tree.source.line, 1, "", "is a xacro file", hint=hint)])
+        raise ModelFileError([tree.source.problem("is a xacro file", hint=hint)])
     if tree.tag in _ROOT_TAGS:
         return _ROOT_TAGS[tree.tag]
     message, hint = f"its root element is <{shorten(tree.tag)}>", ""
@@ -198,8 +197,7 @@ def _format_of(tree: Element, shown: str) -> Format:
         message, hint = "is an SDF file", "convert it to URDF, or name the URDF that it was made from"
     elif tree.tag == "mujocoinclude":
         hint = "name the file that includes it"
-    problem = Problem(shown, tree.source.line, 1, "", message, "<robot> (URDF) or <mujoco> (MJCF)", hint)
-    raise ModelFileError([problem])
+    raise ModelFileError([tree.source.problem(message, "<robot> (URDF) or <mujoco> (MJCF)", hint)])
 
 
 def _check_references(tree: Element, kind: Format, folder: Path, root: Path) -> None:
