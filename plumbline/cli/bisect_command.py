@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from plumbline.cli import options
-from plumbline.cli.help_texts import EXIT_CODES, examples
+from plumbline.cli.help_texts import command
 from plumbline.cli.terminal_output import log, print_json
 from plumbline.engines.environments import EnvironmentUnavailable, version_problem
 from plumbline.engines.registry import IMPORTERS
@@ -40,13 +40,10 @@ def _check_version(_: click.Context, parameter: click.Parameter, text: str | Non
     return text or ""
 
 
-@click.command(
-    epilog=examples(
-        "bisect robot.urdf --engine mujoco",
-        "bisect robot.urdf --engine pinocchio --good 3.4.0 --bad 4.1.0",
-        "bisect reports/out tumbling-ball/mujoco@3.9.0/trajectory/RK4/order",
-    )
-    + EXIT_CODES
+@command(
+    "bisect robot.urdf --engine mujoco",
+    "bisect robot.urdf --engine pinocchio --good 3.4.0 --bad 4.1.0",
+    "bisect reports/out tumbling-ball/mujoco@3.9.0/trajectory/RK4/order",
 )
 @click.argument("target", metavar="FILE|RESULT", type=click.Path(path_type=Path, exists=True))
 @click.argument("key", required=False)

@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from plumbline.cli import options
-from plumbline.cli.help_texts import EXIT_CODES, examples
+from plumbline.cli.help_texts import command, examples
 from plumbline.engines import specifications
 from plumbline.processes.line_process import BadSpecification
 from plumbline.processes.worker_pool import Limits
@@ -36,12 +36,9 @@ def serve(engine: str) -> None:
     serve_standard_streams(adapter)
 
 
-@click.command(
-    epilog=examples(
-        "contract 'cmd:./my_engine --fast'",
-        "contract my_engine.py:MyEngine --level all --junit contract.xml",
-    )
-    + EXIT_CODES,
+@command(
+    "contract 'cmd:./my_engine --fast'",
+    "contract my_engine.py:MyEngine --level all --junit contract.xml",
 )
 @click.argument("engine")
 @click.option(

@@ -12,7 +12,7 @@ import click
 from plumbline import layout
 from plumbline.cli import options
 from plumbline.cli.findings_output import describe_run
-from plumbline.cli.help_texts import EXIT_CODES, examples
+from plumbline.cli.help_texts import command
 from plumbline.cli.terminal_output import (
     command_line,
     count_noun,
@@ -29,14 +29,11 @@ from plumbline.processes.worker_pool import Limits
 MAX_MINUTES = 1e5
 
 
-@click.command(
-    epilog=examples(
-        "fuzz --minutes 10",
-        "fuzz --engine mujoco --engine pinocchio --seed 7 --findings 3",
-        "fuzz --minutes 480 --corpus corpus --jobs 4",
-    )
-    + EXIT_CODES
-    + """
+@command(
+    "fuzz --minutes 10",
+    "fuzz --engine mujoco --engine pinocchio --seed 7 --findings 3",
+    "fuzz --minutes 480 --corpus corpus --jobs 4",
+    session="""
 \b
 A session:
   random mechanisms of seed 2875430316 (--seed repeats them)

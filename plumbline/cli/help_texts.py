@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Callable
+from typing import Any
+
+import click
 
 from plumbline.execution.exit_codes import EXIT_CODE_MEANINGS
 
@@ -31,3 +35,14 @@ def examples(*lines: str) -> str:
 
     """
     return "\n".join(["\b", "Examples:", *(f"  python -m plumbline {line}" for line in lines), "", ""])
+
+
+def command(*lines: str, session: str = "") -> Callable[[Callable[..., Any]], click.Command]:
+    """Make a command whose help ends with examples and exit codes.
+
+    Args:
+        *lines: of `examples`.
+        session: what a session looks like, for the end of the help.
+
+    """
+    return click.command(epilog=(examples(*lines) if lines else "") + EXIT_CODES + session)

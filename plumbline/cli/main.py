@@ -131,9 +131,8 @@ class LazyGroup(click.Group):
                 return super().invoke(ctx)
         except KeyboardInterrupt as interruption:
             resume = " ".join(("run the same command", *interruption.args, "to resume"))
-            is_kept = (
-                ctx.obj is not None and ctx.obj.holds_everything
-            )  # the result cache of `run` and `nightly`
+            # the result cache of `run` and `nightly`
+            is_kept = ctx.obj is not None and ctx.obj.holds_everything
             end = f"; finished cells are kept, {resume}" if is_kept else ""
             click.echo(f"\ninterrupted{end}", err=True)
             # CPython remembers an interruption that passed through exec(), as of a dataclass being made, and
@@ -150,10 +149,8 @@ class LazyGroup(click.Group):
             sys.exit(ExitCode.MACHINE_FAILED)
         except Exception as error:
             words = shorten(" ".join(str(error).split()), 200)
-            click.echo(
-                f"internal error: {type(error).__name__}: {words}; the traceback is in {_write_traceback()}",
-                err=True,
-            )
+            what = f"internal error: {type(error).__name__}: {words}"
+            click.echo(f"{what}; the traceback is in {_write_traceback()}", err=True)
             sys.exit(ExitCode.HARNESS_FAILED)
 
 

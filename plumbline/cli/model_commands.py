@@ -15,7 +15,7 @@ from rich.table import Table
 
 from plumbline import __version__
 from plumbline.cli import options
-from plumbline.cli.help_texts import EXIT_CODES, examples
+from plumbline.cli.help_texts import command
 from plumbline.cli.terminal_output import (
     ProgressDisplay,
     command_line,
@@ -72,15 +72,12 @@ def _parse_state(_: click.Context, __: click.Parameter, text: str | None) -> dic
     return state
 
 
-@click.command(
-    epilog=examples(
-        "model robot.urdf",
-        "model robot.urdf --base free --engine mujoco --engine pinocchio",
-        "model robots/*.xml --strip-geometry --json | jq '.files[].causes'",
-        "model arm.urdf --engine mujoco@3.9.0 --engine mujoco@4.0.0",
-        "model arm.urdf --at shoulder=0.3,elbow=-1.2",
-    )
-    + EXIT_CODES
+@command(
+    "model robot.urdf",
+    "model robot.urdf --base free --engine mujoco --engine pinocchio",
+    "model robots/*.xml --strip-geometry --json | jq '.files[].causes'",
+    "model arm.urdf --engine mujoco@3.9.0 --engine mujoco@4.0.0",
+    "model arm.urdf --at shoulder=0.3,elbow=-1.2",
 )
 @click.argument("files", nargs=-1, required=True, metavar="FILE...")
 @options.model_file_options(are_passed=True)

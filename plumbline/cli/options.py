@@ -183,10 +183,6 @@ def check_importer(name: str) -> None:
         raise click.BadParameter(f"{name}: {problem}")
 
 
-def _note_trust(context: click.Context, _: click.Parameter, is_trusting: bool) -> None:
-    context.meta[_TRUST] = is_trusting
-
-
 def _note_value(context: click.Context, option: click.Parameter, value: Any) -> Any:
     context.meta[f"plumbline.{option.name}"] = value
     return value
@@ -240,7 +236,7 @@ _trust_option = click.option(
     is_flag=True,
     is_eager=True,
     expose_value=False,
-    callback=_note_trust,
+    callback=_note_value,
     help="Start the engines that plumbline.toml of this folder names, now and as long as it does not change.",
 )
 

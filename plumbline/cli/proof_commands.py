@@ -13,7 +13,7 @@ import numpy as np
 
 from plumbline import layout
 from plumbline.cli import options
-from plumbline.cli.help_texts import EXIT_CODES, examples
+from plumbline.cli.help_texts import command
 from plumbline.cli.terminal_output import ProgressDisplay, count_noun, log, print_json, print_table
 from plumbline.execution.exit_codes import ExitCode
 from plumbline.model.datatypes import EngineFailure
@@ -28,14 +28,11 @@ _SUBJECT = (  # of what a certificate is a proof: printed as a sentence
 MAX_DURATION = 1000.0  # s; two bodies take minutes for 30 s
 
 
-@click.command(
-    epilog=examples(
-        "prove tumbling-ball double-tumbling-balls",
-        "prove tumbling-rod --duration 0.5 --out certificates",
-        "prove my-pendulum.yaml --precision octuple --json",
-        "verify certificates/*.json.gz",
-    )
-    + EXIT_CODES
+@command(
+    "prove tumbling-ball double-tumbling-balls",
+    "prove tumbling-rod --duration 0.5 --out certificates",
+    "prove my-pendulum.yaml --precision octuple --json",
+    "verify certificates/*.json.gz",
 )
 @click.argument("names", nargs=-1, required=True, metavar="SCENARIO...")
 @click.option(
@@ -75,13 +72,10 @@ def prove(names: tuple[str, ...], duration: float | None, precision: Any, out: P
     _finish(records, as_json)
 
 
-@click.command(
-    epilog=examples(
-        "verify certificates/tumbling-ball.json.gz",
-        "verify tumbling-ball.json.gz --scenario tumbling-ball",
-        "verify certificates/*.json.gz --json",
-    )
-    + EXIT_CODES
+@command(
+    "verify certificates/tumbling-ball.json.gz",
+    "verify tumbling-ball.json.gz --scenario tumbling-ball",
+    "verify certificates/*.json.gz --json",
 )
 @click.argument("files", nargs=-1, required=True, metavar="FILE...", type=click.Path(path_type=Path))
 @click.option(

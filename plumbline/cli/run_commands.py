@@ -13,7 +13,7 @@ import reports
 from plumbline import layout
 from plumbline.cli import options
 from plumbline.cli.findings_output import wrap
-from plumbline.cli.help_texts import EXIT_CODES, examples
+from plumbline.cli.help_texts import command
 from plumbline.cli.run_display import RunDisplay
 from plumbline.cli.terminal_output import (
     command_line,
@@ -46,15 +46,12 @@ new_only_option = click.option(
 )
 
 
-@click.command(
-    epilog=examples(
-        "run                                    (everything)",
-        "run double-tumbling-balls --engine mujoco",
-        "run --family chain --level state",
-        "run my-pendulum.yaml --out results --json | jq .sentence",
-        "run my-robot.urdf --base free",
-    )
-    + EXIT_CODES,
+@command(
+    "run                                    (everything)",
+    "run double-tumbling-balls --engine mujoco",
+    "run --family chain --level state",
+    "run my-pendulum.yaml --out results --json | jq .sentence",
+    "run my-robot.urdf --base free",
 )
 @options.names_argument
 @options.model_file_options(are_passed=False)
@@ -139,13 +136,10 @@ def run(
     _finish(result, report, as_json, has_matrix)
 
 
-@click.command(
-    epilog=examples(
-        "nightly                               (everything)",
-        "nightly --random 1000 --seed 7 --out nights",
-        "history nightly",
-    )
-    + EXIT_CODES,
+@command(
+    "nightly                               (everything)",
+    "nightly --random 1000 --seed 7 --out nights",
+    "history nightly",
 )
 @options.names_argument
 @options.engines_option

@@ -22,15 +22,14 @@ class RunDisplay(ProgressDisplay, RunObserver):
     """The matrix that fills in, above the progress bar; elsewhere than on a terminal a line per scenario.
 
     Attributes:
-        finished: the cells of the scenarios whose tasks have all finished.
-        rows: theirs, by scenario.
+        rows: those of the scenarios whose tasks have all finished, by scenario.
 
     """
 
     def __init__(self, file: Any) -> None:
         super().__init__(file)
-        self.finished, self.rows = VerdictMatrix({}), dict[str, Sequence[Row]]()
-        self._matrix = VerdictMatrix({})  # with the rows of unfinished scenarios
+        self.rows: dict[str, Sequence[Row]] = {}
+        self._matrix = VerdictMatrix({})  # with the rows of unfinished scenarios too
         self._refreshed = 0.0  # monotonic time of the last picture
         self._live = Live(
             console=self.bar.console, transient=True, auto_refresh=False, get_renderable=self._picture
@@ -54,7 +53,7 @@ class RunDisplay(ProgressDisplay, RunObserver):
             engines: description by name.
 
         """
-        self.finished, self._matrix = VerdictMatrix(engines), VerdictMatrix(engines)
+        self._matrix = VerdictMatrix(engines)
 
     def on_rows(self, scenario: str, rows: Sequence[Row], is_complete: bool) -> None:
         """Take rows of a scenario.
@@ -67,10 +66,9 @@ class RunDisplay(ProgressDisplay, RunObserver):
             self._matrix.add_rows(scenario, rows)
             return
         self.rows[scenario] = rows
-        self.finished.replace_rows(scenario, rows)
         self._matrix.replace_rows(scenario, rows)
         if not self.file.isatty():
-            make_console(self.file).print(self.finished.line(scenario), soft_wrap=True)
+            make_console(self.file).print(self._matrix.line(scenario), soft_wrap=True)
 
     def update(self, done: int, total: int, task_name: str) -> None:
         """Show how far the run is.

@@ -14,7 +14,7 @@ import pyarrow as pa
 import reports
 from plumbline import layout
 from plumbline.cli import options
-from plumbline.cli.help_texts import EXIT_CODES, examples
+from plumbline.cli.help_texts import command, examples
 from plumbline.cli.terminal_output import ProgressDisplay, count_noun, log, print_json, print_table
 from plumbline.engines.registry import ENGINES
 from plumbline.execution.exit_codes import ExitCode
@@ -29,7 +29,7 @@ from plumbline.scenario.loader import Scenario
 MAX_LISTED_CELLS = 10
 
 
-@click.command(epilog=EXIT_CODES)
+@command()
 @click.argument("file", metavar="FILE", type=click.Path(path_type=Path))
 @options.jobs_option
 @options.out_option(layout.output_folder("sweep"))
@@ -136,15 +136,12 @@ def _write_report_again(folder: Path) -> Path | None:
         return reports.write(folder) if (folder / "results.json").is_file() else None
 
 
-@click.command(
-    epilog=examples(
-        "coverage double-tumbling-rods",
-        "coverage furuta four-bar --level state",
-        "coverage --level state --json | jq '.entries[] | select(.smallest == null)'",
-        "coverage drag-rod --engine mujoco --engine exudyn",
-        "coverage --pairs",
-    )
-    + EXIT_CODES,
+@command(
+    "coverage double-tumbling-rods",
+    "coverage furuta four-bar --level state",
+    "coverage --level state --json | jq '.entries[] | select(.smallest == null)'",
+    "coverage drag-rod --engine mujoco --engine exudyn",
+    "coverage --pairs",
 )
 @options.names_argument
 @click.option(

@@ -22,22 +22,12 @@ VERDICT_COLOURS = {
 
 
 class VerdictMatrix:
-    """The rows of a run by scenario, worst scenario first.
-
-    Attributes:
-        scenario_count: number of scenarios with rows.
-
-    """
+    """The rows of a run by scenario, worst scenario first."""
 
     def __init__(self, engines: Mapping[str, EngineInfo]) -> None:
         """Start without rows."""
         self._engines = engines
         self._rows: dict[str, list[Row]] = {}
-
-    @property
-    def scenario_count(self) -> int:
-        """Number of scenarios."""
-        return len(self._rows)
 
     def add_rows(self, scenario: str, rows: Sequence[Row]) -> None:
         """Add rows of a scenario."""

@@ -49,7 +49,7 @@ def test_a_terminal_shows_cells_of_a_scenario_that_still_runs():
         progress(1, 7, "conical mujoco state")
         shown = file.getvalue()
         assert "conical" in shown and "✗" in shown and " 0.1" in shown and "1/7" in shown
-    assert display.finished.scenario_count == 0
+    assert not display.rows
 
 
 def test_without_a_terminal_each_finished_scenario_is_one_line():
