@@ -99,9 +99,7 @@ class EngineInfo:
     missing: str | None = None
     python: str = ""
     has_failed: bool = False  # the engine is missing for another reason than that it is not installed
-    is_lifted: bool = (
-        False  # whether accelerations of bodies are computed here from those of joint coordinates
-    )
+    is_lifted: bool = False  # whether accelerations of bodies are computed here from those of coordinates
 
 
 class Adapter(ABC):

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import multiprocessing
 import threading
-from types import TracebackType
 from typing import Any
 
 import distributed
@@ -56,9 +55,7 @@ class DaskCluster(Executor):
         self._tasks: dict[str, tuple[Task, int]] = {}  # by key of the future, with the number of attempts
         self._done = _dask.as_completed([])
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Disconnect; tasks that still run are dropped."""
         self._client.close()
 

@@ -14,7 +14,6 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field, replace
-from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 from plumbline.processes import worker_process
@@ -124,9 +123,7 @@ class Executor(ABC):
         """Return the executor."""
         return self
 
-    def __exit__(  # noqa: B027 (nothing to drop by default)
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:  # noqa: B027 (nothing to drop by default)
         """Drop what still runs."""
 
     @property
@@ -248,9 +245,7 @@ class WorkerPool(Executor):
         self._is_closed = False
         self._clock, self._last_poll = 0.0, time.monotonic()  # s
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Kill what still runs and remove the scratch folders."""
         with self._lock:
             self._is_closed = True

@@ -319,9 +319,10 @@ class ConvergenceMeasure:
     method: str
     level: str  # "trajectory" or "invariants"
     quantities: tuple[str, ...]
+    # of the last motion: cases that differ in their steps share its runs
     cache: dict[tuple[object, ...], tuple[MotionTruth, dict[float, RefinementRun]]] = field(
         default_factory=dict
-    )  # of the last motion: cases that differ in their steps share its runs
+    )
 
     @cached_property
     def integrator(self) -> Integrator:

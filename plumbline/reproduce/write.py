@@ -7,7 +7,6 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -22,20 +21,18 @@ from plumbline.model.invariants import LONG_RUN_QUANTITIES
 from plumbline.model.kinematics import complete_state
 from plumbline.model.sampling import compared_states
 from plumbline.processes.exceptions import PlumblineError
-from plumbline.processes.worker_pool import Limits, Outcome, ResultCache, Task, WorkerPool
+from plumbline.processes.worker_pool import Outcome, ResultCache, Task, WorkerPool
 from plumbline.reproduce.engine_client import EngineClient
 from plumbline.reproduce.measure import Disagreement
 from plumbline.reproduce.render import no_script_reason, render_script
 from plumbline.reproduce.shrink import OutOfTime, ReproductionCase
+from plumbline.scenario.line_and_column_errors import did_you_mean
 from plumbline.storage.results_store import read_results, write_atomically
 from plumbline.storage.script_index import read_script_index, script_name, scripts_folder, write_script_index
 from plumbline.storage.version_changes import read_version_changes
 from plumbline.truth.step_comparison import RUN_QUANTITIES
 
-REQUESTED_SECONDS, UNREQUESTED_SECONDS = (
-    60.0,
-    3.0,
-)  # of shrinking: a script by its key, and at the end of a run
+REQUESTED_SECONDS, UNREQUESTED_SECONDS = 60.0, 3.0  # of shrinking: a script by its key, at the end of a run
 MIN_CANDIDATES = 6  # shrinking needs at least so many; where they would take too long, it is not begun
 HINT = "request this row by its key"
 
@@ -72,8 +69,6 @@ def list_disagreements(folder: Path) -> dict[str, str]:
 def write_scripts(
     folder: Path,
     keys: Sequence[str] | None = None,
-    limits: Limits | None = None,
-    jobs: int | None = None,
     results: ResultCache | None = None,
     document: dict[str, Any] | None = None,
 ) -> WrittenScripts:
@@ -84,7 +79,6 @@ def write_scripts(
     Args:
         keys: the wanted rows; by default all that disagree: less time is spent on each, and scripts of an
             earlier run are removed.
-        jobs: number of workers; by default as many as the run had.
         results: scripts of earlier runs, used where nothing that they depend on has changed.
         document: content of the folder's results.json, where it has been read already.
 
@@ -101,14 +95,16 @@ def write_scripts(
     with _checked(folder):
         disagreeing = _disagreements(document)
         for key in keys or ():
-            _check_key(key, [row["key"] for row in disagreeing])
+            if key not in (known := [row["key"] for row in disagreeing]):
+                hint = f"; {near}" if (near := did_you_mean(key, known)) else ""
+                raise NotReproducible(f"no row {key!r} disagrees here{hint}")
         cells: dict[tuple[str, ...], list[StoredRow]] = {}
         for row in disagreeing:
             cells.setdefault(_cell(row), []).append(row)
         wanted = {cell: [r for r in rows if keys is None or r["key"] in keys] for cell, rows in cells.items()}
         wanted = {cell: rows for cell, rows in wanted.items() if rows}
         changes = read_version_changes(folder)
-        jobs = jobs or int(document.get("run", {}).get("machine", {}).get("jobs", 1))
+        jobs = int(document.get("run", {}).get("machine", {}).get("jobs", 1))
         for cell, rows in wanted.items():
             try:
                 if keys is None:
@@ -120,7 +116,7 @@ def write_scripts(
                 continue
             quantities = ", ".join(row["quantity"] for row in rows)
             shown = rows[0] | {"quantity": quantities, "since": _version_sentence(rows, changes)}
-            tasks.append(Task(cell, make_script, (disagreement, shown), limits or Limits()))
+            tasks.append(Task(cell, make_script, (disagreement, shown)))
     index = {} if keys is None else read_script_index(folder)
     if keys is None and scripts.is_dir():  # of an earlier run in the same folder
         for old in (*scripts.glob("*.py"), *scripts.glob("index.json")):
@@ -128,7 +124,7 @@ def write_scripts(
     if not tasks:
         return written
     scripts.mkdir(exist_ok=True)
-    for outcome in _outcomes(tasks, results or ResultCache(), jobs, limits):
+    for outcome in _outcomes(tasks, results or ResultCache(), jobs):
         text, reason = outcome.value or ("", outcome.failure)
         if text:
             path = scripts / _file_name("/".join(outcome.key))
@@ -140,9 +136,7 @@ def write_scripts(
     return written
 
 
-def _outcomes(
-    tasks: Sequence[Task], results: ResultCache, jobs: int, limits: Limits | None
-) -> Iterator[Outcome]:
+def _outcomes(tasks: Sequence[Task], results: ResultCache, jobs: int) -> Iterator[Outcome]:
     """Take scripts from the cache, and make the others in workers.
 
     What the environment of another version answers is not in a task's hash, and a script that was not found
@@ -153,7 +147,7 @@ def _outcomes(
     yield from found
     missing = [task for task in tasks if task.key not in {outcome.key for outcome in found}]
     if missing:
-        with WorkerPool(min(jobs, len(missing)), limits) as workers:
+        with WorkerPool(min(jobs, len(missing))) as workers:
             for outcome in workers.run(missing):
                 if outcome.key in kept and outcome.failure is None and outcome.value[0]:
                     results.put(kept[outcome.key], outcome)
@@ -254,13 +248,6 @@ def _version_sentence(rows: list[StoredRow], changes: dict[str, dict[str, Any]])
     ids = {row["known_issue"] for row in rows}
     since = next((issue.since for issue in project_known_issues() if issue.name in ids and issue.since), "")
     return f"Since version {since}." if since else ""
-
-
-def _check_key(key: str, known: list[str]) -> None:
-    if key not in known:
-        near = get_close_matches(key, known, 1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise NotReproducible(f"no row {key!r} disagrees here{hint}")
 
 
 def _check_worthwhile(
