@@ -332,10 +332,22 @@ class Outputs:
         model, state = self.case.model, self.case.state
         weight = np.zeros((2, *state.v.shape))
         weight[0] = model.mass[..., None] * model.gravity[..., None, :]
-        parts = self._of_loads("weight", weight)
+        loads = {"weight": weight}
         for name in ("force", "moment", "drag_force", "drag_moment"):
-            parts += self._of_loads(WORDS[name], self._loads(**{name: getattr(model, name)}))
-        return parts + self._spring_parts() + self._element_parts() + self._joint_parts()
+            loads[WORDS[name]] = self._loads(**{name: getattr(model, name)})
+        parts, bodies = list[Part](), np.arange(model.n)
+        for what, load in loads.items():
+            each = [load * (bodies == k)[:, None] for k in bodies]
+            parts += self._carried_parts(f"the {what} of body {{}}", f"the {what}s", each)
+        springs = {name: getattr(model, name) for name in ("spring_damping", "spring_stiffness")}
+        damping = {name: x for name, x in springs.items() if name == "spring_damping"}
+        for words, fields in ("{}", springs), ("the damping of {}", damping):
+            if fields is springs or all(map(np.any, springs.values())):
+                numbers = np.arange(len(model.spring_body))
+                masks = [numbers == i for i in numbers]
+                each = [self._loads(**{name: x * mask for name, x in fields.items()}) for mask in masks]
+                parts += self._carried_parts(words.format("spring {}"), words.format(SPRINGS), each)
+        return parts + self._element_parts() + self._joint_parts()
 
     def _loads(self, **fields: Array) -> Array:
         """Forces and moments (2, S, N, 3) of bodies by some fields alone."""
@@ -346,24 +358,10 @@ class Outputs:
         return np.array([np.stack([np.broadcast_to(x, shape)[..., 0] for x in some], 1)
                          for some in zip(*loads, strict=True)])  # fmt: skip
 
-    def _of_loads(self, what: str, loads: Array) -> list[Part]:
-        bodies, places = np.arange(self.case.model.n)[:, None], np.flatnonzero(np.any(loads, axis=(0, 1, 3)))
-        each = [(f"the {what} of body {k + 1}", self._carried(loads * (bodies == k))) for k in places]
-        return _each_and_all(f"the {what}s", each)
-
-    def _spring_parts(self) -> list[Part]:
-        model, parts = self.case.model, list[Part]()
-        fields = {name: getattr(model, name) for name in ("spring_damping", "spring_stiffness")}
-        both = np.all([np.any(x) for x in fields.values()])
-        numbers = np.arange(len(model.spring_body))
-        for words, names in (
-            ("{}", list(fields)),
-            *([("the damping of {}", ["spring_damping"])] if both else []),
-        ):
-            loads = [self._loads(**{name: fields[name] * (numbers == i) for name in names}) for i in numbers]
-            each = [(words.format(f"spring {i + 1}"), self._carried(loads[i])) for i in numbers]
-            parts += _each_and_all(words.format(SPRINGS), each)
-        return parts
+    def _carried_parts(self, words: str, every: str, loads: Sequence[Array], first: int = 0) -> list[Part]:
+        """What joints carry of each of some loads (2, S, N, 3), which are of places from the first on."""
+        named = [(words.format(k), one) for k, one in enumerate(loads, first + 1) if np.any(one)]
+        return _each_and_all(every, [(what, self._carried(one)) for what, one in named])
 
     def _element_parts(self) -> list[Part]:
         """Parts along the joints' own motions, which their elements have."""
@@ -372,18 +370,18 @@ class Outputs:
                    "dampers": -model.damping[: model.n] * state.xdot,
                    "efforts": np.broadcast_to(model.effort[: model.n], state.x.shape)}  # fmt: skip
         values = {name: np.zeros((2, *self._near.shape)) for name in (*efforts, "rotors")}
-        for k, s in np.ndindex(model.n, len(state.p)):
+        for k in range(model.n):
             far = int(model.body[k, 0])
-            above = self._turns[s, far] if far >= 0 else np.eye(3)
-            for i, (axis, *pair) in enumerate(JointFrame(model, k, above).axes(state.x[s, k])):
-                row, total = int(pair[1] is not None), 0.0
+            above = self._turns[:, far] if far >= 0 else np.eye(3)
+            for i, (axis, *pair) in enumerate(JointFrame(model, k, above).axes(state.x[:, k])):
+                row = int(pair[1] is not None)
                 for name, amounts in efforts.items():
-                    values[name][row, s, k] += amounts[s, k, i] * axis
-                    total += amounts[s, k, i]
+                    values[name][row, :, k] += amounts[:, k, i, None] * axis
                 if np.any(model.armature[k]):
                     pairs = zip(WRENCHES, pair, strict=True)
-                    held = sum(e @ self.right[name][s, k] for name, e in pairs if e is not None)
-                    values["rotors"][row, s, k] += (held - total) * axis
+                    held = sum(np.vecdot(e, self.right[name][:, k]) for name, e in pairs if e is not None)
+                    total = sum(amounts[:, k, i] for amounts in efforts.values())
+                    values["rotors"][row, :, k] += (held - total)[:, None] * axis
         parts, joints = list[Part](), np.arange(self._near.shape[1])[:, None]
         for name, value in values.items():
             each = [
@@ -408,22 +406,15 @@ class Outputs:
 
     def _joint_parts(self) -> list[Part]:
         """What closing joints and children have in the wrenches of the joints before."""
-        model, closing, parts = (
-            self.case.model,
-            range(self.case.model.n, len(self.case.model.kind)),
-            list[Part](),
-        )
+        model, parts = self.case.model, list[Part]()
         force, moment = (self.right.get(name, np.zeros(self._near.shape)) for name in WRENCHES)
-        for what, every, is_whole in (
+        for what, every, has_force in (
             ("that of", CLOSING_JOINTS, True),
             ("the moment of", "the moments of the closing joints", False),
         ):
-            loads = [self._applied(k, is_whole * force[:, k], moment[:, k]) for k in closing]
-            each = [
-                (f"{what} the closing joint {k + 1}", self._carried(x))
-                for k, x in zip(closing, loads, strict=True)
-            ]
-            parts += _each_and_all(every, each)
+            closing = range(model.n, len(model.kind))
+            loads = [self._applied(k, has_force * force[:, k], moment[:, k]) for k in closing]
+            parts += self._carried_parts(f"{what} the closing joint {{}}", every, loads, model.n)
         parts += self._welds_of_cuts()
         carried = np.zeros((2, *self._near.shape))
         for k in np.flatnonzero(model.body[: model.n, 0] >= 0).tolist():
