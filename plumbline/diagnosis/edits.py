@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from plumbline.diagnosis.cause import Cause, CauseKind
-from plumbline.diagnosis.prediction import TRAILING, Case
-from plumbline.model.datatypes import JOINT_ELEMENTS, SPRING_FIELDS, Array, Model
+from plumbline.diagnosis.prediction import Case
+from plumbline.model.datatypes import JOINT_ELEMENTS, SPRING_FIELDS, VALUE_AXES, Array, Model
 from plumbline.model.kinematics import quaternion_exponential, quaternion_product, rotation_matrix
 
 AXES: tuple[tuple[Any, str], ...] = ((0, " x"), (1, " y"), (2, " z"), (slice(None), ""))  # and all three
@@ -309,7 +309,7 @@ def _factors(case: Case) -> Iterator[Edit]:
         number, places = np.arange(len(has)), np.flatnonzero(has).tolist()
         # of a vector or products with one entry it is a number's
         is_several = np.sum(counts, axis=0) > (2 if np.ndim(one.part) == 2 else 1)
-        is_number = one.thing == "body" and TRAILING[one.names[0]] and one.names[0] != "omega"
+        is_number = one.thing == "body" and VALUE_AXES[one.names[0]] and one.names[0] != "omega"
         chosen = [
             (f"{one.thing} {k + 1}", number == k)
             for k in (places if one.is_of_each else [])
@@ -323,7 +323,7 @@ def _factors(case: Case) -> Iterator[Edit]:
             )
             chosen.append((which, has & (number >= first)))
         for place, where in chosen:
-            masks = {name: where.reshape(-1, *(1,) * TRAILING[name]) * one.part for name in one.names}
+            masks = {name: where.reshape(-1, *(1,) * VALUE_AXES[name]) * one.part for name in one.names}
             more = {"can_vanish": one.can_vanish, "general": one.general}
             yield _factor(one.term, place, scaled(masks), **more)
     for name, what in product(JOINT_ELEMENTS, ("slide", "turn")):

@@ -18,10 +18,6 @@ from plumbline.equations.arithmetic import floats
 from plumbline.equations.responses import EndRows, Responses
 from plumbline.equations.tree import Tree
 from plumbline.model.datatypes import (
-    BODY_FIELDS,
-    JOINT_ELEMENTS,
-    JOINT_FIELDS,
-    SPRING_FIELDS,
     Array,
     Model,
     State,
@@ -32,7 +28,6 @@ from plumbline.model.invariants import kinetic_energy, potential_energy
 from plumbline.model.kinematics import (
     angular_velocity,
     complete_state,
-    coordinates_of_joints,
     elastic_energy,
     joint_coordinates,
     kinetic_energy_of_rotors,
@@ -52,12 +47,6 @@ VECTORS = ("acceleration", "angular_acceleration", "joint_reaction", "joint_mome
 WRENCHES = VECTORS[2:]
 SUMS = ("kinetic_energy", "potential_energy", "angular_momentum")
 QUANTITIES = (*VECTORS, *SUMS)
-# axes of a field behind that of its places
-TRAILING = (
-    dict.fromkeys(("mass", "length", "drag_force", "drag_moment", *SPRING_FIELDS[2:]), 0)
-    | dict.fromkeys(("force", "moment", "p", "omega", "u", "udot", "x", "xdot", "r", "v", *JOINT_ELEMENTS), 1)
-    | dict.fromkeys(("inertia", "point", "turn", "spring_point"), 2)
-)
 CONSTANT_FIELDS = ("kind", "body", "spring_body")
 TINY = float(np.finfo(float).tiny)
 CLOSED = 1e-9  # m, rad and their rates: a larger gap is an open loop
@@ -214,34 +203,8 @@ class Predictor:
             state: of which the minimal coordinates are used.
 
         """
-        cut, n = cut_open(self.case.model), model.n
-        near, order = model.body[:, 1], np.argsort(cut.place)
-        is_body = order < n
-        share = cut.model.mass / self.case.model.mass[near[order]]
-        fields = dict[str, Any]()
-        for name, value in vars(model).items():
-            if name in ("mass", "inertia", *BODY_FIELDS):
-                x = np.take(value, near[order], value.ndim - 1 - TRAILING[name])
-                own = is_body if name in BODY_FIELDS else share
-                fields[name] = x * own.reshape(-1, *(1,) * TRAILING[name])
-            elif name in JOINT_FIELDS[2:]:
-                fields[name] = np.take(value, order, value.ndim - 1 - TRAILING[name])
-            elif name not in CONSTANT_FIELDS:
-                fields[name] = value
-        tree: dict[str, Any] = {
-            name: np.take(getattr(model, name), np.arange(n), getattr(model, name).ndim - 1 - TRAILING[name])
-            for name in JOINT_FIELDS[2:]
-        }
-        like = self.case.model.tree
-        there = complete_state(replace(like, **tree), state)
-        closing = coordinates_of_joints(model, there, range(n, len(model.kind)))
-        coordinates = {
-            name: np.concatenate([getattr(there, name), x], axis=-2)[..., order, :]
-            for name, x in zip(("u", "udot", "x", "xdot"), closing, strict=True)
-        }
-        bodies = {name: getattr(there, name)[..., near[order], :] for name in ("p", "omega", "r", "v")}
-        tree_model = replace(cut.model, **fields)
-        return tree_model, complete_state(tree_model, State(**bodies, **coordinates))
+        cut = cut_open(self.case.model).with_numbers(model)
+        return cut.model, cut.state(complete_state(model, state))
 
     def _of_cuts(self, cases: Sequence[Case]) -> Answers:
         """Quantities in joint coordinates, of loops cut open."""

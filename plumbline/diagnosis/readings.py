@@ -15,8 +15,8 @@ import numpy as np
 
 from plumbline.diagnosis.cause import Cause
 from plumbline.diagnosis.edits import PLURALS, WORDS, Edit, field, with_fields
-from plumbline.diagnosis.prediction import TRAILING, Case, is_closed, single_states
-from plumbline.model.datatypes import JOINT_ELEMENTS, SPRING_FIELDS, Array, Model, State
+from plumbline.diagnosis.prediction import Case, is_closed, single_states
+from plumbline.model.datatypes import JOINT_ELEMENTS, SPRING_FIELDS, VALUE_AXES, Array, Model, State
 from plumbline.model.kinematics import (
     complete_state,
     cross_matrix,
@@ -211,14 +211,14 @@ Read = Callable[[_Place], Any]
 
 
 def _at(name: str, k: int) -> tuple[Any, ...]:
-    return (..., k, *(slice(None),) * TRAILING[name])
+    return (..., k, *(slice(None),) * VALUE_AXES[name])
 
 
 def _row(name: str, k: int, of: Read) -> Change:
     """Replace what a field holds of one place, by one value or one per state."""
 
     def change(case: Case) -> Case:
-        value, values, own = np.asarray(of(_Place(case, k))), field(case, name), TRAILING[name]
+        value, values, own = np.asarray(of(_Place(case, k))), field(case, name), VALUE_AXES[name]
         is_lifted = value.ndim > own and values.ndim == own + 1
         values = np.repeat(values[None], len(value), 0) if is_lifted else values.copy()
         values[_at(name, k)] = value

@@ -44,6 +44,12 @@ from reference_impl.mechanism import ZERO_INERTIA as ZERO_INERTIA
 from reference_impl.mechanism import Mechanism
 
 Model = Mechanism
+# axes of the value that a field of a mechanism or of a state has at one place, behind the axis of the places
+VALUE_AXES = (
+    dict.fromkeys(("mass", "length", "drag_force", "drag_moment", *SPRING_FIELDS[2:]), 0)
+    | dict.fromkeys(("force", "moment", "p", "omega", "u", "udot", "x", "xdot", "r", "v", *JOINT_ELEMENTS), 1)
+    | dict.fromkeys(("inertia", "point", "turn", "spring_point"), 2)
+)
 
 
 def _no_coordinates() -> Array:

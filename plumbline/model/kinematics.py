@@ -310,14 +310,14 @@ def forward_kinematics(
         p, ω′, r and ṙ of all bodies.
 
     """
-    model = model.tree
     r, v = (np.zeros(omega.shape) if given is None else given.copy() for given in (r, v))
     x, xdot = (
         np.zeros((*omega.shape[:-1], model.columns)) if given is None else given for given in (x, xdot)
     )
     p, omega = p.copy(), omega.copy()
     A = rotation_matrix(p)  # (..., N, 3, 3)
-    for k, (kind, far) in enumerate(zip(model.kinds, model.body[:, 0], strict=True)):
+    for k in range(model.n):
+        kind, far = model.kinds[k], int(model.body[k, 0])
         if kind.holds_nothing:
             continue
         above = A[..., far, :, :] if far >= 0 else np.eye(3)

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 from plumbline.model.datatypes import (
     BODY_FIELDS,
     JOINT_FIELDS,
+    VALUE_AXES,
     ZERO_INERTIA,
     Array,
     Bool,
@@ -68,6 +70,13 @@ class CutMechanism:
     model: Model  # a tree of J bodies, depth first
     place: Int[Indices, "joints"]  # which body of the tree joint k of the source holds
     ends: tuple[tuple[int, int], ...]  # of each loop the bodies b and c of the tree that coincide
+    share: Float[Array, "joints"]  # of mass and inertia of its body that a part has
+
+    def with_numbers(self, source: Model) -> CutMechanism:
+        """Cut the same mechanism with other numbers, which may be a batch."""
+        parts = _fields_of_parts(source, np.argsort(self.place), self.share)
+        kept = {name: getattr(self.model, name) for name in ("kind", "body", "spring_body")}
+        return replace(self, source=source, model=replace(source, **kept, **parts))
 
     @property
     def row_scale(self) -> Float[Array, "loop_rows"]:
@@ -183,7 +192,7 @@ def cut_open(model: Model) -> CutMechanism:
     """
     n, (far, near) = model.n, model.body.T
     if not model.has_loops:
-        return CutMechanism(model, model, np.arange(n), ())
+        return CutMechanism(model, model, np.arange(n), (), np.ones(n))
     order: list[int] = []
 
     def visit(body: int) -> None:
@@ -198,18 +207,24 @@ def cut_open(model: Model) -> CutMechanism:
     share = np.ones(len(far))
     for k in range(n, len(far)):
         share[near[k]] = share[k] = share[near[k]] / 2
-    changes = {name: (getattr(model, name)[near].T * share).T[order] for name in ("mass", "inertia")}
-    for name in BODY_FIELDS:
-        value = getattr(model, name)
-        changes[name] = np.concatenate([value, np.zeros((len(far) - n, *value.shape[1:]))])[order]
-    for name in JOINT_FIELDS[2:]:
-        changes[name] = getattr(model, name)[order]
+    changes = _fields_of_parts(model, np.array(order), share[order])
     above = np.where(far[order] < 0, -1, place[far[order]])
     changes["body"] = np.stack([above, np.arange(len(order))], axis=1)
     changes["spring_body"] = np.where(model.spring_body < 0, -1, place[model.spring_body])
     kinds = tuple(model.kind[k] for k in order)
     ends = tuple((int(place[near[k]]), int(place[k])) for k in range(n, len(far)))
-    return CutMechanism(model, replace(model, kind=kinds, **changes), place, ends)
+    return CutMechanism(model, replace(model, kind=kinds, **changes), place, ends, share[order])
+
+
+def _fields_of_parts(model: Model, order: NDArray[np.intp], share: Array) -> dict[str, Any]:
+    """Fields of the bodies and joints of a tree that holds the joints in this order."""
+    is_body, near, fields = order < model.n, model.body[order, 1], dict[str, Any]()
+    factors = dict.fromkeys(("mass", "inertia"), share) | dict.fromkeys(BODY_FIELDS, is_body)
+    for name in (*factors, *JOINT_FIELDS[2:]):
+        value, own = getattr(model, name), VALUE_AXES[name]
+        taken = np.take(value, near if name in factors else order, value.ndim - 1 - own)
+        fields[name] = taken * factors[name].reshape(-1, *(1,) * own) if name in factors else taken
+    return fields
 
 
 def displaced(model: Model, state: State, step: Float[Array, "nu"]) -> State:
