@@ -356,11 +356,8 @@ class _Fit:
             return
         self.length, self.left, self.halvings = length, float(np.max(np.abs(off))), 0
         slopes = (effects[1:] - effects[0]).T / (STEP * self.scale)
-        if not np.all(np.isfinite(slopes)):
-            self.is_active = False
-            return
         size = np.linalg.norm(slopes, axis=0)
-        if not np.all(size > 0):
+        if not np.all((size > 0) & np.isfinite(size)):
             self.is_active = False
             return
         inverse = np.linalg.pinv(slopes / size, RANK_TOLERANCE) / size[:, None]

@@ -180,23 +180,18 @@ def _reduced(model: Model, states: list[State], kept: list[int]) -> Problem:
         while above >= 0 and above not in place:
             above = int(model.body[above, 0])
         far.append(place.get(above, -1))
-    fields = {
-        name: getattr(model, name)[kept] for name in ("mass", "inertia", *BODY_FIELDS, *JOINT_FIELDS[2:])
-    }
+    names = ("mass", "inertia", *BODY_FIELDS, *JOINT_FIELDS[2:])
+    fields = {name: getattr(model, name)[kept] for name in names}
     lacking = np.arange(model.columns) >= np.array([[model.kinds[k].element_count] for k in kept])
-    for name in (*BODY_FIELDS, *JOINT_ELEMENTS):
-        every = getattr(model, name)
-        if not np.any(fields[name]) and np.any(every):
-            fields[name] = np.resize(every[np.any(every.reshape(model.n, -1), axis=1)], fields[name].shape)
-            if name in JOINT_ELEMENTS:
-                fields[name] = np.where(lacking, 0.0, np.max(np.abs(every)))
-    if np.any(_turns(model)) and not np.any(_turns(model)[kept]):
-        fields["turn"] = np.resize(model.turn[np.any(_turns(model), axis=1)], fields["turn"].shape)
     skew = np.any(model.inertia * (1 - np.eye(3)), axis=(1, 2))
-    if np.any(skew) and not np.any(skew[kept]):
-        fields |= {
-            name: np.resize(getattr(model, name)[skew], fields[name].shape) for name in ("mass", "inertia")
-        }
+    has = {name: np.any(getattr(model, name).reshape(model.n, -1), axis=1) for name in BODY_FIELDS}
+    has |= {"turn": np.any(_turns(model), axis=1), "mass": skew, "inertia": skew}
+    for name, where in has.items():
+        if np.any(where) and not np.any(where[kept]):
+            fields[name] = np.resize(getattr(model, name)[where], fields[name].shape)
+    for name in JOINT_ELEMENTS:
+        if not np.any(fields[name]):
+            fields[name] = np.where(lacking, 0.0, np.max(np.abs(getattr(model, name))))
     ends = np.array([[place.get(int(b), -1) for b in pair] for pair in model.spring_body], np.intp)
     ends = ends.reshape(-1, 2)
     ends[np.all(ends < 0, axis=1), 1] = 0

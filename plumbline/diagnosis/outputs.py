@@ -443,8 +443,7 @@ class Outputs:
             return -self._carried(self._applied(k, 0 * weld, weld), own)
 
         for k in range(model.n, len(model.kind)):
-            body = int(model.body[k, 1])
-            share = float(cut.model.mass[cut.place[k]] / model.mass[body])
+            body, share = int(model.body[k, 1]), float(cut.share[cut.place[k]])
             force, moment = (self.right[name][:, k] for name in WRENCHES)
             weld = share * inertial[:, body] - moment - cross(self._near[:, k] - state.r[:, body], force)
             each.append((f"the moment of the weld in body {body + 1}", carried(k, weld)))

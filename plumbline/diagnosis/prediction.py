@@ -24,7 +24,7 @@ from plumbline.model.datatypes import (
     StateQuantities,
     StepRun,
 )
-from plumbline.model.invariants import kinetic_energy, potential_energy
+from plumbline.model.invariants import angular_momentum, kinetic_energy, potential_energy
 from plumbline.model.kinematics import (
     angular_velocity,
     complete_state,
@@ -33,7 +33,6 @@ from plumbline.model.kinematics import (
     kinetic_energy_of_rotors,
     maximal_coordinates,
     rotate_vectors,
-    rotation_matrix,
     stack_states,
 )
 from plumbline.model.loops import cut_open, determinate_projectors, loop_gaps, wrench_length
@@ -275,19 +274,15 @@ def maximal_quantities(model: Model, state: State, missing_gamma: Sequence[int])
     change[: len(rows.gamma)] = np.where(np.isin(rows.joint, missing_gamma), -rows.gamma, 0.0)
     found = system.solve(*at, change, joint_coordinates(model, state)[2])
     assert found.joint_moment is not None
-    a = rotation_matrix(state.p)
-    spin = rotate_vectors(a, rotate_vectors(model.inertia, state.omega))
-    momentum = np.sum(np.cross(state.r, model.mass[:, None] * state.v) + spin, axis=0)
     return {
         "acceleration": found.acceleration,
         "angular_acceleration": angular_velocity(state.p, found.pddot),
         "joint_reaction": found.joint_reaction,
         "joint_moment": found.joint_moment,
-        "kinetic_energy": np.asarray(
-            kinetic_energy(model, state.v, state.omega) + kinetic_energy_of_rotors(model, state)
-        ),
-        "potential_energy": np.asarray(potential_energy(model, state.r) + elastic_energy(model, state)),
-        "angular_momentum": momentum,
+        "kinetic_energy": kinetic_energy(model, state.v, state.omega)
+        + kinetic_energy_of_rotors(model, state),
+        "potential_energy": potential_energy(model, state.r) + elastic_energy(model, state),
+        "angular_momentum": angular_momentum(model, state.r, state.p, state.v, state.omega),
     }
 
 

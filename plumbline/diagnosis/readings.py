@@ -346,9 +346,12 @@ def _joint_readings(case: Case, k: int) -> Iterator[Reading]:
     if k < model.n:
         yield from _coordinate_readings(model, k)
     if len(kind.motions) == 2:
-        for name in JOINT_ELEMENTS:
-            term, pair = f"{WORDS.get(name, name)} of the two coordinates", getattr(model, name)[k]
-            yield Reading(term, "exchanged", _constant(name, k, pair[[1, 0, *range(2, len(pair))]]))
+        order = [1, 0, *range(2, model.columns)]
+        terms = {name: f"{WORDS.get(name, name)} of the two coordinates" for name in JOINT_ELEMENTS}
+        terms |= {"x": "coordinates", "xdot": "rates"} if k < model.n else {}
+        for name, term in terms.items():
+            exchanged = partial(lambda name, j: getattr(j, name)[..., order], name)
+            yield Reading(term, "exchanged", _row(name, k, exchanged))
     if kind.has_pitch:
         for words, factor in (("reversed", -1.0), ("taken per turn, not per radian", 0.5 / np.pi)):
             yield Reading("pitch", words, _constant("length", k, factor * model.length[k]))
@@ -381,10 +384,6 @@ def _coordinate_readings(model: Model, k: int) -> Iterator[Reading]:
             own = np.arange(model.stiffness.shape[1]) == i
             pull = _row("effort", k, partial(lambda own, j: j.effort + own * j.stiffness * j.x, own))
             yield Reading(f"spring {i + 1}", "without its coordinate", pull)
-    if len(motions) == 2:
-        for name, term in (("x", "coordinates"), ("xdot", "rates")):
-            reverse = partial(lambda name, j: getattr(j, name)[:, ::-1], name)
-            yield Reading(term, "exchanged", _row(name, k, reverse))
 
 
 def _point_readings(model: Model, k: int) -> Iterator[Reading]:
