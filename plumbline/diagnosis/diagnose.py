@@ -368,13 +368,16 @@ class _Diagnosing:
 
     def _places_of_unknowns(self, difference: Difference) -> Iterator[list[tuple[Cause, list[Edit]]]]:
         """Forces, then velocity terms of joints, that may be others at each state."""
-        yield from force_places(self.model)
         terms, places = Terms(difference.predictor), list[tuple[Cause, list[Edit]]]()
+
+        def edits(cause: Cause, effects: Sequence[Answers]) -> list[Edit]:
+            return [Edit(cause, effect=difference.flat_vectors(one)) for one in effects]
+
+        yield from force_places(self.model, lambda k: edits(Cause("term", "moment"), terms.unit_moments(k)))
         for k in np.flatnonzero(~self.model.free).tolist():
             cause = Cause("term", "velocity term", f"joint {k + 1}", "another at each state")
-            effects = [difference.flat_vectors(one) for one in terms.unit_velocity_terms(k)]
-            if effects:
-                places.append((cause, [Edit(cause, effect=effect) for effect in effects]))
+            if some := edits(cause, terms.unit_velocity_terms(k)):
+                places.append((cause, some))
         yield places
 
     def _partly(self, wrong: Sequence[str]) -> tuple[Cause, ...]:

@@ -7,16 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from plumbline.diagnosis.cause import Cause
-from plumbline.diagnosis.edits import Edit, at_place, coordinate_place, with_fields
-from plumbline.diagnosis.prediction import VECTORS, Answers, Case, Predictor
+from plumbline.diagnosis.edits import Edit, at_place, coordinate_place
+from plumbline.diagnosis.prediction import VECTORS, Answers, Predictor
 from plumbline.equations.responses import Responses
 from plumbline.model.datatypes import Array, Model
-from plumbline.model.kinematics import cross, quaternion_exponential, quaternion_product, rotation_matrix
+from plumbline.model.kinematics import cross, rotation_matrix
 from plumbline.model.loops import cut_open
 
 NOT_HELD = 1e-9  # of a direction: what the joint holds of it
@@ -95,7 +96,6 @@ class Terms:
         kinds, damping = self.model.kinds, self.model.damping[:, 0]
         damped = [k for k, kind in enumerate(kinds) if kind.is_spherical and damping[k]]
         turns, omega = rotation_matrix(self.state.p), self.found.omega
-        moments = self.found.to_wrenches()[..., 1, :] if damped else np.zeros(0)
         for i, axis in enumerate("xyz" if damped else ""):
             effects = {}
             for k in damped:
@@ -103,9 +103,7 @@ class Terms:
                 far, along = self.found.far[at], turns[:, at, :, i]
                 spin = omega[:, at] - (omega[:, far] if far >= 0 else 0.0)
                 lost = damping[k] * (spin - np.vecdot(spin, along)[:, None] * along)
-                units = moments[..., at, :] - (moments[..., far, :] if far >= 0 else 0.0)
-                effects[k] = np.matvec(units, lost[:, None, None])
-                effects[k][:, at, 3] += lost  # what the damper applies is a part of the joint's moment
+                effects[k] = np.matvec(self._moments_between(k), lost[:, None, None])
             yield from self._of_joints(effects, Cause("term", "damping", "", f"about the {axis} axis alone"))
 
     def fixed(self) -> Iterator[tuple[Cause, Answers]]:
@@ -181,6 +179,23 @@ class Terms:
             solution[s, :, 2:] += (indeterminate @ balance).reshape(-1, 2, 3)
         return np.asarray(solution - self.found.solution)
 
+    @cached_property
+    def _moments(self) -> Array:
+        """Responses (S, N, 4, 3, N, 3) to unit moments on the bodies."""
+        return self.found.to_wrenches()[..., 1, :]
+
+    def _moments_between(self, k: int) -> Array:
+        """Responses (S, N, 4, 3, 3) to unit moments that a joint applies to its bodies, world axes."""
+        at = int(self.joints[k])
+        far = self.found.far[at]
+        units = self._moments[..., at, :] - (self._moments[..., far, :] if far >= 0 else 0.0)
+        units[:, at, 3] += np.eye(3)  # they are a part of the joint's moment
+        return units
+
+    def unit_moments(self, k: int) -> list[Answers]:
+        """Return the effects of unit moments that a joint applies to its bodies."""
+        return [self.answers(one) for one in np.moveaxis(self._moments_between(k), -1, 0)]
+
     def unit_velocity_terms(self, k: int) -> list[Answers]:
         """Return the effects of unit accelerations that velocities might cause at a joint."""
         at = self._columns[self.joints[k]]
@@ -201,11 +216,14 @@ def missing_gammas(predictor: Predictor) -> Iterator[tuple[Cause, Answers]]:
 # -- unknown forces ------------------------------------------------------------------------------------
 
 
-def force_places(model: Model) -> Iterator[list[tuple[Cause, list[Edit]]]]:
+def force_places(
+    model: Model, moments_in: Callable[[int], list[Edit]]
+) -> Iterator[list[tuple[Cause, list[Edit]]]]:
     """List the places of forces by the number of amounts that are unknown at a state.
 
     Args:
         model: a tree.
+        moments_in: lists edits by unit moments between the bodies of a joint.
 
     Yields:
         Causes, each with edits by a unit of its forces: of one amount, of all springs together, of two
@@ -226,7 +244,7 @@ def force_places(model: Model) -> Iterator[list[tuple[Cause, list[Edit]]]]:
             term = "force" if what == "slide" else "torque"
             single.append((another(term, coordinate_place(model, k, i)), [unit("effort", (k, i))]))
         if kind.is_spherical:
-            balls.append((another("moment", f"joint {k + 1}"), _moments_in_ball(model, k)))
+            balls.append((another("moment", f"joint {k + 1}"), moments_in(k)))
         if len(kind.motions) > 1:
             efforts = [edit for _, (edit,) in single[-len(kind.motions) :]]
             joints.append((another("efforts", f"joint {k + 1}"), efforts))
@@ -249,21 +267,6 @@ def force_places(model: Model) -> Iterator[list[tuple[Cause, list[Edit]]]]:
         yield [(another("moments", "the ball joints"), [one for _, some in balls for one in some])]
     both = [loads["force"][k] + loads["moment"][k] for k in range(model.n)]
     yield [(another("force and moment", f"body {k + 1}"), some) for k, some in enumerate(both)]
-
-
-def _moments_in_ball(model: Model, k: int) -> list[Edit]:
-    """Three other moments between the bodies of a ball joint: of a spring that rests at other attitudes."""
-
-    def turned(axis: Array) -> Callable[[Case, Array], Case]:
-        def change(case: Case, _: Array) -> Case:
-            stiffness, turn = case.model.stiffness.copy(), case.model.turn.copy()
-            stiffness[k, 0] = stiffness[k, 0] or 1.0
-            turn[k, 1] = quaternion_product(turn[k, 1], quaternion_exponential(axis / 2))
-            return with_fields(case, stiffness=stiffness, turn=turn)
-
-        return change
-
-    return [Edit(Cause("number", "moment"), turned(axis)) for axis in np.eye(3)]
 
 
 def is_spanned(basis: Array, wanted: Array, states: NDArray[np.intp], accepted: float) -> bool:
