@@ -14,7 +14,8 @@ fails the run.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence, Set
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from functools import cache
@@ -34,7 +35,6 @@ from pydantic import (
     PositiveInt,
     TypeAdapter,
     ValidationError,
-    field_validator,
     model_validator,
 )
 
@@ -260,6 +260,34 @@ def _check_ratio(value: float) -> float:
     return value
 
 
+def _valid_text(valid: str, check: Callable[[str], object]) -> AfterValidator:
+    """A text of which a check is true; it may raise, as of a version or a number of thousands of digits."""
+
+    def checked(text: str) -> str:
+        with suppress(ValueError):
+            if check(text):
+                return text
+        raise invalid_value_error(f"is {shorten(repr(text))}" if text.strip() else "is empty", valid)
+
+    return AfterValidator(checked)
+
+
+_Name = Annotated[str, _valid_text("one line of printable text", lambda text: text and text.isprintable())]
+_Sentence = Annotated[str, _valid_text("a sentence", str.strip)]
+_Versions = Annotated[
+    str,
+    _valid_text(
+        "a version range, written like '>=1.13,<2'",
+        lambda text: SpecifierSet(text).contains("1.0") is not None,
+    ),
+]
+_Since = Annotated[
+    str,
+    _valid_text(
+        f"a version, written like '4.1.0' or '3.3.1{OR_EARLIER}'",
+        lambda text: Version(text.removesuffix(OR_EARLIER) or "0"),
+    ),
+]
 _Ratio = Annotated[PositiveFloat, AfterValidator(_check_ratio)]
 _Texts = Annotated[list[str], BeforeValidator(_as_list), Field(min_length=1)]
 
@@ -348,58 +376,23 @@ class _Cause(BaseModel):
 class _Entry(_Selector):
     """An entry as the file has it: a finding, and the rows that it covers."""
 
-    id: str = _field("A name of the entry, unique in all files: the finding's.")
+    id: _Name = _field("A name of the entry, unique in all files: the finding's.")
     engine: str = _field("Name or pattern of engines.")
-    versions: str = _field("A version range, as '>=1.13,<2'.", "")
+    versions: _Versions = _field("A version range, as '>=1.13,<2'.", "")
     cause: _Cause | None = _field(
         "The cause that the diagnosis names, as `plumbline explain` prints it.", None
     )
     needs: list[str] | None = _field("What a difference without a cause needs.", None)
     mechanism: Mechanism | None = _field("The mechanism of a disagreement.", None)
-    since: str = _field("The first version that shows it, as '4.1.0' or '3.3.1 or earlier'.", "")
-    evidence: str = _field("A measurement, a script, a document.")
-    reason: str = _field("The cause.")
+    since: _Since = _field("The first version that shows it, as '4.1.0' or '3.3.1 or earlier'.", "")
+    evidence: _Sentence = _field("A measurement, a script, a document.")
+    reason: _Sentence = _field("The cause.")
     script: str = _field("A file of docs/surface that shows it.", "")
     rows: list[_Selector] | None = _field(
         "Rows that it covers, by default those of the entry's own patterns; an empty list: none, because the "
         "adapter goes around it.",
         None,
     )
-
-    @field_validator("id")
-    @classmethod
-    def _check_id(cls, text: str) -> str:
-        if not text or not text.isprintable():
-            raise invalid_value_error(f"is {shorten(repr(text))}", "one line of printable text")
-        return text
-
-    @field_validator("evidence", "reason")
-    @classmethod
-    def _check_says_something(cls, text: str) -> str:
-        if not text.strip():
-            raise invalid_value_error("is empty", "a sentence")
-        return text
-
-    @field_validator("versions")
-    @classmethod
-    def _check_version_range(cls, text: str) -> str:
-        try:
-            SpecifierSet(text).contains("1.0")
-        except ValueError:  # InvalidSpecifier, or a number of thousands of digits
-            raise invalid_value_error(
-                f"is {shorten(repr(text))}", "a version range, written like '>=1.13,<2'"
-            ) from None
-        return text
-
-    @field_validator("since")
-    @classmethod
-    def _check_since(cls, text: str) -> str:
-        try:
-            Version(text.removesuffix(OR_EARLIER) or "0")
-        except ValueError:  # InvalidVersion, or a number of thousands of digits
-            valid = f"a version, written like '4.1.0' or '3.3.1{OR_EARLIER}'"
-            raise invalid_value_error(f"is {shorten(repr(text))}", valid) from None
-        return text
 
     @model_validator(mode="after")
     def _check_rows(self) -> _Entry:
