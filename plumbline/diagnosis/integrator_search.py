@@ -338,10 +338,8 @@ def _joint_space_edits(declared: JointSpaceMethod, model: Model) -> Iterator[Edi
 
 def _with_weights(declared: JointSpaceMethod, i: int, j: int, x: float) -> JointSpaceMethod:
     """Weight i by x more, weight j by x less."""
-    weights = list(declared.weights)
-    weights[i] += x
-    weights[j] -= x
-    return replace(declared, weights=tuple(weights))
+    changes = x * np.eye(len(declared.weights))
+    return replace(declared, weights=tuple((declared.weights + changes[i] - changes[j]).tolist()))
 
 
 def _other_formulas(declared: JointSpaceMethod, model: Model) -> Iterator[tuple[str, JointSpaceMethod]]:
@@ -491,14 +489,11 @@ def _constrained_edits(declared: ConstrainedMethod, *, is_level_fixed: bool = Fa
 
 
 def _of_spectral_radius(base: ConstrainedMethod, at_level: str) -> Edit:
-    def method(x: float) -> ConstrainedMethod:
-        other = generalized_alpha(
-            x,
-            solver_atol=base.solver_atol,
-            solver_rtol=base.solver_rtol,
-            difference_step=base.difference_step,
-        )
-        return replace(other, constraint_level=base.constraint_level)
-
+    names = "solver_atol", "solver_rtol", "difference_step"
+    kept: dict[str, Any] = {name: getattr(base, name) for name in names}
     words = f"it took the generalised-α step with spectral radius {{}}{at_level}"
-    return _family(words, base.alpha_f / (1 - base.alpha_f), method)
+    return _family(
+        words,
+        base.alpha_f / (1 - base.alpha_f),
+        lambda x: replace(generalized_alpha(x, **kept), constraint_level=base.constraint_level),
+    )

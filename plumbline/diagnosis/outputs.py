@@ -69,18 +69,13 @@ class Outputs:
 
     def name(self, quantity: str, reported: Array) -> Cause | None:
         """Find what was returned in place of one quantity; None where nothing known explains it."""
-        bound = self.bounds[quantity]
-        return self._of_places(quantity, reported, None) or (
-            self._of_wrong_places(quantity, reported) if bound.ndim > 1 and bound.shape[1] > 1 else None
-        )
-
-    def _of_wrong_places(self, quantity: str, reported: Array) -> Cause | None:
-        bound, right = self.bounds[quantity], self.right[quantity]
-        off = reported - right
+        whole = self._of_places(quantity, reported, None)
+        bound, off = self.bounds[quantity], reported - self.right[quantity]
+        if whole or bound.ndim == 1:
+            return whole
         wrong = [k for k in range(bound.shape[1]) if not error_ratio(off[:, k], bound[:, k]) <= 1]
-        if not wrong or len(wrong) == bound.shape[1]:
-            return self._exchanged(quantity, reported, wrong) if wrong else None
-        return self._of_places(quantity, reported, wrong) or self._exchanged(quantity, reported, wrong)
+        some = self._of_places(quantity, reported, wrong) if 0 < len(wrong) < bound.shape[1] else None
+        return some or self._exchanged(quantity, reported, wrong)
 
     def _exchanged(self, quantity: str, reported: Array, wrong: list[int]) -> Cause | None:
         """Rows that are those of other bodies."""
@@ -88,8 +83,8 @@ class Outputs:
         for k in wrong:
             others = (j for j in range(count) if j != k and self._is_that_of(quantity, reported, k, j))
             source[k] = next(others, -1)
-            if source[k] < 0:
-                return None
+        if not source or -1 in source.values():
+            return None
         thing = _thing(quantity)
         of = " and ".join(f"{thing} {k + 1}" for k in wrong)
         as_that = " and ".join(f"{thing} {source[k] + 1}" for k in wrong)
