@@ -30,10 +30,10 @@ from adapters.importer_common import (
     Refused,
     depth_first,
     joint_from_screw,
-    joint_names,
     make_body,
     make_joint,
     merge_made_up_bodies,
+    names_of_parts,
     pose_of_coordinates,
 )
 from plumbline.importers.importer import ModelFile
@@ -99,9 +99,7 @@ class _Layout(LayoutWithOwnVelocities):
             raise NotImplementedError(f"a joint of type {kind}")
         joint.resetPositions()
         screws = np.array(joint.getRelativeJacobian()).T
-        names = joint_names(self.file).get(node.getName(), []) if self.file.format == "mjcf" else []
-        if len(names) != len(screws):
-            names = [f"{name}/{k}" for k in range(len(screws))]
+        names = names_of_parts(self.file, node.getName(), name, len(screws))
         return [
             joint_from_screw(own, screw[:3], screw[3:], **_numbers(joint, k))
             for k, (own, screw) in enumerate(zip(names, screws, strict=True))

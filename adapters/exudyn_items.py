@@ -26,12 +26,12 @@ from adapters.exudyn_common import (
     make_system,
     sizes_of_body,
 )
-from adapters.pose_functions import PROBE, Pose, about, turned
+from adapters.pose_functions import Pose, about, turned
 from adapters.surface_record import SurfaceRecord
 from plumbline.engines.missing_names import add_parts
 from plumbline.model.datatypes import Array, Call, Float, Model, State
 from plumbline.model.kinematics import quaternion_rate, rotate_vectors, rotation_matrix
-from plumbline.model.probe_frames import anchor_point, probe_points
+from plumbline.model.probe_frames import PROBE_TURN, anchor_point, probe_points
 
 AXES = np.eye(3)
 utilities: Any = rigidBodyUtilities  # as below, functions are untyped
@@ -236,7 +236,7 @@ def _add_rotors(body_kind: str) -> Callable[[_Items], None]:
         s.mbs.Assemble()
         call = _call("Node1D", body_kind)
         turns = np.reshape([s.of_body(rotor, "RotationMatrix") for rotor in rotors], (-1, 3, 3, 3))
-        s.add_axes(call, [x @ y @ z @ PROBE for x, y, z in turns @ np.array(frames).mT])
+        s.add_axes(call, [x @ y @ z @ PROBE_TURN for x, y, z in turns @ np.array(frames).mT])
         spins = np.reshape([s.of_body(rotor, "AngularVelocity") for rotor in rotors], (-1, 3, 3))
         s.add("frame_angular_velocity", call, np.sum(spins, axis=1))
         s.add("frame_angular_velocity", (*call, MASS), _gathered(s.momenta(rotors), LINES) / inertia)
@@ -274,7 +274,7 @@ def _add_plane_bodies(node_kind: str, body_kind: str, turning: str, sliding: str
         turns, momenta = np.tile(AXES, (len(bodies), 1, 1)), s.momenta(bodies)
         for i, turn in enumerate(read("RotationMatrix")):
             turns[i][np.ix_(PLANES[i % 3], PLANES[i % 3])] = turn.reshape(3, 3)[:2, :2]
-        s.add_axes(call, [x @ y @ z @ PROBE for x, y, z in turns.reshape(-1, 3, 3, 3)])
+        s.add_axes(call, [x @ y @ z @ PROBE_TURN for x, y, z in turns.reshape(-1, 3, 3, 3)])
         s.add("frame_position", call, _gathered(read("Position"), PLANES))
         s.add("frame_velocity", call, 2 * _gathered(read("Velocity"), PLANES))
         spins = [spin[2] for spin in read("AngularVelocity")]
@@ -384,13 +384,13 @@ def _add_relative_markers(s: _Items) -> None:
         if is_shift:
             s.add("frame_position_from_anchor", (*call, "OutputVariableType.Displacement"), place)
         elif not kind.startswith(between):
-            turns = np.array([turned(angles) @ PROBE for angles in place])
+            turns = np.array([turned(angles) @ PROBE_TURN for angles in place])
             s.add("frame_axes_by_angles", call, np.reshape(turns.mT, (-1, 3)))
 
 
 def _add_connectors(s: _Items) -> None:
     """Connectors and joints between the anchor and probe points, and what they say of the distance."""
-    turn, shift, fixed = PROBE, s.anchor / 2, s.ground(s.anchor)
+    turn, shift, fixed = PROBE_TURN, s.anchor / 2, s.ground(s.anchor)
     damping, made = 3 * np.eye(6), []
     for body, one in zip(s.rigid_bodies(), s.bodies, strict=True):
         ends = fixed, s.marker("MarkerBodyRigid", bodyNumber=body, localPosition=one.arm)
@@ -606,9 +606,9 @@ def _pose(turn: Array, place: Array) -> Array:
 def _add_robots(s: _Items) -> None:
     """Robots of one link on a base at the anchor, with the probe frame as their tool."""
     angle, poses = 0.4, []
-    base, back = _pose(PROBE, s.anchor), _pose(about(2, -angle), np.zeros(3))
+    base, back = _pose(PROBE_TURN, s.anchor), _pose(about(2, -angle), np.zeros(3))
     for one in s.bodies:
-        tool = robots.RobotTool(HT=_pose(PROBE, one.arm))
+        tool = robots.RobotTool(HT=_pose(PROBE_TURN, one.arm))
         robot = robots.Robot(base=robots.RobotBase(HT=base), tool=tool)
         before = np.linalg.inv(base) @ _pose(one.turn, one.place) @ back
         robot.AddLink(robots.RobotLink(one.mass, [0.0] * 3, AXES, jointType="Rz", preHT=before))

@@ -39,10 +39,9 @@ from plumbline.model.datatypes import Array, EngineFailure, Float, State
 from plumbline.model.kinematics import (
     quaternion_exponential,
     quaternion_product,
-    rotation_matrix,
     rotation_vector,
 )
-from plumbline.model.probe_frames import PROBE_ATTITUDE
+from plumbline.model.probe_frames import PROBE_TURN
 
 AXES = np.eye(3)
 PULL = 1.0  # 1/s², of the force −m x of points that are pulled back
@@ -582,4 +581,4 @@ def _add_turns(record: SurfaceRecord, state: State) -> None:
         mbs.Assemble()
         _solve(mbs, options)
         turns = [mbs.GetObjectOutputBody(body, Output.RotationMatrix, [0.0, 0, 0]) for body in bodies]
-        record.add_axes(names, np.array(turns).reshape(-1, 3, 3) @ rotation_matrix(PROBE_ATTITUDE))
+        record.add_axes(names, np.array(turns).reshape(-1, 3, 3) @ PROBE_TURN)

@@ -22,10 +22,8 @@ from adapters.pose_functions import turned
 from adapters.surface_record import SurfaceRecord
 from plumbline.engines.missing_names import add_parts
 from plumbline.model.datatypes import Array, Model, State
-from plumbline.model.kinematics import rotation_matrix
-from plumbline.model.probe_frames import PROBE_ATTITUDE, probe_points
+from plumbline.model.probe_frames import PROBE_TURN, probe_points
 
-TURN = rotation_matrix(PROBE_ATTITUDE)
 FEW_BODIES = 3  # of mechanisms on which what does not depend on the mechanism is compared
 
 
@@ -34,11 +32,11 @@ def _as_given(values: Array) -> Array:
 
 
 def _in_probe_axes(values: Array) -> Array:
-    return values @ TURN
+    return values @ PROBE_TURN
 
 
 def _axes(values: Array) -> Array:
-    return (values.reshape(-1, 3, 3) @ TURN).mT.reshape(-1, 3)
+    return (values.reshape(-1, 3, 3) @ PROBE_TURN).mT.reshape(-1, 3)
 
 
 def _axes_of_angles(values: Array) -> Array:

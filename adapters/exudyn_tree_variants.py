@@ -24,8 +24,8 @@ from adapters.exudyn_common import (
     set_explicit_method,
     set_linear_solver,
 )
-from adapters.exudyn_variants import MANY_BODIES, of_ways, texts
-from plumbline.engines.variants import variants_of
+from adapters.exudyn_variants import is_open, of_ways, texts
+from plumbline.engines.variants import both, has, variants_of
 from plumbline.model.datatypes import Array, EngineFailure, Float, Model
 
 utilities: Any = rigidBodyUtilities  # as below, functions are untyped
@@ -272,30 +272,18 @@ class TreeChange:
     ways: Ways = field(default_factory=dict)
 
 
-def _is_small(model: Model) -> bool:
-    return not model.has_loops and model.n <= MANY_BODIES
-
-
 def _is_plain(model: Model) -> bool:
-    """Whether nothing but gravity acts on a small mechanism."""
-    acts = model.has_elements or model.has_loads or model.has_drag or len(model.spring_body)
-    return _is_small(model) and not acts
+    """Whether nothing but gravity acts on a mechanism."""
+    return not (model.has_elements or model.has_loads or model.has_drag or len(model.spring_body))
 
 
 def _is_serial(model: Model) -> bool:
     return _is_plain(model) and np.array_equal(model.body[:, 0], np.arange(model.n) - 1)
 
 
-def _has_elements(model: Model) -> bool:
-    return _is_small(model) and bool(np.any(model.stiffness) or np.any(model.damping))
-
-
-def _has_effort(model: Model) -> bool:
-    return _is_small(model) and bool(np.any(model.effort))
-
-
-_option = variants_of("option", TreeChange, _is_small)
-_spelling = variants_of("spelling", TreeChange, _is_small)
+_option = variants_of("option", TreeChange, is_open)
+_spelling = variants_of("spelling", TreeChange, is_open)
+HAS_ELEMENTS = has("stiffness", "damping")
 CONNECTORS = "CoordinateSpringDamper", "CoordinateSpringDamperExt"
 
 VARIANTS = (
@@ -307,18 +295,18 @@ VARIANTS = (
         _is_plain,
         matrices=_by_plucker_matrices,
     ),
-    variants_of("vectors", TreeChange, _is_plain)(
+    variants_of("vectors", TreeChange, both(is_open, _is_plain))(
         "kinematicTree.KinematicTree33 kinematicTree.JointTransformMotionSubspace", matrices=_by_vectors
     ),
     _option("kinematicTree.Inertia2T66", _is_serial, matrices=_by_robot),
     *(_option(names, matrices=_by_step(run)) for names, run in STEPS.items()),
     *(
-        _spelling(f"itemInterface.{name} itemInterface.ObjectConnector{name}", _has_elements,
+        _spelling(f"itemInterface.{name} itemInterface.ObjectConnector{name}", HAS_ELEMENTS,
                   add_elements=_grounded(name))
         for name in CONNECTORS
     ),
     *(
-        _spelling(f"itemInterface.ObjectConnector{name}SpringForceUserFunction", _has_elements,
+        _spelling(f"itemInterface.ObjectConnector{name}SpringForceUserFunction", HAS_ELEMENTS,
                   add_elements=_grounded(name, by_function=True))
         for name in CONNECTORS
     ),
@@ -326,13 +314,13 @@ VARIANTS = (
         _spelling(names, suits, add_elements=add)
         for names, add, suits in (
             ("itemInterface.ObjectGenericODE2ForceUserFunction "
-             "itemInterface.ObjectGenericODE2MassMatrixUserFunction", _generic_by_functions, _has_elements),
-            ("itemInterface.ObjectKinematicTreeForceUserFunction", _tree_by_function, _has_elements),
+             "itemInterface.ObjectGenericODE2MassMatrixUserFunction", _generic_by_functions, HAS_ELEMENTS),
+            ("itemInterface.ObjectKinematicTreeForceUserFunction", _tree_by_function, HAS_ELEMENTS),
             ("itemInterface.LoadCoordinateLoadUserFunction itemInterface.MarkerNodeCoordinate",
-             _load_by_function, _has_elements),
+             _load_by_function, HAS_ELEMENTS),
             ("itemInterface.LoadCoordinate itemInterface.NodePointGround",
-             _grounded("ObjectConnectorCoordinateSpringDamper"), _has_effort),
+             _grounded("ObjectConnectorCoordinateSpringDamper"), has("effort")),
         )
     ),
-    *of_ways(_spelling, _is_small, "LoadVectorUserFunction"),
+    *of_ways(_spelling, "LoadVectorUserFunction"),
 )  # fmt: skip

@@ -27,7 +27,7 @@ from adapters.exudyn_common import (
     sizes_of_body,
 )
 from adapters.pose_functions import Pose, rate_maps
-from plumbline.engines.variants import Variant, variants_of
+from plumbline.engines.variants import Variant, both, has, variants_of
 from plumbline.model.datatypes import Array, Float, JointKind, Model, Unsupported
 from plumbline.model.kinematics import quaternion_rate, rotation_matrix, rotation_vector
 from plumbline.model.welding import RigidPart
@@ -80,10 +80,6 @@ def _angle_rates(p: Float[Array, "4"]) -> Float[Array, "3 3"]:
     if abs(np.cos(pose.forms["y"])) < MIN_COS_MIDDLE_ANGLE:
         raise Unsupported("the second of a node's three angles is near ±90°, where they lose digits")
     return np.asarray(np.linalg.inv(rate_maps(pose)["xyzdot"]))
-
-
-def _no_rates_of_its_own(p: Float[Array, "4"]) -> Float[Array, "3 3"]:
-    return np.eye(3)
 
 
 def _weight(marker: Any, gravity: Array, kind: str = "LoadMassProportional") -> Any:
@@ -219,13 +215,8 @@ def _ball_of_generic(mbs: Any, joint: Joint) -> Any:
     return mbs.AddObject(items.ObjectJointGeneric(markerNumbers=list(joint.markers), constrainedAxes=rows))
 
 
-def _assemble(mbs: Any) -> None:
-    mbs.Assemble()
-
-
 def _assemble_by_parts(mbs: Any) -> None:
-    for part in ASSEMBLY:
-        getattr(mbs, part)()
+    call_parts(mbs, " ".join(ASSEMBLY))
     mbs.systemIsConsistent = True  # which only Assemble finds out
 
 
@@ -252,7 +243,7 @@ class Change:
     rates: Callable[[Array], Array] = euler_parameter_rates  # p → B
     joints: Callable[[Any, Joint], Any] = _usual_joint
     are_meant: Callable[[JointKind], bool] = lambda _: True  # the joints that ``joints`` adds
-    assemble: Callable[[Any], None] = _assemble
+    assemble: Callable[[Any], None] = lambda mbs: mbs.Assemble()
     ways: Ways = field(default_factory=dict)  # of loads and spring-dampers
     solver: Callable[[], Any] = exudyn.MainSolverImplicitSecondOrder
     initialize: Callable[[Any, Any, Any], bool] = lambda solver, *rest: bool(solver.InitializeSolver(*rest))
@@ -264,25 +255,22 @@ class Change:
         return (self.joints if self.are_meant(joint.kind) else _usual_joint)(mbs, joint)
 
 
-def _is_open(model: Model) -> bool:
+def is_open(model: Model) -> bool:
     """Whether a mechanism has no loops, and so few bodies that one more dense solve is cheap."""
     return not model.has_loops and model.n <= MANY_BODIES
 
 
 def _has_no_axes(model: Model) -> bool:
     """Whether rates of constraints follow from outputs: others need a polynomial in the coordinates."""
-    return _is_open(model) and all(kind.has_attitude for kind in model.kinds)
+    return all(kind.has_attitude for kind in model.kinds)
 
 
-_option = variants_of("option", Change, _is_open)
-_spelling = variants_of("spelling", Change, _is_open)
+_option = variants_of("option", Change, is_open)
+_spelling = variants_of("spelling", Change, is_open)
 
 
 def _joints(names: str, add: Callable[[Any, Joint], Any], are_meant: Callable[[JointKind], bool]) -> Variant:
-    def suits(model: Model) -> bool:
-        return _is_open(model) and any(map(are_meant, model.kinds))
-
-    return _spelling(names, suits, joints=add, are_meant=are_meant)
+    return _spelling(names, lambda model: any(map(are_meant, model.kinds)), joints=add, are_meant=are_meant)
 
 
 def _renamed(kind: str) -> Callable[..., Any]:
@@ -401,10 +389,6 @@ def _drag_by_two(way: Callable[..., Any]) -> Callable[..., Any]:
     return add
 
 
-def _has_drag(model: Model) -> bool:
-    return bool(np.any(model.drag_force)) and bool(np.any(model.drag_moment))
-
-
 def _has_elements_that(what: str) -> Callable[[Model], bool]:
     """Whether a joint with one motion of this kind has a spring, damper or effort."""
 
@@ -420,9 +404,9 @@ def _has_elements_that(what: str) -> Callable[[Model], bool]:
 
 
 HAS: Mapping[str, Callable[[Model], bool]] = {
-    "LoadForceVector": lambda model: bool(np.any(model.force)),
-    "LoadTorqueVector": lambda model: bool(np.any(model.moment)),
-    DRAG: _has_drag,
+    "LoadForceVector": has("force"),
+    "LoadTorqueVector": has("moment"),
+    DRAG: both(has("drag_force"), has("drag_moment")),
     "ObjectConnectorSpringDamper": lambda model: len(model.spring_body) > 0,
     "ObjectConnectorLinearSpringDamper": _has_elements_that("slide"),
     "ObjectConnectorTorsionalSpringDamper": _has_elements_that("turn"),
@@ -471,17 +455,9 @@ WAYS: tuple[tuple[str, str, Callable[..., Any]], ...] = (
 )  # fmt: skip
 
 
-def of_ways(
-    spelling: Callable[..., Variant], is_meant: Callable[[Model], bool], end: str = ""
-) -> Sequence[Variant]:
+def of_ways(spelling: Callable[..., Variant], end: str = "") -> Sequence[Variant]:
     """List the ways to make items, of mechanisms that have some; of those whose names have this end."""
-
-    def suits(kind: str) -> Callable[[Model], bool]:
-        return lambda model: is_meant(model) and HAS[kind](model)
-
-    return [
-        spelling(names, suits(kind), ways={kind: way}) for kind, names, way in WAYS if names.endswith(end)
-    ]
+    return [spelling(names, HAS[kind], ways={kind: way}) for kind, names, way in WAYS if names.endswith(end)]
 
 
 def _initialize_by_parts(solver: Any, mbs: Any, settings: Any) -> bool:
@@ -544,8 +520,8 @@ VARIANTS = (
     _spelling(
         "itemInterface.NodeRigidBodyRotVecLG",
         _has_no_axes,
-        add_body=_node("NodeRigidBodyRotVecLG", rotation_vector, _no_rates_of_its_own),
-        rates=_no_rates_of_its_own,
+        add_body=_node("NodeRigidBodyRotVecLG", rotation_vector, lambda _: np.eye(3)),
+        rates=lambda _: np.eye(3),
     ),
     _spelling(
         "MainSystem.CreateRigidBody rigidBodyUtilities.RigidBodyInertia",
@@ -566,7 +542,7 @@ VARIANTS = (
     _spelling("MainSystem.ModifyNode MainSystem.ModifyObject", add_body=_set_later(modifies=True)),
     _option(texts("MainSystem", *ASSEMBLY, "systemIsConsistent"), assemble=_assemble_by_parts),
     _option("SystemData.GetSystemState SystemData.SetSystemState", assemble=_assemble_and_set_state),
-    *of_ways(_spelling, _is_open),
+    *of_ways(_spelling),
     _option(
         texts(IMPLICIT, "InitializeSolverPreChecks", *INITIALISATION), initialize=_initialize_by_parts
     ),

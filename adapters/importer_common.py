@@ -185,6 +185,12 @@ def joint_names(file: ModelFile) -> dict[str, list[str]]:
     }
 
 
+def names_of_parts(file: ModelFile, body: str, joint: str, count: int) -> list[str]:
+    """Return names of the joints that an engine has made one of: the file's, or the one's with numbers."""
+    names = joint_names(file).get(body, []) if file.format == "mjcf" else []
+    return names if len(names) == count else [f"{joint}/{k}" for k in range(count)]
+
+
 def merge_made_up_bodies(bodies: Sequence[NeutralBody], file: ModelFile) -> list[NeutralBody]:
     """Merge massless bodies that an importer made up for the joints of a body of an MJCF file.
 

@@ -16,9 +16,8 @@ from adapters.mujoco_common import structure_of
 from adapters.mujoco_probes import Probed
 from plumbline.model.datatypes import Array, Float
 from plumbline.model.kinematics import quaternion_exponential, quaternion_product, rotation_matrix
-from plumbline.model.probe_frames import PROBE_ATTITUDE
+from plumbline.model.probe_frames import PROBE_TURN
 
-PROBE = rotation_matrix(PROBE_ATTITUDE)
 SCALAR = {mujoco.mjtJoint.mjJNT_HINGE: "HINGE", mujoco.mjtJoint.mjJNT_SLIDE: "SLIDE"}
 
 
@@ -73,7 +72,7 @@ def _at_point(s: Probed, vectors: Array) -> tuple[Array, Array]:
 
 
 def _add_attitudes(s: Probed) -> None:
-    d, inertial = s.d, rotation_matrix(s.m.body_iquat[s.links]).mT @ PROBE
+    d, inertial = s.d, rotation_matrix(s.m.body_iquat[s.links]).mT @ PROBE_TURN
     places, turns = np.zeros((len(s.links), 3)), np.zeros((len(s.links), 9))
     same, call = mujoco.mjtSameFrame.mjSAMEFRAME_NONE, ("mj_local2Global", "mjtSameFrame")
     for site, body, place, turn in zip(s.sites, s.links, places, turns, strict=True):
@@ -81,7 +80,7 @@ def _add_attitudes(s: Probed) -> None:
     s.add_attitudes(call, turns)
     s.add("frame_position", call, places)
     for name in ("xquat", "xmat", "ximat", "xiquat", "site_xquat"):  # older versions lack the last
-        of = None if name == "site_xquat" else inertial if name[1] == "i" else PROBE
+        of = None if name == "site_xquat" else inertial if name[1] == "i" else PROBE_TURN
         ids = s.sites if name == "site_xquat" else s.links
         s.add_attitudes((f"MjData.{name}",), getattr(d, name)[ids], of)
 
@@ -146,7 +145,7 @@ def _add_joint_frames(s: Probed) -> None:
     positions = tuple(x for x in by if x.endswith(("POS", "QUAT")))
     if by:
         s.add("body_position", positions, place[links])
-        s.add_axes(positions, turn[links] @ PROBE)
+        s.add_axes(positions, turn[links] @ PROBE_TURN)
         s.add("frame_angular_velocity", tuple(x for x in by if x not in positions), spin[links])
     if np.any(m.jnt_type == mujoco.mjtJoint.mjJNT_HINGE):
         s.add("frame_angular_velocity", ("MjData.xaxis",), along[links])

@@ -12,6 +12,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
+from functools import reduce
+from operator import or_
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +25,7 @@ from adapters import mujoco_actuation as actuation
 from adapters import mujoco_shapes as shapes
 from adapters.mujoco_common import bodies_of, compiler_of, dense_rows, member, through_inverse
 from adapters.pose_functions import FIXED_PLACE, Pose, rate_maps
-from plumbline.engines.variants import Variant, names_of_column, variants_of
+from plumbline.engines.variants import Variant, both, every, has, names_of_column, variants_of
 from plumbline.model.datatypes import Array, Model
 from plumbline.model.kinematics import quaternion_conjugate, quaternion_product, rotation_matrix
 from plumbline.model.probe_frames import PROBE_ATTITUDE
@@ -51,7 +53,7 @@ def _no_change(*given: Any) -> Any:
     return given if len(given) > 1 else given[0]
 
 
-NEEDLESS = tuple(  # flags of what no free mechanism without elements has
+NEEDLESS = " ".join(  # flags of what no free mechanism without elements has
     f"mjtDisableBit.mjDSBL_{name}"
     for name in (
         "LIMIT", "CONSTRAINT", "EQUALITY", "CLAMPCTRL", "REFSAFE", "SENSOR", "EULERDAMP", "SPRING", "DAMPER",
@@ -93,7 +95,8 @@ def _set_options(**values: Any) -> Callable[[Any, Any], tuple[Any, Any]]:
         for name, value in values.items():
             given = value
             if isinstance(value, str):
-                given = int(member(value)) | (getattr(m.opt, name) if name.endswith("flags") else 0)
+                set_already = getattr(m.opt, name) if name.endswith("flags") else 0
+                given = reduce(or_, [int(member(one)) for one in value.split()], set_already)
             setattr(m.opt, name, given)
         return m, mujoco.MjData(m)
 
@@ -342,13 +345,6 @@ def _never_asleep(spec: Any) -> Any:
     return spec
 
 
-def _without_needless(m: Any, d: Any) -> tuple[Any, Any]:
-    """Disable what the mechanism has none of."""
-    for flag in NEEDLESS:
-        m.opt.disableflags |= int(member(flag))
-    return m, d
-
-
 def _keep(m: Any, d: Any) -> None:
     """Leave what the last state left in the data."""
 
@@ -382,55 +378,49 @@ def _oriented(kind: str, convert: Callable[[Pose], Array]) -> Variant:
 
 
 def _has_free_balls(model: Model) -> bool:
-    """Whether a tree has balls or rods, and none with elements, which act on rotation vectors."""
+    """Whether there are balls or rods, and none with elements, which act on rotation vectors."""
     balls = [k for k, kind in enumerate(model.kinds) if kind.holds_no_turn]
     elements = (model.armature, model.damping, model.stiffness, model.effort)
-    return _is_free(model) and bool(balls) and not any(np.any(x[balls]) for x in elements)
+    return bool(balls) and not any(np.any(x[balls]) for x in elements)
 
 
 def _has_inertia(model: Model) -> bool:
     """Whether no body is a point mass or flat to rounding, whose full inertia MuJoCo's compiler refuses."""
     moments = np.linalg.eigvalsh(model.inertia)
-    is_flat = moments[:, 2] >= (1 - ROUNDING) * (moments[:, 0] + moments[:, 1])
-    return _is_free(model) and not np.any(is_flat)
+    return bool(np.all(moments[:, 2] < (1 - ROUNDING) * (moments[:, 0] + moments[:, 1])))
 
 
-def _has_free_bodies(model: Model) -> bool:
-    return _is_free(model) and bool(np.any(model.free))
+def _has_loops(model: Model) -> bool:
+    return model.has_loops
 
 
 _option = variants_of("option", Change, _is_free)
 _spelling = variants_of("spelling", Change, _is_free)
 
 
-def _has_attached(model: Model) -> bool:
-    """Whether bodies of a mechanism without constraints are fixed to others."""
-    return _is_free(model) and any(kind.is_rigid for kind in model.kinds)
+_of_any = variants_of("option", Change, every)
+_of_constraints = variants_of("option", Change, is_constrained)
+_of_loops = variants_of("option", Change, _has_loops)
 
 
-def _has_elements(*names: str) -> Callable[[Model], bool]:
-    """Whether a mechanism without constraints has one of these elements of joints."""
-    return lambda model: _is_free(model) and any(np.any(getattr(model, name)) for name in names)
-
-
-def _options(suits: Callable[[Model], bool] = is_constrained, **values: Any) -> Variant:
+def _options(suits: Callable[[Model], bool] = every, **values: Any) -> Variant:
     """Set options that concern constraints; the texts among them are its names."""
     names = " ".join(value for value in values.values() if isinstance(value, str))
-    return _option(names, suits, remake=_set_options(**{"iterations": 100, "tolerance": 0.0} | values))
+    set_options = _set_options(**{"iterations": 100, "tolerance": 0.0} | values)
+    return _of_constraints(names, suits, remake=set_options)
 
 
 def _of_shapes(by: str, describe: Callable[[Any], Any], suits: Callable[[Model], bool]) -> Variant:
     """Describe bodies of geoms."""
     names = f"mjtInertiaFromGeom.mjINERTIAFROMGEOM_{by} {SHAPES}"
-    both: Callable[[Model], bool] = lambda model: _has_inertia(model) and suits(model)  # noqa: E731
-    return _spelling(names, both, has_own_inertia=True, describe=describe)
+    return _spelling(names, both(_has_inertia, suits), has_own_inertia=True, describe=describe)
 
 
 def _actuated(
     ways: Mapping[str, Mapping[str, str]],
     read: str = "",
     names: str = "",
-    suits: Callable[[Model], bool] = _has_elements("effort"),  # noqa: B008
+    suits: Callable[[Model], bool] = has("effort"),  # noqa: B008
 ) -> Variant:
     """Let actuators exert what the joints have."""
     own = " ".join(actuation.names_of(ways))
@@ -445,25 +435,13 @@ THREE: dict[str, Any] = {"iterations": 3, "tolerance": 0.0}
 SPARSE: dict[str, Any] = {"jacobian": "mjtJacobian.mjJAC_SPARSE"}
 
 
-def _has_loops(model: Model) -> bool:
-    return model.has_loops
-
-
-def _has_nothing_else(model: Model) -> bool:
-    return _is_free(model) and not model.has_elements
-
-
-def _every(_: Model) -> bool:
-    return True
-
-
 VARIANTS = (
     _option(" ".join(STAGES), forward=_forward_by(*STAGES)),
-    _option(" ".join(PARTS), _every, forward=_forward_by(*PARTS)),
+    _of_any(" ".join(PARTS), forward=_forward_by(*PARTS)),
     _option("mj_forwardSkip mjtStage", forward=_forward_with_skips),
     _option("mj_step1", forward=_forward_by("mj_step1", *LAST_STAGES)),
     _option("mj_getState mj_setState mj_stateSize mj_resetData mjtState", forward=_forward_after_set_state),
-    _option(" ".join(OTHER_PARTS), _every, forward=_forward_by(*OTHER_PARTS)),
+    _of_any(" ".join(OTHER_PARTS), forward=_forward_by(*OTHER_PARTS)),
     _option("mj_copyState mj_extractState", forward=_forward_after_copied_state),
     _option(
         "mj_setKeyframe mj_resetDataKeyframe MjsKey", describe=_with_key, forward=_forward_after_keyframe
@@ -477,7 +455,7 @@ VARIANTS = (
     _option("mj_step2", forward=_forward_by_step("mj_step1", "mj_step2")),
     _option("set_mjcb_passive", forward=_forward_by_callback("passive")),
     _option("set_mjcb_control", forward=_forward_by_callback("control")),
-    _option(" ".join(NEEDLESS), _has_nothing_else, remake=_without_needless),
+    _option(NEEDLESS, lambda model: not model.has_elements, remake=_set_options(disableflags=NEEDLESS)),
     _option("MjData", reset=_keep),
     _option("mj_copyData", remake=_copied_data),
     _option("MjModel", remake=lambda m, d: pickle.loads(pickle.dumps((m, d)))),
@@ -486,32 +464,26 @@ VARIANTS = (
     _option("rollout.rollout", forward=_forward_by_rollout),
     _option("mj_normalizeQuat mj_checkPos mj_checkVel mj_checkAcc", forward=_forward_with_checks),
     _option("mj_defaultOption", remake=_default_options),
-    _option(
+    _of_constraints(
         "mj_mulJacTVec MjData.efc_AR MjData.efc_b MjData.efc_Y MjData.efc_R",
-        is_constrained,
         remake=_set_options(**THREE, **SPARSE, solver="mjtSolver.mjSOL_PGS"),
         forward=_forward_by_constraint_matrix,
     ),
-    _option(
+    _of_constraints(
         "mj_mulJacVec mj_constraintUpdate MjData.efc_J MjData.efc_aref MjData.efc_D MjData.efc_diagA "
         "MjData.efc_KBIP",
-        is_constrained,
         remake=_set_options(**THREE, **SPARSE),
         forward=_forward_by_constraint_rows,
     ),
-    _option(
+    _of_loops(
         "mj_island MjData.iacc MjData.iefc_force MjData.iacc_smooth MjData.ifrc_smooth "
         "MjData.ifrc_constraint MjData.iefc_R MjData.iefc_aref",
-        _has_loops,
         remake=_set_options(**THREE, **SPARSE),
         forward=_forward_by_islands,
     ),
-    _option(
-        "MjData.eq_active", _has_loops, describe=_switched_off, forward=_forward_by_switched_welds
-    ),
-    _option(
+    _of_loops("MjData.eq_active", describe=_switched_off, forward=_forward_by_switched_welds),
+    _of_loops(
         "MjOption.ls_iterations MjOption.ls_tolerance",
-        _has_loops,
         # other limits than by default: Newton's whole step is right of a linear problem, whatever they are
         remake=_set_options(**THREE, ls_iterations=7, ls_tolerance=1e-3),
     ),
@@ -533,21 +505,21 @@ VARIANTS = (
         actuation.SERVO,
         "JOINTACTFRC",
         "mjtGain.mjGAIN_FIXED mjtBias.mjBIAS_AFFINE mjtSensor.mjSENS_JOINTACTFRC",
-        _has_elements("stiffness", "damping"),
+        has("stiffness", "damping"),
     ),
     _actuated(actuation.PID, names="mjtGain.mjGAIN_PID mjtDyn.mjDYN_PID mjtCtrlInput"),
     _spelling(
         " ".join((*actuation.CALLBACKS, *actuation.names_of(actuation.BY_CALLBACK))),
-        _has_elements("effort"),
+        has("effort"),
         describe=actuation.with_actuators(actuation.BY_CALLBACK),
         forward=actuation.forward_by_callbacks,
     ),
     _spelling(
         "mjtWrap.mjWRAP_JOINT mjtTendon mjtObj.mjOBJ_TENDON mjtSensor.mjSENS_TENDONACTFRC "
         "mjtTrn.mjTRN_TENDON",
-        lambda model: (
-            _has_elements("effort", "stiffness", "damping", "armature")(model)
-            and any(kind.motions for kind in model.kinds)
+        both(
+            has("effort", "stiffness", "damping", "armature"),
+            lambda model: any(kind.motions for kind in model.kinds),
         ),
         describe=actuation.with_fixed_tendons,
         remake=actuation.elements_on_tendons,
@@ -564,7 +536,7 @@ VARIANTS = (
     ),
     _spelling(
         "MjsBody MjData.qfrc_gravcomp",
-        _has_attached,
+        lambda model: any(kind.is_rigid for kind in model.kinds),  # fixed to others
         describe=actuation.with_gravcomp_of_attached,
         forward=actuation.forward_without_gravity,
     ),
@@ -582,11 +554,11 @@ VARIANTS = (
         has_own_inertia=True,
         describe=shapes.without_shapes,
     ),
-    _of_shapes("AUTO", shapes.of_shapes, lambda model: bool(np.any(model.rods))),
+    _of_shapes("AUTO", shapes.of_shapes, has("rods")),
     _of_shapes("TRUE", shapes.of_shapes_only, lambda model: not np.any(model.rods)),
-    _spelling("mjtEq.mjEQ_CONNECT", _has_loops, describe=shapes.welds_as_points),
+    variants_of("spelling", Change, _has_loops)("mjtEq.mjEQ_CONNECT", describe=shapes.welds_as_points),
     _spelling("mjtJoint.mjJNT_HINGE", _has_free_balls, ball_joints=HINGES),
-    _spelling("mjtJoint.mjJNT_SLIDE", _has_free_bodies, free_joints=(*SLIDES, *BALL)),
+    _spelling("mjtJoint.mjJNT_SLIDE", has("free"), free_joints=(*SLIDES, *BALL)),
 )  # fmt: skip
 
 
@@ -603,8 +575,6 @@ COLUMN_NAMES = names_of_column(
         "loops": _has_loops,
         "pitches": lambda model: any(kind.has_pitch for kind in model.kinds),
         "springs between points": lambda model: len(model.spring_body) > 0,
-        "moments and drag": lambda model: any(
-            np.any(x) for x in (model.moment, model.drag_force, model.drag_moment)
-        ),
+        "moments and drag": has("moment", "drag_force", "drag_moment"),
     },
 )

@@ -27,9 +27,9 @@ from adapters.importer_common import (
     LoadingImporter,
     Refused,
     joint_from_screw,
-    joint_names,
     make_body,
     make_joint,
+    names_of_parts,
     pose,
     pose_of_coordinates,
 )
@@ -54,9 +54,8 @@ class _Layout(LayoutWithOwnVelocities):
         return self.m.gravity.linear
 
     def _bodies(self) -> Iterator[NeutralBody]:
-        names = joint_names(self.file) if self.file.format == "mjcf" else {}
         for j in range(1, self.m.njoints):  # Pinocchio's order is depth first
-            yield self._body(j, self._frame(j), names)
+            yield self._body(j, self._frame(j))
 
     def _kind(self, j: int) -> str:
         short, nq, nv = self.m.joints[j].shortname(), self.m.nqs[j], self.m.nvs[j]
@@ -79,16 +78,16 @@ class _Layout(LayoutWithOwnVelocities):
             raise NotImplementedError(f"joint {self.m.names[j]!r}, which moves no body")
         return frame
 
-    def _body(self, j: int, frame: Any, names: dict[str, list[str]]) -> NeutralBody:
+    def _body(self, j: int, frame: Any) -> NeutralBody:
         m, P, parent = self.m, frame.placement, self.m.parents[j]
         above = self._frame(parent).placement.inverse() if parent else pin.SE3.Identity()
         zero, inertia = above * m.jointPlacements[j] * P, P.actInv(m.inertias[j])
         return make_body(
-            frame.name, parent - 1, zero.homogeneous, self._joints(j, frame, names.get(frame.name, [])),
+            frame.name, parent - 1, zero.homogeneous, self._joints(j, frame),
             inertia.mass, inertia.lever, inertia.inertia,
         )  # fmt: skip
 
-    def _joints(self, j: int, frame: Any, names: list[str]) -> Iterator[ElementaryJoint]:
+    def _joints(self, j: int, frame: Any) -> Iterator[ElementaryJoint]:
         """Hinges and slides by the columns of the motion subspace at q = 0."""
         m, P, kind, own = self.m, frame.placement, self._kind(j), self.m.names[j]
         S = np.array(self.data.joints[j].S).reshape(6, -1)
@@ -103,10 +102,7 @@ class _Layout(LayoutWithOwnVelocities):
             else:
                 yield make_joint(own, "ball", anchor=anchor, **numbers)
             return
-        if m.nvs[j] == 1:
-            names = [own]
-        elif len(names) != m.nvs[j]:
-            names = [f"{own}/{k}" for k in range(m.nvs[j])]
+        names = [own] if m.nvs[j] == 1 else names_of_parts(self.file, frame.name, own, m.nvs[j])
         for k, (name, column) in enumerate(zip(names, S.T, strict=True)):
             at = slice(q, q + 2) if kind == "continuous" else slice(q + k, q + k + 1)
             self.places.append(((P, origin, kind == "continuous", at), slice(v + k, v + k + 1)))

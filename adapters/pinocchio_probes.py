@@ -11,8 +11,7 @@ import pinocchio as pin
 from adapters.pinocchio_common import WORLD_ALIGNED
 from adapters.surface_record import SurfaceRecord
 from plumbline.model.datatypes import Array, Call, Float, Model
-from plumbline.model.kinematics import rotation_matrix
-from plumbline.model.probe_frames import PROBE_ATTITUDE, probe_points
+from plumbline.model.probe_frames import PROBE_TURN, probe_points
 
 
 def add_probe_frames(
@@ -25,11 +24,10 @@ def add_probe_frames(
         placements: of each body's frame in that joint's frame.
 
     """
-    turn = rotation_matrix(PROBE_ATTITUDE)
-    return [
-        int(pin_model.addFrame(pin.Frame(f"probe {k}", j, place * pin.SE3(turn, x), pin.FrameType.OP_FRAME)))
-        for k, (j, place, x) in enumerate(zip(joints, placements, probe_points(model), strict=True))
-    ]
+    own = enumerate(zip(joints, placements, probe_points(model), strict=True))
+    kind = pin.FrameType.OP_FRAME
+    frames = [pin.Frame(f"probe {k}", j, at * pin.SE3(PROBE_TURN, x), kind) for k, (j, at, x) in own]
+    return [int(pin_model.addFrame(frame)) for frame in frames]
 
 
 class Probed(SurfaceRecord):

@@ -19,7 +19,7 @@ import numpy as np
 import pinocchio as pin
 
 from adapters.pinocchio_common import composite
-from plumbline.engines.variants import Variant, variants_of
+from plumbline.engines.variants import Variant, has, variants_of
 from plumbline.model.datatypes import Array, Float, Model
 
 LIMITS = (
@@ -112,7 +112,7 @@ def _spelled(
 
     def suits(model: Model) -> bool:
         has_own_rates = any(spelling.has_own_rates for spelling in joints.values())
-        return _is_tree(model) and not (has_own_rates and model.has_elements) and is_meant(model)
+        return not (has_own_rates and model.has_elements) and is_meant(model)
 
     every = [f"Joint{what}{kind}" for kind in kinds.split() for what in ("Model", "Data")]
     return _spelling(names or " ".join(every), suits, joints=joints)
@@ -123,10 +123,6 @@ def _moves(*motions: str) -> Callable[[Model], bool]:
     return lambda model: any(
         tuple(what for what, _ in kind.motions) == motions and not kind.has_pitch for kind in model.kinds
     )
-
-
-def _has_free_body(model: Model) -> bool:
-    return bool(np.any(model.free))
 
 
 def _saved(form: str, end: str) -> Callable[[pin.Model], pin.Model]:
@@ -235,12 +231,12 @@ def _cosines(q: Array) -> Array:
 
 def _has_one_root(model: Model) -> bool:
     """Whether one joint carries all, and has an inertia that can be shared."""
-    return _is_tree(model) and int(np.sum(model.body[:, 0] < 0)) == 1 and not model.kinds[0].holds_distance
+    return int(np.sum(model.body[:, 0] < 0)) == 1 and not model.kinds[0].holds_distance
 
 
 def _is_short(model: Model) -> bool:
     """Whether `aba` keeps its digits; where it loses them is recorded of the column pinocchio-aba."""
-    return _is_tree(model) and model.n <= 3
+    return model.n <= 3
 
 
 VARIANTS = (
@@ -291,7 +287,7 @@ VARIANTS = (
         lambda model: _moves("turn")(model) or _moves("slide")(model),
     ),
     *(
-        _spelled(names, {"JointModelFreeFlyer": Spelling(_made(*parts, "Spherical"))}, _has_free_body)
+        _spelled(names, {"JointModelFreeFlyer": Spelling(_made(*parts, "Spherical"))}, has("free"))
         for names, parts in (("PX PY", ("PX", "PY", "PZ")), ("Translation", ("Translation",)))
     ),
     *(

@@ -52,7 +52,7 @@ from plumbline.model.kinematics import (
     rotation_matrix,
     rotation_vector,
 )
-from plumbline.model.probe_frames import PROBE_ATTITUDE
+from plumbline.model.probe_frames import PROBE_TURN
 
 FIXED_PLACE = np.array([0.3, -0.2, 0.5])
 FIXED_TURN, OTHER_TURN = (
@@ -60,7 +60,6 @@ FIXED_TURN, OTHER_TURN = (
 )
 POSE_STATES = 2  # at which they are called
 TERMS = 40  # of a series in rotation vectors up to π
-PROBE = rotation_matrix(PROBE_ATTITUDE)
 
 
 def xyz_angles(R: Float[Array, "3 3"]) -> Float[Array, "3"]:
@@ -204,7 +203,7 @@ class _Body:
         pose, _, form = form.rpartition(".")
         found, above = {}, self.pose * self.poses[pose].inverse() if pose else None
         if (turn := self._attitude(form, value)) is not None:
-            found["frame_axes"] = ((above.R @ turn if above else turn) @ PROBE).T
+            found["frame_axes"] = ((above.R @ turn if above else turn) @ PROBE_TURN).T
         if (place := self._place(form, value)) is not None:
             found["body_position"] = above.r + above.R @ place if above else place
         return found

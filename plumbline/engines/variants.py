@@ -13,6 +13,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import numpy as np
+
 from plumbline.layout import ROOT
 from plumbline.model.datatypes import Call, Model
 
@@ -30,17 +32,32 @@ class Variant:
     suits: Suits  # the mechanisms that it is compared on
 
 
+def every(_: Model) -> bool:
+    """Whether a mechanism is one."""
+    return True
+
+
+def both(*suits: Suits) -> Suits:
+    """Whether a mechanism is of all these."""
+    return lambda model: all(one(model) for one in suits)
+
+
+def has(*names: str) -> Suits:
+    """Whether any of these arrays of a model has a number that is not 0."""
+    return lambda model: any(np.any(getattr(model, name)) for name in names)
+
+
 def variants_of(kind: VariantKind, change: Callable[..., Any], usual: Suits) -> Callable[..., Variant]:
     """Return what makes the entries of a table: of names in one text, the mechanisms, and what is changed.
 
     Args:
         change: makes the adapter's own record of that.
-        usual: the mechanisms of entries that say nothing else.
+        usual: the mechanisms of all entries, some of which have a further condition.
 
     """
 
-    def make(names: str, suits: Suits = usual, **changed: Any) -> Variant:
-        return Variant(kind, tuple(names.split()), change(**changed), suits)
+    def make(names: str, suits: Suits = every, **changed: Any) -> Variant:
+        return Variant(kind, tuple(names.split()), change(**changed), both(usual, suits))
 
     return make
 
@@ -52,7 +69,7 @@ def names_of_column(column: str, mechanisms: Mapping[str, Suits]) -> Sequence[tu
         mechanisms: by word of `adapters/surface/column_names.json` those on which it does; "all" is given.
 
     """
-    suits: Mapping[str, Suits] = {"all": lambda _: True, **mechanisms}
+    suits: Mapping[str, Suits] = {"all": every, **mechanisms}
     return [(tuple(names), suits[word]) for word, names in _column_names()[column].items()]
 
 

@@ -9,8 +9,10 @@ from __future__ import annotations
 import numpy as np
 
 from plumbline.model.datatypes import Array, Float, Model
+from plumbline.model.kinematics import rotation_matrix
 
 PROBE_ATTITUDE = np.array([1.0, 2.0, 3.0, 4.0]) / np.sqrt(30.0)  # quaternion, probe axes → body axes
+PROBE_TURN = rotation_matrix(PROBE_ATTITUDE)
 _DIRECTION = np.array([2.0, -3.0, 6.0]) / 7.0
 
 
