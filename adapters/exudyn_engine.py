@@ -193,27 +193,23 @@ class ExudynChain:
             stiffness, damping, effort = (x[k, i] for x in (model.stiffness, model.damping, model.effort))
             if not (stiffness or damping or effort):
                 continue
-            coefficients = {"stiffness": float(stiffness), "damping": float(damping)}
             turns = rotation_matrix(model.turn[k])
             sign = -1 if what == "turn" and i and number == 1 else 1  # a universal joint's second axis
+            given: dict[str, Any] = {"markerNumbers": ends[::sign], "offset": float(sign * model.rest[k, i])}
+            given |= {"stiffness": float(stiffness), "damping": float(damping)}
             if what == "slide":
-                connector = add_item(
-                    self.mbs, self.change.ways, "ObjectConnectorLinearSpringDamper", markerNumbers=ends,
-                    axisMarker0=turns[0][:, number], offset=float(model.rest[k, i]),
-                    force=float(-effort), **coefficients,
-                )  # fmt: skip
+                kind, push = "ObjectConnectorLinearSpringDamper", "force"
+                given["axisMarker0"] = turns[0][:, number]
             else:
+                kind, push = "ObjectConnectorTorsionalSpringDamper", "torque"
                 # the node keeps the angle of the last step, near which the next one is taken
-                last_angle = self.mbs.AddNode(
-                    items.NodeGenericData(initialCoordinates=[sign * self.x[k, i]], numberOfDataCoordinates=1)
-                )
+                start = {"initialCoordinates": [sign * self.x[k, i]], "numberOfDataCoordinates": 1}
+                given["nodeNumber"] = self.mbs.AddNode(items.NodeGenericData(**start))
                 local = np.roll(np.eye(3), -number - 1, axis=1) if sign > 0 else SECOND_AXIS
-                connector = add_item(
-                    self.mbs, self.change.ways, "ObjectConnectorTorsionalSpringDamper",
-                    markerNumbers=ends[::sign], rotationMarker0=turns[::sign][0] @ local,
-                    rotationMarker1=turns[::sign][1] @ local, offset=float(sign * model.rest[k, i]),
-                    nodeNumber=last_angle, torque=float(-sign * effort), **coefficients,
-                )  # fmt: skip
+                first, second = (turn @ local for turn in turns[::sign])
+                given |= {"rotationMarker0": first, "rotationMarker1": second}
+            given[push] = float(-sign * effort)
+            connector = add_item(self.mbs, self.change.ways, kind, **given)
             self.connectors.append((k, connector, what == "slide", sign * axis))
 
     def _end_marker(self, body: int, point: Array) -> Any:

@@ -298,30 +298,25 @@ def _created_between(function: str, **more: Any) -> Callable[..., Any]:
     return add
 
 
-def _created_along(
-    mbs: Any, function: str, given: Mapping[str, Any], axis: Array, start: float, **more: Any
-) -> Any:
-    """The same along an axis of the first body, with coordinates that are zero at the start."""
-    ends = [mbs.GetMarker(marker) for marker in given["markerNumbers"]]
-    law = {name: given[name] for name in ("stiffness", "damping", "offset")} | more
-    name = "bodyNumbers" if function == "CreateTorsionalSpringDamper" else "itemNumbers"
-    place = {"position": ends[0]["localPosition"], "axis": axis, "useGlobalFrame": False}
+def _created_along(mbs: Any, **given: Any) -> Any:
+    """A spring-damper by a function of the system, along or about an axis of the first body.
+
+    Its coordinate is zero at the start.
+    """
+    ends, is_turn = [mbs.GetMarker(marker) for marker in given["markerNumbers"]], "torque" in given
+    if is_turn:
+        axis = np.asarray(given["rotationMarker0"])[:, 2]
+        start = mbs.GetNodeParameter(given["nodeNumber"], "initialCoordinates")[0]
+    else:
+        axis = np.asarray(given["axisMarker0"])
+        (here, turn), (there, _) = (_place_of(mbs, end) for end in ends)
+        start = float((turn @ axis) @ (there - here))
+    law = {x: given[x] for x in ("stiffness", "damping", "offset", "force", "torque") if x in given}
     law["offset"] -= start
-    return getattr(mbs, function)(**{name: [end["bodyNumber"] for end in ends]}, **place, **law)
-
-
-def _torsional_by_function(mbs: Any, **given: Any) -> Any:
-    axis = np.asarray(given["rotationMarker0"])[:, 2]
-    angle = mbs.GetNodeParameter(given["nodeNumber"], "initialCoordinates")[0]
-    function = "CreateTorsionalSpringDamper"
-    return _created_along(mbs, function, given, axis, angle, torque=given["torque"])
-
-
-def _linear_by_function(mbs: Any, **given: Any) -> Any:
-    axis = np.asarray(given["axisMarker0"])
-    (here, turn), (there, _) = (_place_of(mbs, mbs.GetMarker(marker)) for marker in given["markerNumbers"])
-    shift = float((turn @ axis) @ (there - here))
-    return _created_along(mbs, "CreateLinearSpringDamper", given, axis, shift, force=given["force"])
+    law |= {"position": ends[0]["localPosition"], "axis": axis, "useGlobalFrame": False}
+    bodies = {"bodyNumbers" if is_turn else "itemNumbers": [end["bodyNumber"] for end in ends]}
+    create = mbs.CreateTorsionalSpringDamper if is_turn else mbs.CreateLinearSpringDamper
+    return create(**bodies, **law)
 
 
 def _place_of(mbs: Any, marker: Any) -> tuple[Array, Array]:
@@ -437,8 +432,8 @@ WAYS: tuple[tuple[str, str, Callable[..., Any]], ...] = (
         (f"ObjectConnector{name}SpringDamper", f"MainSystem.Create{name}SpringDamper", way)
         for name, way in (
             ("", _created_between("CreateSpringDamper")),
-            ("Torsional", _torsional_by_function),
-            ("Linear", _linear_by_function),
+            ("Torsional", _created_along),
+            ("Linear", _created_along),
             ("RigidBody", _created_between("CreateRigidBodySpringDamper", **_NOT_INTRINSIC)),
         )
     ),

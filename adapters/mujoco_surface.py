@@ -325,28 +325,27 @@ def _add_tendon_limits(s: Probed) -> None:
 
 def _add_jacobians(s: Probed) -> None:
     m, d, rows = s.m, s.d, defaultdict[tuple[str, str], list[Array]](list)
-
-    def add(call: str, *values: Array) -> None:
-        for quantity, value in zip(JACOBIANS[call], values, strict=True):
-            rows[quantity, call].append(value)
-
     for b, site in zip(s.links, s.sites, strict=True):
         (p, r), (dp, dr) = np.zeros((2, 2, 3, m.nv))
-        mujoco.mj_jac(m, d, p, r, d.site_xpos[site], b)
-        add("mj_jac", p @ d.qvel, r @ d.qvel)
+        point, geom = d.site_xpos[site], m.geom(m.site(site).name).id
         axis = d.site_xmat[site].reshape(3, 3)[:, 0].copy()
-        mujoco.mj_jacPointAxis(m, d, p, r, d.site_xpos[site], axis, b)
-        add("mj_jacPointAxis", p @ d.qvel)
-        geom = m.geom(m.site(site).name).id
-        numbers = {"mj_jacBody": b, "mj_jacBodyCom": b, "mj_jacSite": site, "mj_jacGeom": geom}
-        for call, number in numbers.items():
-            getattr(mujoco, call)(m, d, p, r, number)
-            add(call, p @ d.qvel, r @ d.qvel)
-        mujoco.mj_jacDot(m, d, dp, dr, d.site_xpos[site], b)
-        add("mj_jacDot", dp @ d.qvel + p @ d.qacc, dr @ d.qvel + r @ d.qacc)
-        for call in ("mj_jacSubtreeCom", "mj_angmomMat"):
-            getattr(mujoco, call)(m, d, p, b)
-            add(call, p @ d.qvel)
+        for call, arguments in (
+            ("mj_jac", (p, r, point, b)),
+            ("mj_jacPointAxis", (p, r, point, axis, b)),
+            ("mj_jacBody", (p, r, b)),
+            ("mj_jacBodyCom", (p, r, b)),
+            ("mj_jacSite", (p, r, site)),
+            ("mj_jacGeom", (p, r, geom)),
+            ("mj_jacDot", (dp, dr, point, b)),
+            ("mj_jacSubtreeCom", (p, b)),
+            ("mj_angmomMat", (p, b)),
+        ):
+            getattr(mujoco, call)(m, d, *arguments)
+            values = [p @ d.qvel, r @ d.qvel]
+            if call == "mj_jacDot":
+                values = [dp @ d.qvel + p @ d.qacc, dr @ d.qvel + r @ d.qacc]
+            for quantity, value in zip(JACOBIANS[call], values, strict=False):
+                rows[quantity, call].append(value)
     for (quantity, call), vectors in rows.items():
         s.add(quantity, (call,), vectors)
 

@@ -258,12 +258,11 @@ def _add_centres(s: Probed) -> None:
     m, (q, v, a), data, derived = s.m, s.motion, s.m.createData(), s.m.createData()
     s.add("total_mass", ("computeTotalMass",), pin.computeTotalMass(m))
     pin.centerOfMass(m, data, q, v, a)
-    for quantity, name in (("", "com"), ("_velocity", "vcom"), ("_acceleration", "acom")):
-        s.add(f"centre_of_mass{quantity}", ("centerOfMass", f"Data.{name}"), getattr(data, name)[0])
     pin.forwardKinematics(m, derived, q, v, a)
     for quantity, name, level in (
         ("", "com", "POSITION"), ("_velocity", "vcom", "VELOCITY"), ("_acceleration", "acom", "ACCELERATION"),
     ):  # fmt: skip
+        s.add(f"centre_of_mass{quantity}", ("centerOfMass", f"Data.{name}"), getattr(data, name)[0])
         pin.centerOfMass(m, derived, getattr(pin.KinematicLevel, level))
         call = "centerOfMass", "KinematicLevel", f"KinematicLevel.{level}"
         s.add(f"centre_of_mass{quantity}", call, getattr(derived, name)[0])
