@@ -7,7 +7,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from inspect import Parameter, signature
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 import exudyn
 import numpy as np
@@ -181,6 +181,32 @@ def mass_matrix_and_force(solver: Any, mbs: Any) -> tuple[Float[Array, "nq nq"],
     return M, np.array(solver.GetSystemResidual())[: len(M)]
 
 
+class _StepRecorder(Generic[Sample]):
+    """The function that Exudyn calls after every step: checks, samples, and carries exceptions out."""
+
+    def __init__(
+        self, sampled_steps: set[int], read_sample: Callable[[], Sample], check_step: Callable[[float], None]
+    ) -> None:
+        self.sampled_steps, self.read_sample, self.check_step = sampled_steps, read_sample, check_step
+        self.samples, self.clock = [read_sample()], [0.0]
+        self.taken = 0
+        self.error: Exception | None = None
+
+    def after_step(self, _: Any, t: float) -> bool:
+        if t == 0:  # Exudyn calls once before the first step: its initial accelerations are there now
+            self.samples[0] = self.read_sample()
+            return True
+        self.taken += 1
+        try:
+            self.check_step(t)
+            if self.taken in self.sampled_steps:
+                self.samples.append(self.read_sample())
+                self.clock.append(t)
+        except Exception as error:  # Exudyn would wrap it in one of its own
+            self.error = error
+        return self.error is None
+
+
 def run_solver(
     solver: Any,
     mbs: Any,
@@ -208,45 +234,29 @@ def run_solver(
             (Exudyn reports an early stop as a success); the message ends with Exudyn's own.
 
     """
-    steps, sampled_steps = round(float(times[-1] / step)), set(np.rint(times / step).astype(int).tolist())
-    samples, clock, taken, failure = [read_sample()], [0.0], 0, None
+    steps = round(float(times[-1] / step))
+    recorder = _StepRecorder(set(np.rint(times / step).astype(int).tolist()), read_sample, check_step)
     if steps == 0:
-        return samples, np.array(clock)
-
-    def after_step(_: Any, t: float) -> bool:
-        nonlocal taken, failure
-        if t == 0:  # Exudyn calls once before the first step: its initial accelerations are there now
-            samples[0] = read_sample()
-            return True
-        taken += 1
-        try:
-            check_step(t)
-            if taken in sampled_steps:
-                samples.append(read_sample())
-                clock.append(t)
-        except Exception as error:  # Exudyn would wrap it in one of its own
-            failure = error
-        return failure is None
-
-    mbs.SetPostStepUserFunction(after_step)
+        return recorder.samples, np.array(recorder.clock)
+    mbs.SetPostStepUserFunction(recorder.after_step)
     settings.timeIntegration.numberOfSteps = steps
     settings.timeIntegration.endTime = float(times[-1])
     try:
         finished = solver.SolveSystem(mbs, settings)
     except (RuntimeError, ValueError, ENGINE_ERROR) as error:
-        raise EngineFailure(f"Exudyn stopped after {taken} of {steps} steps: {error}") from error
+        raise EngineFailure(f"Exudyn stopped after {recorder.taken} of {steps} steps: {error}") from error
     finally:
-        mbs.SetPostStepUserFunction(0)  # the function holds the system: together they would never be freed
-    if failure is not None:
-        raise failure
+        mbs.SetPostStepUserFunction(0)  # the recorder holds the system: together they would never be freed
+    if recorder.error is not None:
+        raise recorder.error
     end = mbs.systemData.GetTime()
-    if not finished or taken != steps or abs(end - times[-1]) > 1e-9 * times[-1]:
+    if not finished or recorder.taken != steps or abs(end - times[-1]) > 1e-9 * times[-1]:
         message = " ".join(str(solver.GetErrorString()).split()) or "no reason given"
         raise EngineFailure(
-            f"Exudyn stopped at t = {end} s after {taken} steps, "
+            f"Exudyn stopped at t = {end} s after {recorder.taken} steps, "
             f"asked for {steps} to {times[-1]} s: {message}"
         )
-    return samples, np.array(clock)
+    return recorder.samples, np.array(recorder.clock)
 
 
 # -- calls that differ between versions --------------------------------------------------------------
