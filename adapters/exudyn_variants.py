@@ -311,7 +311,8 @@ def _created_along(mbs: Any, **given: Any) -> Any:
         axis = np.asarray(given["axisMarker0"])
         (here, turn), (there, _) = (_place_of(mbs, end) for end in ends)
         start = float((turn @ axis) @ (there - here))
-    law = {x: given[x] for x in ("stiffness", "damping", "offset", "force", "torque") if x in given}
+    numbers = "stiffness", "damping", "offset", "force", "torque"
+    law: dict[str, Any] = {name: given[name] for name in numbers if name in given}
     law["offset"] -= start
     law |= {"position": ends[0]["localPosition"], "axis": axis, "useGlobalFrame": False}
     bodies = {"bodyNumbers" if is_turn else "itemNumbers": [end["bodyNumber"] for end in ends]}
