@@ -22,11 +22,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from rich.markup import render
 
 from plumbline.cli import verdict_matrix
-from plumbline.cli.main import main
 from plumbline.judging.rows import VERDICT_STYLES, Row, Verdict
 from plumbline.model.kinematics import quaternion_conjugate, quaternion_product, rotation_vector
 from reports import chunks, html_report, junit, report_data, sarif, step_summary
@@ -36,6 +34,7 @@ from reports.issue_text import issue_text
 from reports.stored_results import Results, replace_unprintable
 from reports.verdicts import css_class, error_ratio, format_number, needs_attention, rank
 from tests.helpers import example_results as fixture
+from tests.helpers.commands import invoke
 
 REPORTS = Path(html_report.__file__).parent
 
@@ -43,6 +42,11 @@ REPORTS = Path(html_report.__file__).parent
 @pytest.fixture(scope="module")
 def out(example_run):
     return example_run
+
+
+@pytest.fixture
+def results(out):
+    return Results.load(out)
 
 
 @pytest.fixture(scope="module")
@@ -124,8 +128,7 @@ def decoded_chunks(text):
     return {name: decode_chunk(body, texts) for name, body in found}
 
 
-def test_the_sentence_counts_and_versions_come_first(out, text):
-    results = Results.load(out)
+def test_the_sentence_counts_and_versions_come_first(results, text):
     parsed = Parsed(text)
     before_matrix = parsed.words[: parsed.words.index("Worst error over its tolerance")]
     assert results.run["sentence"] in before_matrix
@@ -137,8 +140,7 @@ def test_the_sentence_counts_and_versions_come_first(out, text):
         assert engine["version"] in parsed.words
 
 
-def test_every_cell_is_in_the_static_matrix_with_glyph_text_and_class(out, text):
-    results = Results.load(out)
+def test_every_cell_is_in_the_static_matrix_with_glyph_text_and_class(results, text):
     start = text.index('<table class="matrix"')
     table = text[start : text.index("</table>", start)]
     lines = table.split('<tr class="line"')[1:]
@@ -155,9 +157,8 @@ def test_every_cell_is_in_the_static_matrix_with_glyph_text_and_class(out, text)
             assert (format_number(ratio) if ratio is not None else worst["verdict"]) in cell
 
 
-def test_terminal_and_report_show_the_same_row_of_each_cell(out, text):
+def test_terminal_and_report_show_the_same_row_of_each_cell(results, text):
     """The report's link names the row; glyph and ratio of the terminal's cell are those of the same row."""
-    results = Results.load(out)
     shown = re.findall(r'<td class="cell [^>]*><a title="([^"]*)">(.*?)</a></td>', text, re.DOTALL)
     cells: dict[tuple[str, str], list[Row]] = {
         (s, e): [] for s, e in product(results.scenarios, results.engines)
@@ -320,8 +321,7 @@ def test_tables_keep_three_digits_and_leave_out_what_is_no_number():
     ]  # fmt: skip
 
 
-def test_a_difference_of_1e_9_survives_in_the_motion(out, text):
-    results = Results.load(out)
+def test_a_difference_of_1e_9_survives_in_the_motion(results, text):
     poses, name = results.table("trajectories"), "double-tumbling"
     motion = decoded_chunks(text)[f"scenario-{list(results.scenarios).index(name)}"]["motion"]
     frames = len(motion["t"])
@@ -353,8 +353,7 @@ def test_rotation_vectors_are_exact_for_tiny_and_large_angles():
             )
 
 
-def test_the_first_crossing_is_of_the_undecimated_curve(out, text):
-    results = Results.load(out)
+def test_the_first_crossing_is_of_the_undecimated_curve(results, text):
     curves = results.table("curves")
     seen = 0
     for k, name in enumerate(results.scenarios):
@@ -434,17 +433,16 @@ def test_a_night_of_thousands_of_scenarios_stays_under_8_megabytes(out, tmp_path
     assert f"<b>{sum(row['verdict'] == 'agrees' for row in copies)}</b><span>agree" in text
 
 
-def test_a_page_above_its_budget_has_fewer_points(out, text, monkeypatch):
+def test_a_page_above_its_budget_has_fewer_points(results, text, monkeypatch):
     monkeypatch.setattr(html_report, "MAX_PAGE_BYTES", len(text.encode()) - 30_000)
-    smaller = html_report.render(Results.load(out), History())
+    smaller = html_report.render(results, History())
     assert len(smaller.encode()) <= html_report.MAX_PAGE_BYTES
     few, many = (decoded_chunks(page)["scenario-0"]["curves"][0]["t"] for page in (smaller, text))
     assert len(few) < len(many)
 
 
-def test_a_history_shows_what_is_new_and_skips_a_damaged_night(out, tmp_path):
+def test_a_history_shows_what_is_new_and_skips_a_damaged_night(out, results, tmp_path):
     past = fixture.nights(out, tmp_path / "history", count=4)
-    results = Results.load(out)
     history = History.load(past, results)
     assert len(history.nights) == 4 and history.unreadable == ["2026-11-02"]
     assert history.last_passed is history.nights[-2]
@@ -478,8 +476,7 @@ def test_a_run_of_the_state_level_alone_has_a_page(out, tmp_path):
     assert data["scenario-0"]["curves"] == [] and data["scenario-0"]["motion"] is None
 
 
-def test_gaps_of_one_reason_are_one_finding_and_declared_ones_have_a_page(out):
-    results = Results.load(out)
+def test_gaps_of_one_reason_are_one_finding_and_declared_ones_have_a_page(results):
     gap = next(row for row in results.rows if row["verdict"] == "unsupported")
     names = list(results.scenarios)
     gap |= {"known_issue": None, "is_declared": False}
@@ -497,8 +494,7 @@ def test_gaps_of_one_reason_are_one_finding_and_declared_ones_have_a_page(out):
     assert "Declared gaps" in words and "2 findings need attention" in words
 
 
-def test_a_finding_has_its_mechanism_with_the_worst_body_marked_a_plot_and_its_numbers(out):
-    results = Results.load(out)
+def test_a_finding_has_its_mechanism_with_the_worst_body_marked_a_plot_and_its_numbers(results):
     first = next(f for f in results.findings if f["verdict"] == "disagrees")
     row = next(row for row in results.rows if row["key"] == first["rows"][0])
     row["extra"] = {"body": 1.0}
@@ -519,8 +515,7 @@ def test_a_finding_has_its_mechanism_with_the_worst_body_marked_a_plot_and_its_n
     assert all(html.escape(f["name"]) in page for f in found) and 'class="robot"' in page
 
 
-def test_a_run_that_compared_nothing_is_not_shown_as_agreement(out):
-    results = Results.load(out)
+def test_a_run_that_compared_nothing_is_not_shown_as_agreement(results):
     gaps = [row for row in results.rows if row["verdict"] in ("unsupported", "not installed")]
     words = Parsed(html_report.render(replace(results, rows=gaps), History())).words
     assert "Nothing was compared" in words and "Nothing needs attention" not in words
@@ -542,9 +537,8 @@ def test_a_report_that_cannot_be_written_leaves_the_old_one(out, tmp_path, monke
     assert [p.name for p in copy.iterdir() if p.name.startswith(".")] == []
 
 
-def test_junit_counts_what_it_holds_and_survives_every_text(out):
-    results = Results.load(out)
-    root = ET.parse(junit.write(Results.load(out))).getroot()
+def test_junit_counts_what_it_holds_and_survives_every_text(results):
+    root = ET.parse(junit.write(results)).getroot()
     cases = root.findall("./testsuite/testcase")
     assert len(cases) == len(results.rows) == int(root.get("tests", ""))
     for tag, total in (("failure", "failures"), ("error", "errors"), ("skipped", "skipped")):
@@ -555,8 +549,7 @@ def test_junit_counts_what_it_holds_and_survives_every_text(out):
     assert any("behaves as if gravity" in (failure.text or "") for failure in root.findall(".//failure"))
 
 
-def test_sarif_has_a_result_per_finding_and_suppresses_recorded_ones(out):
-    results = Results.load(out)
+def test_sarif_has_a_result_per_finding_and_suppresses_recorded_ones(results):
     log = json.loads(sarif.write(results).read_text())
     found = log["runs"][0]["results"]
     assert [one["ruleId"] for one in found] == [finding["name"] for finding in results.findings]
@@ -564,8 +557,7 @@ def test_sarif_has_a_result_per_finding_and_suppresses_recorded_ones(out):
         assert ("suppressions" in one) == (finding["known_issue"] is not None)
 
 
-def test_junit_and_the_summary_name_the_finding(out):
-    results = Results.load(out)
+def test_junit_and_the_summary_name_the_finding(results):
     root = ET.parse(junit.write(results)).getroot()
     messages = [f.get("message") for f in (*root.iter("failure"), *root.iter("error"))]
     names = [f["name"] for f in results.findings if f["known_issue"] is None]
@@ -574,8 +566,7 @@ def test_junit_and_the_summary_name_the_finding(out):
     assert all(finding["name"] in summary for finding in results.findings)
 
 
-def test_the_text_of_an_issue_has_script_versions_and_the_expected_number(out):
-    results = Results.load(out)
+def test_the_text_of_an_issue_has_script_versions_and_the_expected_number(results):
     finding = next(f for f in results.findings if f["verdict"] == "disagrees")
     text = issue_text(results, finding)
     assert "## Reproduction steps" in text and finding["sentence"][1:] in text
@@ -584,31 +575,26 @@ def test_the_text_of_an_issue_has_script_versions_and_the_expected_number(out):
     assert not scripts or scripts[0].rstrip() in text
 
 
-def test_a_finding_is_explained_and_reported_by_the_beginning_of_its_name(out, tmp_path):
-    def typed(*words):
-        return CliRunner().invoke(main, list(map(str, words)))
-
-    results = Results.load(out)
+def test_a_finding_is_explained_and_reported_by_the_beginning_of_its_name(out, results, tmp_path):
     scripted = next(f for f in results.findings if not results.scripts.keys().isdisjoint(f["rows"]))
-    printed = typed("report", out, "--issue", scripted["name"][:-1])
+    printed = invoke("report", out, "--issue", scripted["name"][:-1])
     assert (printed.exit_code, printed.stdout) == (0, issue_text(results, scripted) + "\n")
-    assert "no finding has this name" in typed("report", out, "--issue", "nothing").stderr
-    assert "findings begin so" in typed("explain", "pinocchio", "--results", out).stderr
+    assert "no finding has this name" in invoke("report", out, "--issue", "nothing").stderr
+    assert "findings begin so" in invoke("explain", "pinocchio", "--results", out).stderr
     entry = {"id": "coarse-steps", "engine": "mujoco", "verdict": "unresolved"}
     entry |= {"evidence": "measured", "reason": "short"}
     own = tmp_path / "own.yaml"
     own.write_text(json.dumps([entry]))
-    assert "--known FILE prints the entry" in typed("explain", "coarse-steps", "--results", out).stdout
-    explained = typed("explain", "coarse-steps", "--results", out, "--known", own).stdout
+    assert "--known FILE prints the entry" in invoke("explain", "coarse-steps", "--results", out).stdout
+    explained = invoke("explain", "coarse-steps", "--results", out, "--known", own).stdout
     assert "Evidence: measured" in explained and "short" in explained
 
 
-def test_the_step_summary_shows_text_as_text_and_keeps_its_limit(out):
+def test_the_step_summary_shows_text_as_text_and_keeps_its_limit(out, results):
     text = step_summary.write(Results.load(out)).read_text(encoding="utf-8")
     assert "<" not in text and "`" not in text
     assert html.unescape(step_summary.escape_markdown(fixture.HOSTILE)) == fixture.HOSTILE
     assert not re.search(r"(?<!&)[|*_#\[\]`<>@]", step_summary.escape_markdown("|*_#[]`<>@me"))
-    results = Results.load(out)
     bad = next(row for row in results.rows if row["verdict"] == "disagrees")
     results.rows.extend(
         {**bad, "quantity": f"q{k}", "key": f"k{k}", "reason": "long " * 60} for k in range(5000)
