@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -12,6 +13,7 @@ from reports.stored_results import Record, Results
 from reports.verdicts import finding_by_row, format_number, needs_attention, shown_verdict
 
 OWN = "an own scenario"
+COUNTED = ("tests", "failures", "errors", "skipped")
 
 
 def write(results: Results) -> Path:
@@ -22,7 +24,7 @@ def write(results: Results) -> Path:
     Rows that are information are only counted, in a property of the suite.
     """
     suites = ET.Element("testsuites", name="plumbline", time=f"{float(results.run['duration']):.3f}")
-    totals = {"tests": 0, "failures": 0, "errors": 0, "skipped": 0}
+    totals = Counter(dict.fromkeys(COUNTED, 0))
     names = finding_by_row(results)
     for name, scenario in results.scenarios.items():
         found = [results.rows[place] for place in results.row_indices[name]]
@@ -31,7 +33,7 @@ def write(results: Results) -> Path:
         about = {"family": scenario["family"], "run": str(results.run["sentence"])}
         suite, counted = add_suite(suites, name, found, about, names)
         suite.set("timestamp", str(results.run["started"])[:19])
-        totals = {k: v + counted[k] for k, v in totals.items()}
+        totals.update(counted)
     suites.attrib |= {k: str(v) for k, v in totals.items()}
     path = results.folder / "junit.xml"
     write_atomically(path, ET.tostring(suites, encoding="utf-8", xml_declaration=True))
@@ -61,7 +63,7 @@ def add_suite(
     element = ET.SubElement(suite, "properties")
     for key, value in {**properties, "information": str(len(found) - len(rows))}.items():
         ET.SubElement(element, "property", name=key, value=value)
-    counted = {"tests": 0, "failures": 0, "errors": 0, "skipped": 0}
+    counted = dict.fromkeys(COUNTED, 0)
     for row in rows:
         outcome = _add_test_case(suite, row, findings.get(row["key"], ""))
         counted["tests"] += 1
