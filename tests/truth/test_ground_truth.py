@@ -167,11 +167,17 @@ def test_motion_truth_holds_growth_length_and_detectable_effects():
         assert mine[1:] == pytest.approx(theirs[1:], rel=1e-5) and mine[-1] > 1e-7
 
 
-@pytest.mark.parametrize("wrong", ["", *MOTION_UNITS])
-def test_two_methods_that_differ_by_more_than_rounding_are_reported(wrong):
+@pytest.fixture(scope="module")
+def ball():
+    """A ball, its initial state and its motion."""
     model = pendulums.make_model("b")
     at = pendulums.state_from_seed(model, seed=2, rate=0.5)
-    sound = motion_truth(model, at, TIMES, None)
+    return model, at, motion_truth(model, at, TIMES, None)
+
+
+@pytest.mark.parametrize("wrong", ["", *MOTION_UNITS])
+def test_two_methods_that_differ_by_more_than_rounding_are_reported(ball, wrong):
+    model, at, sound = ball
     limit = 1e3 * np.finfo(float).eps * sound.growth  # 10³ ε G(t), as the rows say
     off = np.zeros(9)
     off[-1] = 1.0
@@ -189,35 +195,28 @@ def test_two_methods_that_differ_by_more_than_rounding_are_reported(wrong):
 
 
 @pytest.mark.parametrize("name", MOTION_UNITS)
-def test_a_truth_that_is_not_a_number_is_in_doubt(name: str) -> None:
-    model = pendulums.make_model("b")
-    at = pendulums.state_from_seed(model, seed=2, rate=0.5)
-    sound = motion_truth(model, at, TIMES, None)
+def test_a_truth_that_is_not_a_number_is_in_doubt(ball, name):
+    model, at, sound = ball
     made = TrajectoryTruth(sound.trajectory, sound.uncertainty | {name: np.full(9, np.nan)}, "made")
     with patch("plumbline.truth.trajectory_truth.trajectory_truth", lambda *_: made):
         assert motion_truth(model, at, TIMES, None).conflict
 
 
-def test_the_wanted_time_does_not_shrink_with_the_uncertainty() -> None:
-    model = pendulums.make_model("b")
-    at = pendulums.state_from_seed(model, seed=2, rate=0.5)
-    sound = motion_truth(model, at, TIMES, None)
+def test_the_wanted_time_does_not_shrink_with_the_uncertainty(ball):
+    *_, sound = ball
     vague = replace(sound, uncertainty=sound.uncertainty | {"position": np.linspace(0, 1e-8, 9)})
     assert sound.horizon == sound.wanted_time == vague.wanted_time == 1.0
     assert vague.horizon == 0.0
 
 
-def test_taylors_method_is_limited_in_bodies():
-    model = pendulums.make_model("b")
-    found = motion_truth(
-        model, pendulums.state_from_seed(model, seed=2, rate=0.5), TIMES[:3], None, max_compiled_bodies=0
-    )
+def test_taylors_method_is_limited_in_bodies(ball):
+    model, at, _ = ball
+    found = motion_truth(model, at, TIMES[:3], None, max_compiled_bodies=0)
     assert "not used for more than 0 bodies" in found.method
 
 
-def test_a_closed_form_replaces_the_motion():
-    model = pendulums.make_model("b")
-    at = pendulums.state_from_seed(model, seed=2, rate=0.5)
+def test_a_closed_form_replaces_the_motion(ball):
+    model, at, _ = ball
     run = pendulums.reference_trajectory(model, at, TIMES)
     found = motion_truth(model, at, TIMES, (run.r + 1e-9, run.p, "a book"))
     assert np.array_equal(found.trajectory.r, run.r + 1e-9) and "closed form: a book" in found.method
