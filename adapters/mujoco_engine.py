@@ -854,16 +854,22 @@ def _add_equalities(spec: Any, links: list[Any], constraints: _Constraints) -> N
         names = [f"end {loop} {side}" for side in (1, 2)]
         for k, name in zip(pair, names, strict=True):
             set_attributes(links[k].add_site(), name=name)
-        _add_equality(spec, "WELD", *names)
+        equality = _add_equality(spec, "WELD", *names)
+        if not hasattr(equality, "objtype"):  # 3.2.0 welds bodies, at an anchor and in a pose
+            for k, name in zip(pair, names, strict=True):
+                links[k].name = name
+            equality.data[:] = np.append([0.0] * 6 + [1.0] + [0.0] * 3, 1.0)
 
 
 def _add_equality(spec: Any, kind: Literal["TENDON", "JOINT", "WELD"], name: str, other: str = "") -> Any:
     """Add a constraint at zero, as hard as MuJoCo accepts; of an other element only where there is one."""
-    of = {"WELD": "SITE"}.get(kind, kind)
-    return set_attributes(
-        spec.add_equality(), type=member(f"mjtEq.mjEQ_{kind}"), objtype=member(f"mjtObj.mjOBJ_{of}"),
+    equality = set_attributes(
+        spec.add_equality(), type=member(f"mjtEq.mjEQ_{kind}"),
         name1=name, name2=other, solref=[0.0, 0.0], solimp=[*[MAX_IMPEDANCE] * 2, 1, 0.5, 2],
     )  # fmt: skip
+    if hasattr(equality, "objtype"):
+        equality.objtype = member(f"mjtObj.mjOBJ_{'SITE' if kind == 'WELD' else kind}")
+    return equality
 
 
 def _principal_inertia(J: Array) -> tuple[Array, Array]:
