@@ -48,6 +48,7 @@ from plumbline.model.redescription import (
     state_of_balls,
 )
 from plumbline.model.welding import split_bodies
+from plumbline.processes.exceptions import describe_exception
 from plumbline.truth.rounding_bound import RoundingBound, rounding_bounds, state_rounding_bound
 
 WELDED_HALVES = "two welded halves"
@@ -400,7 +401,12 @@ def check_state_relation(
     worst, count, unexplained = (0.0, "", 0), 0, 0.0
     refused: Unsupported | None = None
     others = [relation.transform(model, state) for state in states]
-    answered = _evaluate_together(evaluate_other, others)
+    try:
+        answered = _evaluate_together(evaluate_other, others)
+    except MemoryError:
+        raise
+    except Exception as error:  # an engine may raise anything, and other relations are to be checked
+        return RelationResult(relation.name, None, "", 0, 0, describe_exception(error), "failed")
     for index, (state, other) in enumerate(zip(states, answered, strict=True)):
         here = answers[index]
         if isinstance(here, Unsupported):

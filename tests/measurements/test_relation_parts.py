@@ -103,6 +103,18 @@ def test_equal_answers_and_refused_ones():
     assert str(evaluate_or_refusal(refusing, MODEL, STATES[0])) == "never"
 
 
+def test_an_option_by_which_the_engine_fails_is_a_failure_of_its_own_row():
+    def failing(_model, _states):
+        raise AttributeError("no such option")
+
+    answers = load_adapter("reference").evaluate(MODEL, STATES)
+    bounds = [state_rounding_bound(MODEL, state) for state in STATES]
+    found = check_state_relation(Relation("by it"), answers, failing, MODEL, STATES, bounds, bounds)
+    assert (found.relation, found.ratio, found.refusal) == ("by it", None, "failed")
+    (row,) = judge_relations(RowContext("", "", "mujoco", "mujoco", ""), [found])
+    assert row.verdict == "failed" and "no such option" in row.reason
+
+
 def test_runs_are_measured_by_length_turn_and_speed():
     at = STATES[0]
     length, g = float(np.sum(stretched_length(MODEL))), np.linalg.norm(MODEL.gravity)
