@@ -111,7 +111,7 @@ def test_an_option_by_which_the_engine_fails_is_a_failure_of_its_own_row():
     bounds = [state_rounding_bound(MODEL, state) for state in STATES]
     found = check_state_relation(Relation("by it"), answers, failing, MODEL, STATES, bounds, bounds)
     assert (found.relation, found.ratio, found.refusal) == ("by it", None, "failed")
-    (row,) = judge_relations(RowContext("", "", "mujoco", "mujoco", ""), [found])
+    (row,) = judge_relations(WHO, [found]).rows
     assert row.verdict == "failed" and "no such option" in row.reason
 
 
