@@ -407,8 +407,8 @@ class _Entry(_Selector):
 
     @property
     def is_wrong(self) -> bool:
-        """Whether the engine is wrong, in rows that disagree or where no row shows it."""
-        return not self._selectors or any(one.verdict == "disagrees" for one in self._selectors)
+        """Whether the engine is wrong or fails, in rows or where no row shows it."""
+        return not self._selectors or any(one.verdict in ("disagrees", "failed") for one in self._selectors)
 
     def every_issue(self) -> Iterator[KnownIssue]:
         """Make the issues of all rows."""
