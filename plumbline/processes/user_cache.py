@@ -94,15 +94,7 @@ class CheckedFiles:
 
         """
         make_private_folder(self._folder)
-        handle, temporary = tempfile.mkstemp(dir=self._folder, prefix=".new-")
-        try:
-            with os.fdopen(handle, "wb") as file:
-                file.write(_checksum(name, body) + body)
-            os.replace(temporary, self.path(name))
-        except BaseException:
-            with contextlib.suppress(OSError):  # the first error is the one to report
-                os.unlink(temporary)
-            raise
+        replace_file(self.path(name), _checksum(name, body) + body)
 
     def trim(self, max_bytes: int) -> None:
         """Remove the files that were not used for longest, until the others fit.
@@ -125,6 +117,34 @@ class CheckedFiles:
             with contextlib.suppress(OSError):
                 os.unlink(path)
                 excess -= size
+
+
+def replace_file(path: Path, data: bytes, *, is_public: bool = False) -> None:
+    """Replace a file as a whole: write a temporary file beside it, and rename it.
+
+    Args:
+        path: the file; its old content stays where writing fails.
+        data: its new content.
+        is_public: whether others may read it; such a file is flushed to the disk before it is renamed.
+
+    Raises:
+        OSError: the file cannot be written.
+
+    """
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(data)
+            if is_public:
+                file.flush()
+                os.fsync(file.fileno())
+        if is_public:
+            os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except BaseException:
+        with contextlib.suppress(OSError):  # the first error is the one to report
+            os.unlink(temporary)
+        raise
 
 
 def _checksum(name: str, body: bytes) -> bytes:

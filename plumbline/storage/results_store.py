@@ -7,12 +7,9 @@ docs/results.md.
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
 import re
 import stat
-import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,6 +20,7 @@ import pyarrow.parquet as pq
 
 from plumbline.judging.findings import find_findings
 from plumbline.judging.rows import Columns, Row
+from plumbline.processes.user_cache import replace_file
 from plumbline.scenario.line_and_column_errors import shorten
 from plumbline.storage.results_schema import DamagedResults, check_results
 from plumbline.storage.schema_upgrade import upgrade_document, upgrade_summary
@@ -119,18 +117,7 @@ def write_atomically(path: Path, data: bytes) -> None:
         OSError: the file cannot be written.
 
     """
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        with contextlib.suppress(OSError):  # the first error is the one to report
-            os.unlink(temporary)
-        raise
+    replace_file(path, data, is_public=True)
 
 
 def to_json_value(value: Any) -> Any:
