@@ -165,7 +165,8 @@ class SourceSlice:
         names = textwrap.indent(textwrap.fill(", ".join(sorted(self._empty)), WIDTH), "    ")
         head = [NOT_CALLED] + ([NAMED_ONLY.format(names=names, count=len(self._empty))] if names else [])
         kept = [self._modules[name].kept for name in self._in_order()]
-        return "\n".join([*head, *(text for one in kept for _, text in sorted(one.items()))])
+        parts = [*head, *(text for one in kept for _, text in sorted(one.items()))]
+        return "".join(part if part.count("\n") == 1 else f"\n{part}\n" for part in parts)
 
     def _in_order(self) -> Iterator[str]:
         """The modules, each after those that it imports."""

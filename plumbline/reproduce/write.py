@@ -257,9 +257,18 @@ def _check_worthwhile(
     scenario, engine, level, integrator, *_ = cell
     if (level, integrator) == ("relations", "-") and (scenario, engine, "state", "-") in cells:
         raise NotReproducible(f"the state-level script of this engine and scenario shows it; {HINT}")
+    if level == "surface":  # one script of each mistake
+        same = (own[0] for own in cells.values() if _surface_mistake(own[0]) == _surface_mistake(rows[0]))
+        if (first := next(same)["key"]) != rows[0]["key"]:
+            raise NotReproducible(f"the script of {first} shows the same mistake; {HINT}")
     seconds = rows[0].get("cpu_time", 0.0) if level in ("trajectory", "invariants") else 0.0
     if seconds > UNREQUESTED_SECONDS / MIN_CANDIDATES:
         raise NotReproducible(f"one candidate takes {seconds:.1f} s, too long at the end of a run; {HINT}")
+
+
+def _surface_mistake(row: StoredRow) -> tuple[str, ...]:
+    """What a row of the surface shows: the finding that it is recorded as, else the call that is wrong."""
+    return row["engine"], row["level"], str(row["known_issue"] or row["extra"].get(WRONG_CALL, ""))
 
 
 def _largest_printed_ratio(printed: str) -> float:

@@ -149,6 +149,18 @@ def test_at_the_end_of_a_run_nothing_long_is_begun(results):
         assert write_scripts(results, ["s"]).reasons == {"s": "began"}
 
 
+def test_at_the_end_of_a_run_a_mistake_of_the_surface_has_one_script(results):
+    document = results_store.read_results(results)
+    row = document["rows"][0] | {"level": "surface", "integrator": "-", "known_issue": "wrong"}
+    document["rows"] = [row | {"key": name, "quantity": name} for name in ("frame_axes", "frame_position")]
+    store(results, document)
+    with patch("plumbline.reproduce.write.find_disagreement", side_effect=NotReproducible("began")):
+        reasons = write_scripts(results).reasons
+        assert write_scripts(results, ["frame_position"]).reasons == {"frame_position": "began"}
+    same = "the script of frame_axes shows the same mistake; request this row by its key"
+    assert reasons == {"frame_axes": "began", "frame_position": same}
+
+
 # --- damaged input ------------------------------------------------------------------------------------
 
 INDICES = (
