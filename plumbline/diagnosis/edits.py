@@ -44,11 +44,17 @@ class Edit:
     scale: float = 1.0  # natural size of a change of x
     can_vanish: bool = True  # whether factors 0, 2 and −1 are possible
     effect: Array | None = None
+    begin: float | None = None  # where the fit of the number begins; by default at the right one
 
     @property
     def nominal(self) -> Array:
         """The right numbers; none of what has no amount."""
         return np.array(self.cause.nominal)
+
+    @property
+    def start(self) -> Array:
+        """The numbers where their fit begins."""
+        return self.nominal if self.begin is None else np.array([self.begin])
 
 
 # -- changes of fields ---------------------------------------------------------------------------------

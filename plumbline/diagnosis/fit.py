@@ -263,7 +263,7 @@ class Search:
         known = {id(one.combination[0]) for one in found}
         order = most_similar(self.slopes[:, mask], wanted, MIN_SIMILARITY, MAX_CANDIDATES)
         starts = [
-            ((self.numbers[i],), self.numbers[i].nominal) for i in order if id(self.numbers[i]) not in known
+            ((self.numbers[i],), self.numbers[i].start) for i in order if id(self.numbers[i]) not in known
         ]
         fits = self.fit(starts, mask)
         order_of = {id(one): i for i, one in enumerate((*self.numbers, *self.fixed))}

@@ -251,7 +251,7 @@ def _best(edits: Sequence[Edit], steps: _Steps, term: str = "steps", *, are_all_
     batches += [with_amounts] if are_all_named else [[edit] for edit in with_amounts]
     found = list[Cause]()
     for batch in batches:
-        starts = [((edit,), edit.nominal) for edit in batch]
+        starts = [((edit,), edit.start) for edit in batch]
         for one in fit_amounts(steps.evaluate, 0.0, SCREENING_RATIO, starts) if not found else ():
             with np.errstate(all="ignore"):
                 left = steps.left(changed(steps.case, one.combination, one.amounts))
@@ -397,12 +397,10 @@ def _formulas(known: list[Any], others: Iterator[tuple[str, Any]]) -> Iterator[E
             yield Edit(cause, lambda case, _, method=method: replace(case, method=method))  # type: ignore[misc]
 
 
-def _family(
-    words: str, declared: float, method: Callable[[float], StepMethod], can_vanish: bool = True
-) -> Edit:
+def _family(words: str, declared: float, method: Callable[[float], StepMethod], **more: Any) -> Edit:
     """Formulas with a parameter, that stands in words which complete "behaves as if"."""
     cause = Cause("method", "steps", "", words, nominal=(declared,))
-    return Edit(cause, lambda case, x: replace(case, method=method(float(x[0]))), can_vanish=can_vanish)
+    return Edit(cause, lambda case, x: replace(case, method=method(float(x[0]))), **more)
 
 
 def _parameter(declared: StepMethod, name: str, words: str) -> Edit:
@@ -496,4 +494,5 @@ def _of_spectral_radius(base: ConstrainedMethod, at_level: str) -> Edit:
         words,
         base.alpha_f / (1 - base.alpha_f),
         lambda x: replace(generalized_alpha(x, **kept), constraint_level=base.constraint_level),
+        begin=0.5,  # at 1 the difference hardly depends on it
     )
