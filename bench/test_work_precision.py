@@ -14,7 +14,7 @@ from adapters.pinocchio_engine import Pinocchio
 from bench import work_precision
 from bench.test_right_hand_side import record_table
 from plumbline.model.datatypes import Model, State
-from plumbline.model.kinematics import state_from_minimal
+from plumbline.model.kinematics import complete_state
 from plumbline.scenario.loader import find_scenario_file, load_scenario
 
 ERRORS = (1e-4, 1e-6, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12)
@@ -41,7 +41,7 @@ def perturbed_pendulums(count: int) -> tuple[Model, list[State]]:
     varied = [state.omega * (1 + 0.2 * rng.normal(size=state.omega.shape)) for _ in range(count - 1)]
     return model, [
         state,
-        *(state_from_minimal(model, state.p, omega, state.u, state.udot) for omega in varied),
+        *(complete_state(model, State(state.p, omega, state.u, state.udot)) for omega in varied),
     ]
 
 

@@ -202,7 +202,7 @@ def _reduced(model: Model, states: list[State], kept: list[int]) -> Problem:
         spring_body=ends,
         **fields,
     )
-    some = [State(**{name: x[kept] for name, x in vars(s).items()}) for s in states]
+    some = [s[kept] for s in states]
     return reduced, [complete_state(reduced, s) for s in some]
 
 

@@ -241,7 +241,7 @@ def is_closed(model: Model, state: State) -> bool:
 
 def single_states(state: State) -> list[State]:
     """Split arrays (S, ...) into states."""
-    return [State(**{name: x[s] for name, x in vars(state).items()}) for s in range(len(state.p))]
+    return [state[s] for s in range(len(state.p))]
 
 
 def projectors_at(model: Model, states: Sequence[State]) -> list[Array | None]:

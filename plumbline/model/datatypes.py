@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -52,8 +52,8 @@ VALUE_AXES = (
 )
 
 
-def _no_coordinates() -> Array:
-    return np.zeros((0, 2))
+def _absent() -> Array:
+    return np.zeros((0, 0))
 
 
 class Unsupported(PlumblineError):
@@ -86,24 +86,28 @@ class State:
     bodies, x and xdot of the other joints; of the other bodies p, omega, r and v follow.  ``u`` is the unit
     direction of rod k, from the point where the rod hangs to the near point of body k, and ``udot`` its rate
     (u·udot = 0); both are zero for other joints.  The rod's angular velocity without axial spin is u × udot.
-    `plumbline.model.kinematics.state_from_minimal` makes states.
+    `plumbline.model.kinematics.complete_state` computes what follows; what is not given is zero.
     """
 
     p: Float[Array, "*#batch bodies 4"]
     omega: Float[Array, "*#batch bodies 3"]  # rad/s, body frame
     u: Float[Array, "*#batch bodies 3"]  # world frame
     udot: Float[Array, "*#batch bodies 3"]  # 1/s, world frame
-    r: Float[Array, "*#batch bodies 3"]  # m, world frame
-    v: Float[Array, "*#batch bodies 3"]  # m/s, world frame: ṙ
+    r: Float[Array, "*#batch bodies 3"] = field(default_factory=_absent)  # m, world frame
+    v: Float[Array, "*#batch bodies 3"] = field(default_factory=_absent)  # m/s, world frame: ṙ
     # rad or m: coordinates of joint k in the order of its kind's motions, angles unwrapped; rates
-    x: Float[Array, "*#batch bodies coordinates"] = field(default_factory=_no_coordinates)
-    xdot: Float[Array, "*#batch bodies coordinates"] = field(default_factory=_no_coordinates)
+    x: Float[Array, "*#batch bodies coordinates"] = field(default_factory=_absent)
+    xdot: Float[Array, "*#batch bodies coordinates"] = field(default_factory=_absent)
 
     def __post_init__(self) -> None:
-        """Give mechanisms without such coordinates zeros of the right shape."""
-        for name in ("x", "xdot"):
+        """Put zeros of the right shape where nothing is given."""
+        for name, width in (("r", 3), ("v", 3), ("x", 2), ("xdot", 2)):
             if not getattr(self, name).size:
-                object.__setattr__(self, name, np.zeros((len(self.p), 2)))
+                object.__setattr__(self, name, np.zeros((*self.p.shape[:-1], width)))
+
+    def __getitem__(self, at: Any) -> State:
+        """Take the entries at an index of every array: bodies of one state, or states of many."""
+        return State(*(x[at] for x in vars(self).values()))
 
 
 @dataclass(frozen=True, eq=False)

@@ -134,7 +134,7 @@ def reorder_bodies(model: Model, state: State, order: Int[Indices, "bodies"]) ->
     kind = tuple(model.kind[k] for k in joints)
     spring_body = place[model.spring_body]
     reordered = replace(model, kind=kind, body=place[model.body[joints]], spring_body=spring_body, **fields)
-    return reordered, State(**{name: x[order] for name, x in vars(state).items()})
+    return reordered, state[order]
 
 
 def bodies_between(model: Model, state: State, first: int, end: int) -> tuple[Model, State]:
@@ -160,5 +160,4 @@ def bodies_between(model: Model, state: State, first: int, end: int) -> tuple[Mo
     fields |= {name: getattr(model, name)[first:end] for name in ("mass", "inertia", *BODY_FIELDS)}
     fields |= {name: getattr(model, name)[springs] for name in SPRING_FIELDS}
     fields |= {name: np.maximum(fields[name] - first, -1) for name in ("body", "spring_body")}
-    few = State(**{name: x[first:end] for name, x in vars(state).items()})
-    return replace(model, kind=tuple(model.kind[k] for k in joints), **fields), few
+    return replace(model, kind=tuple(model.kind[k] for k in joints), **fields), state[first:end]

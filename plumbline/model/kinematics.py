@@ -210,46 +210,6 @@ def angular_velocity(p: Float[Array, "... 4"], pdot: Float[Array, "... 4"]) -> F
     return 2.0 * quaternion_product(quaternion_conjugate(p), pdot)[..., 1:]
 
 
-def state_from_minimal(
-    model: Model,
-    p: Float[Array, "bodies 4"],
-    omega: Float[Array, "bodies 3"],
-    u: Float[Array, "bodies 3"],
-    udot: Float[Array, "bodies 3"],
-    x: Float[Array, "bodies coordinates"] | None = None,
-    xdot: Float[Array, "bodies coordinates"] | None = None,
-    r: Float[Array, "bodies 3"] | None = None,
-    v: Float[Array, "bodies 3"] | None = None,
-) -> State:
-    """Complete minimal coordinates to a state, from the world outwards.
-
-    Args:
-        p: unit quaternions, body → world; of bodies whose joint leaves their attitude free.
-        omega: angular velocities of the same bodies, body frame [rad/s].
-        u: unit directions of the rods, world frame; zero for other joints.
-        udot: their rates, perpendicular to ``u`` [1/s].
-        x: coordinates of hinges, slides and their like [rad, m]; absent: zeros.
-        r: centres of mass of free bodies, world frame [m]; absent: zeros.
-        v: their velocities [m/s].
-
-    Returns:
-        The state, on the constraint manifold to rounding.
-
-    """
-    pair, vector = np.zeros((model.n, model.columns)), np.zeros((model.n, 3))
-    start = State(
-        p=p,
-        omega=omega,
-        u=u,
-        udot=udot,
-        r=vector if r is None else r,
-        v=vector if v is None else v,
-        x=pair if x is None else x,
-        xdot=pair if xdot is None else xdot,
-    )
-    return complete_state(model, start)
-
-
 def stack_states(states: Sequence[State]) -> State:
     """Put states into one, of arrays with a leading axis.
 
@@ -285,10 +245,10 @@ def forward_kinematics(
     omega: Float[Array, "... bodies 3"],
     u: Float[Array, "... bodies 3"],
     udot: Float[Array, "... bodies 3"],
-    r: Float[Array, "... bodies 3"] | None = None,
-    v: Float[Array, "... bodies 3"] | None = None,
-    x: Float[Array, "... bodies coordinates"] | None = None,
-    xdot: Float[Array, "... bodies coordinates"] | None = None,
+    r: Float[Array, "... bodies 3"],
+    v: Float[Array, "... bodies 3"],
+    x: Float[Array, "... bodies coordinates"],
+    xdot: Float[Array, "... bodies coordinates"],
 ) -> tuple[
     Float[Array, "... bodies 4"],
     Float[Array, "... bodies 3"],
@@ -302,7 +262,7 @@ def forward_kinematics(
         omega: angular velocities of the same bodies, body frame [rad/s].
         u: unit directions of the rods, world frame; zero for other joints.
         udot: their rates [1/s].
-        r: centres of mass of free bodies, world frame [m]; absent, like the rest: zeros.
+        r: centres of mass of free bodies, world frame [m].
         v: their velocities [m/s].
         x: joint coordinates [rad, m].
 
@@ -310,11 +270,7 @@ def forward_kinematics(
         p, ω′, r and ṙ of all bodies.
 
     """
-    r, v = (np.zeros(omega.shape) if given is None else given.copy() for given in (r, v))
-    x, xdot = (
-        np.zeros((*omega.shape[:-1], model.columns)) if given is None else given for given in (x, xdot)
-    )
-    p, omega = p.copy(), omega.copy()
+    p, omega, r, v = (given.copy() for given in (p, omega, r, v))
     A = rotation_matrix(p)  # (..., N, 3, 3)
     for k in range(model.n):
         kind, far = model.kinds[k], int(model.body[k, 0])

@@ -110,9 +110,7 @@ class CutMechanism:
 
         """
         bodies = self.place[: self.source.n]
-        return complete_state(
-            self.source, State(**{name: value[bodies] for name, value in vars(state).items()})
-        )
+        return complete_state(self.source, state[bodies])
 
     def source_quantities(self, answer: StateQuantities) -> StateQuantities:
         """Describe quantities of the tree as those of the mechanism.

@@ -19,12 +19,12 @@ from pydantic import ValidationError
 from plumbline.layout import ROOT
 from plumbline.model.datatypes import FREE, JOINT_ELEMENTS, KINDS, Array, Float, Model, State, column_count
 from plumbline.model.kinematics import (
+    complete_state,
     own_rates,
     quaternion_product,
     rate_count,
     rotation_matrix,
     spring_vectors,
-    state_from_minimal,
     turn_of_z,
 )
 from plumbline.model.loops import assembled, loop_gaps, motion_without_inertia, without_still_rates
@@ -275,7 +275,7 @@ def build_scenario(source: YamlSource, path: Path) -> Scenario:
     with np.errstate(all="ignore"):
         tree = _build_model(document, bodies, far, springs)
         model = _add_closing_joints(tree, document, closed)
-        state = state_from_minimal(model, *_minimal_coordinates(bodies, turns, model.columns))
+        state = complete_state(model, _minimal_coordinates(bodies, turns, model.columns))
         state = _closed_state(source, model, state, bodies)
         distances = np.linalg.norm(spring_vectors(model, state.r, state.p), axis=-1)
     for k in np.flatnonzero(distances <= INPUT_ROUNDING * np.max(np.abs(model.spring_point), initial=0.0)):
@@ -572,8 +572,8 @@ def _build_model(
     )
 
 
-def _minimal_coordinates(bodies: list[Body], turns: list[Array], columns: int) -> tuple[Array, ...]:
-    """p, omega, u, udot, x, xdot, r, v: unit and perpendicular to rounding."""
+def _minimal_coordinates(bodies: list[Body], turns: list[Array], columns: int) -> State:
+    """A state of which the minimal coordinates count: unit and perpendicular to rounding."""
     n = len(bodies)
     p, u, udot, r, v = np.empty((n, 4)), *np.zeros((4, n, 3))
     x, xdot = np.zeros((2, n, columns))
@@ -599,4 +599,4 @@ def _minimal_coordinates(bodies: list[Body], turns: list[Array], columns: int) -
             r[k] = np.array(body.joint.position) - rotation_matrix(p[k]) @ np.array(body.proximal)
             v[k] = body.joint.velocity
     omega = np.array([body.angular_velocity for body in bodies], dtype=float)
-    return p, omega, u, udot, x, xdot, r, v
+    return State(p, omega, u, udot, r, v, x, xdot)

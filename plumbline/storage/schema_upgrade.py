@@ -12,8 +12,8 @@ import pyarrow as pa
 
 from plumbline.judging.findings import Finding, find_findings
 from plumbline.judging.rows import Row, Verdict, error_ratio
-from plumbline.model.datatypes import Model
-from plumbline.model.kinematics import state_from_minimal
+from plumbline.model.datatypes import Model, State
+from plumbline.model.kinematics import complete_state
 
 Record = dict[str, Any]
 
@@ -82,7 +82,7 @@ def _with_joints(about: Record) -> Record:
         return about
     arrays = {name: np.array(value, float) for name, value in {**old, **about["state"]}.items()}
     model = Model.chain(**{name: arrays[name] for name in old})
-    state = state_from_minimal(model, **{name: arrays[name] for name in ("p", "omega", "u", "udot")})
+    state = complete_state(model, State(**{name: arrays[name] for name in ("p", "omega", "u", "udot")}))
     fields = {name: np.asarray(value).tolist() for name, value in model.fields.items()}
     return about | {"model": fields, "state": {name: x.tolist() for name, x in vars(state).items()}}
 

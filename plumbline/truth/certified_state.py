@@ -240,7 +240,7 @@ def quantity_scales(c: Any, balls: dict[str, Any]) -> dict[str, float]:
     rate = max(rate, float(np.max(np.abs(c.state.xdot))), float(np.max(np.abs(c.state.udot))))
     sizes = (0.0, 0.0, 0.0)
     if model.has_elements:
-        state = State(**{name: value[None] for name, value in vars(c.state).items()})
+        state = c.state[None]
         elements, springs = joint_elements(model, state, np.zeros((1, model.n))), spring_terms(model, state)
         push, turn = (
             float(sum(np.sum(e.size) for e in elements if e.is_slide == is_slide))

@@ -69,6 +69,10 @@ class BodyStates:
     energy: Array  # (...,) J, kinetic and potential
     momentum: Array  # (..., 3) kg m²/s, angular, about the origin
 
+    def __getitem__(self, at: Any) -> BodyStates:
+        """Take the entries at an index of the leading axes."""
+        return BodyStates(*(x[at] for x in vars(self).values()))
+
     def rounded(self) -> State:
         """Round the motion to doubles."""
         return State(*(np.asarray(getattr(self, one.name), float) for one in fields(State)))

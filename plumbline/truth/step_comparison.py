@@ -184,7 +184,7 @@ class FormulaSteps:
         self._end_bounds: dict[tuple[int, int], _EndBounds] = {}
         count = max(self.counts)
         both = joint_space_steps(model, self.starts + disturbed, sizes + sizes, method, count, axes + axes)
-        self.true = [[_pick(links, i) for links in both] for i in range(len(starts))]
+        self.true = [[links[i] for links in both] for i in range(len(starts))]
         self.growth = np.empty((len(starts), count + 1))  # of perturbations, running maximum
         for i, (index, h, _) in enumerate(starts):
             weights = self.step_bound((self.starts[i],), (self.bounds[index],), h, 1)
@@ -260,7 +260,7 @@ class FormulaSteps:
         for i, run in enumerate(runs):
             count = min(RESIDUAL_STEPS, len(run.trajectory.t) - 1)
             _, bound = self._bounds_after(i, count)
-            for name, difference in _differences(_pick(motions[count], i), run.trajectory, count).items():
+            for name, difference in _differences(motions[count][i], run.trajectory, count).items():
                 found.append((difference / (count * bound[name][:, None])).ravel())
         return np.concatenate(found)
 
@@ -470,10 +470,6 @@ def _paths(far: NDArray[np.intp]) -> NDArray[np.bool_]:
     return path
 
 
-def _pick(links: BodyStates, i: int | slice) -> BodyStates:
-    return BodyStates(*(getattr(links, name)[i] for name in BodyStates.__match_args__))
-
-
 def _disturbed(model: Model, state: State, bound: RoundingBound) -> State:
     """A state nearby: rates off in random directions, in the proportions in which roundings disturb them."""
     rng = np.random.default_rng(derive_seed("disturbed step"))
@@ -611,7 +607,7 @@ class StepsFromSamples:
         ends, self.declared = coordinates_after(charts, self.start, v[:count], [h])
         self.after = charts.bodies(ends, self.declared)
         rounded = self.here.rounded()
-        self.states = [State(**{name: x[i] for name, x in vars(rounded).items()}) for i in range(len(v))]
+        self.states = [rounded[i] for i in range(len(v))]
         self.bounds = acceleration_bounds(method, model, self.states)
         self.states_r, self.middle_cosine = rounded.r, charts.middle_cosine(q)
         sizes = _sizes(rounded, self.bounds) | charts.coordinate_sizes(coordinates)
@@ -792,9 +788,7 @@ class RunSteps(StepsFromSamples):
             found[f"run_{name}"] = StepDeviations(
                 np.linalg.norm(difference, axis=-1), self.of_step[quantity], effects[name]
             )
-        totals = self._total_errors(
-            self.start, self.velocities[1:], self.declared, _pick(self.here, slice(1, None)), self.after
-        )
+        totals = self._total_errors(self.start, self.velocities[1:], self.declared, self.here[1:], self.after)
         for name, error in totals.items():
             parts = ("kinetic_energy", "potential_energy") if name == "energy" else ("angular_momentum",)
             scale_of = np.array([sum(getattr(b, part) for part in parts) for b in bounds])

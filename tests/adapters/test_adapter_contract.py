@@ -18,8 +18,7 @@ import pytest
 from plumbline.engines.adapter import UNSUPPORTED_KINDS
 from plumbline.engines.registry import ENGINES, load_adapter
 from plumbline.model import kinematics
-from plumbline.model.datatypes import BadInput, EngineFailure, Unsupported
-from plumbline.truth.certified_state import certify_state
+from plumbline.model.datatypes import BadInput, EngineFailure, State, Unsupported
 from plumbline.truth.rounding_bound import state_rounding_bound
 from tests.helpers import engine_process as worker
 from tests.helpers import pendulums
@@ -220,8 +219,8 @@ def single_body(
         gravity=np.array([0.0, 0.0, -10.0]),
     )
     u = np.array([u], float) * (joint > 0)
-    at = kinematics.state_from_minimal(
-        subject, np.array([p], float), np.array([omega], float), u, np.zeros((1, 3))
+    at = kinematics.complete_state(
+        subject, State(np.array([p], float), np.array([omega], float), u, np.zeros((1, 3)))
     )
     return subject, at
 

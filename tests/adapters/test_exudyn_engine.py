@@ -11,8 +11,8 @@ from adapters import exudyn_tree_engine
 from adapters.exudyn_common import _StepRecorder, make_settings, set_linear_solver, silence_engine
 from adapters.exudyn_engine import Exudyn, ExudynChain
 from adapters.exudyn_tree_engine import ExudynTree
-from plumbline.model.datatypes import EngineFailure, Model, Unsupported
-from plumbline.model.kinematics import joint_vectors, state_from_minimal
+from plumbline.model.datatypes import EngineFailure, Model, State, Unsupported
+from plumbline.model.kinematics import complete_state, joint_vectors
 from plumbline.reproduce.engine_client import EngineClient
 from plumbline.reproduce.measure import StepMeasure
 from plumbline.reproduce.shrink import ReproductionCase
@@ -64,8 +64,8 @@ def near_singular_pendulum(rate):
     subject = replace(pendulums.make_model("b"), gravity=np.zeros(3), moment=np.array([[0.0, 4.0, 0.0]]))
     subject = subject.changed(inertia=0.1 * np.eye(3)[None], proximal=np.zeros((1, 3)))
     zero = np.zeros((1, 3))
-    return subject, state_from_minimal(
-        subject, np.array([[1.0, 0, 0, 0]]), np.array([[rate, 0.0, 0.0]]), zero, zero
+    return subject, complete_state(
+        subject, State(np.array([[1.0, 0, 0, 0]]), np.array([[rate, 0.0, 0.0]]), zero, zero)
     )
 
 
@@ -150,7 +150,7 @@ def light_and_heavy_balls():
         moment=np.zeros((5, 3)), drag_force=zero, drag_moment=zero,
     )  # fmt: skip
     p = np.resize([[0.6, 0.8, 0.0, 0.0], [0.6, 0.0, 0.8, 0.0]], (5, 4))
-    return model, state_from_minimal(model, p, *np.zeros((3, 5, 3)))
+    return model, complete_state(model, State(p, *np.zeros((3, 5, 3))))
 
 
 @pytest.mark.parametrize(("solver", "least", "most"), [("EXUdense", 10, 1000), ("EigenSparse", 0, 1)])

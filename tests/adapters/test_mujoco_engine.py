@@ -10,7 +10,7 @@ import pytest
 
 from plumbline.measurements.state_relations import QUANTITIES
 from plumbline.model import kinematics
-from plumbline.model.datatypes import EngineFailure
+from plumbline.model.datatypes import EngineFailure, State
 from plumbline.model.kinematics import complete_state, rotation_matrix
 from plumbline.model.random_mechanisms import ELEMENTS, random_loop_mechanism, random_tree
 from plumbline.model.sampling import random_states
@@ -39,7 +39,7 @@ def test_flat_bodies_and_points_on_the_joint():
     subject = subject.changed(
         inertia=J, mass=np.array([1.0, 1e-9]), proximal=np.array([[0, 0, 0.0], [0.1, 0, 0]])
     )
-    at = kinematics.state_from_minimal(subject, at.p, at.omega, at.u, at.udot)
+    at = kinematics.complete_state(subject, State(at.p, at.omega, at.u, at.udot))
     (got,) = worker.call_adapter("mujoco", "evaluate", subject, [at])
     true = certify_state(subject, at).quantities
     np.testing.assert_allclose(got.acceleration, true.acceleration, rtol=1e-10, atol=1e-10)

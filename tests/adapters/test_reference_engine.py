@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from adapters.reference_engine import Reference
-from plumbline.model.datatypes import EngineFailure
+from plumbline.model.datatypes import EngineFailure, State
 from plumbline.model.kinematics import (
     angular_velocity,
-    state_from_minimal,
+    complete_state,
     velocity_jacobian,
 )
 from tests.helpers.random_chains import random_chain
@@ -43,7 +43,7 @@ def test_a_singular_model_fails_with_its_cause():
     model, state = model_and_state([False])
     inertia = np.diag([0.1, 0.1, 0.0])[None]
     thin_body = model.changed(inertia=inertia, proximal=np.array([[0, 0, 0.3]]))
-    state = state_from_minimal(thin_body, state.p, state.omega, state.u, state.udot)
+    state = complete_state(thin_body, State(state.p, state.omega, state.u, state.udot))
     with pytest.raises(EngineFailure, match="inertia of body 1 is singular"):
         Reference().evaluate(thin_body, [state])
     with pytest.raises(EngineFailure, match="inertia of body 1 is singular"):

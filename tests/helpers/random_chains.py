@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from plumbline.model.datatypes import Array, Model, State
-from plumbline.model.kinematics import state_from_minimal
+from plumbline.model.kinematics import complete_state
 from plumbline.model.random_mechanisms import random_inertias
 
 
@@ -55,7 +55,7 @@ def random_state(rng: np.random.Generator, model: Model, rate: float = 2.0) -> S
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     udot = np.cross(rate * rng.normal(size=(n, 3)), u)
     omega = rate * rng.normal(size=(n, 3))
-    return state_from_minimal(model, p, omega, np.where(rod, u, 0.0), np.where(rod, udot, 0.0))
+    return complete_state(model, State(p, omega, np.where(rod, u, 0.0), np.where(rod, udot, 0.0)))
 
 
 def random_chain(
@@ -83,7 +83,7 @@ def in_other_units(
         drag_force=model.drag_force * mass / time,
         drag_moment=model.drag_moment * mass * length**2 / time,
     )
-    return scaled, state_from_minimal(scaled, state.p, state.omega / time, state.u, state.udot / time)
+    return scaled, complete_state(scaled, State(state.p, state.omega / time, state.u, state.udot / time))
 
 
 def norms_per_body(difference: Array) -> Array:

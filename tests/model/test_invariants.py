@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from plumbline.model.datatypes import Trajectory
+from plumbline.model.datatypes import State, Trajectory
 from plumbline.model.invariants import (
     INVARIANT_UNITS,
     attitude_error,
@@ -19,10 +19,10 @@ from plumbline.model.invariants import (
 )
 from plumbline.model.kinematics import (
     angular_velocity,
+    complete_state,
     joint_vectors,
     quaternion_product,
     quaternion_rate,
-    state_from_minimal,
 )
 from plumbline.model.random_mechanisms import random_tree
 from tests.helpers import pendulums
@@ -287,7 +287,7 @@ def joint_vector_of_second_body(model, run):
     found = []
     for r, p in zip(run.r, run.p, strict=True):
         still = np.zeros((2, 3))
-        hung = state_from_minimal(model.changed(length=np.zeros(2)), p, still, still, still).r
+        hung = complete_state(model.changed(length=np.zeros(2)), State(p, still, still, still)).r
         found.append(r[1] - hung[1] - (r[0] - hung[0]))
     return np.array(found)
 

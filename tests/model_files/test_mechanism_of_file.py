@@ -10,11 +10,12 @@ from plumbline.engines.importer_calls import read_model_file
 from plumbline.importers.lumping import lump_fixed_bodies
 from plumbline.importers.neutral_model import ElementaryJoint, NeutralBody, NeutralModel
 from plumbline.importers.xml_tree import ModelFileError
+from plumbline.model.datatypes import State
 from plumbline.model.kinematics import (
+    complete_state,
     quaternion_conjugate,
     quaternion_product,
     rotation_matrix,
-    state_from_minimal,
 )
 from plumbline.model.lift import lift_acceleration
 from plumbline.model_files import mechanism_of_file
@@ -78,7 +79,7 @@ def accelerations(model, scenario, at):
                 filled += 1
                 k, filled = (k + 1, 0) if filled == len(m.kinds[k].motions) else (k, filled)
                 continue
-            now = state_from_minimal(m, p, omega, u, udot, x, xdot, r, v)
+            now = complete_state(m, State(p, omega, u, udot, r, v, x, xdot))
             far, turn = int(m.body[k, 0]), coordinates[-4:]
             if joint.kind == "ball":
                 relative = quaternion_product(quaternion_product(a, turn), quaternion_conjugate(a))
@@ -95,7 +96,7 @@ def accelerations(model, scenario, at):
                 centre = rate[:3] + np.cross(spun, arm) + np.cross(spin, np.cross(spin, arm))
                 given += [*centre, *(R @ rate[3:])]
             k += 1
-    state = state_from_minimal(m, p, omega, u, udot, x, xdot, r, v)
+    state = complete_state(m, State(p, omega, u, udot, r, v, x, xdot))
     own = certify_state(m, state).quantities
     lifted = lift_acceleration(m, state, np.array(given), "relative, near axes", "the file")
     return (own.acceleration, own.angular_acceleration), lifted

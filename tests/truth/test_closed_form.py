@@ -11,7 +11,7 @@ from scipy.special import ellipj, ellipkinc
 from plumbline.engines.registry import load_adapter
 from plumbline.model.datatypes import Model, State
 from plumbline.model.invariants import attitude_error, position_error
-from plumbline.model.kinematics import quaternion_product, rotation_matrix, state_from_minimal
+from plumbline.model.kinematics import complete_state, quaternion_product, rotation_matrix
 from plumbline.truth.closed_form import CLOSED_FORMS, ClosedFormMismatch, closed_form_motion
 from plumbline.truth.closed_form.tops_and_pendulums import elliptic_f, elliptic_pi, jacobi
 from tests.helpers.catalogue import catalogue_scenarios
@@ -54,8 +54,8 @@ def quaternion(axis, angle):
 
 def make_state(model, p, omega, u=None, udot=None):
     none = np.zeros((model.n, 3))
-    return state_from_minimal(
-        model, p, np.array([omega]), none if u is None else u, none if udot is None else udot
+    return complete_state(
+        model, State(p, np.array([omega]), none if u is None else u, none if udot is None else udot)
     )
 
 
@@ -222,7 +222,7 @@ def scale_oscillation(case, part):
         angle = np.arctan2(sine, s[2])
         back = quaternion(list(axis if sine else [1.0, 0, 0]), (1 - part) * angle)
         p[k] = quaternion_product(back[0], case.state.p[k])
-    state = state_from_minimal(case.model, p, part * case.state.omega, case.state.u, case.state.udot)
+    state = complete_state(case.model, State(p, part * case.state.omega, case.state.u, case.state.udot))
     return ScenarioStub(case.closed_form, case.model, state)
 
 
@@ -233,7 +233,7 @@ def test_small_oscillations_of_a_chain_with_rods():
         p = np.concatenate([quaternion([0, 1, 0], 0.002 * part), quaternion([0, 1, 0], -0.004 * part)])
         u = np.array([[0, 0, 0], [-np.sin(0.003 * part), 0, -np.cos(0.003 * part)]])
         udot = np.cross([[0, 0, 0], [0, 0.01 * part, 0]], u)
-        state = state_from_minimal(model, p, np.zeros((2, 3)), u, udot)
+        state = complete_state(model, State(p, np.zeros((2, 3)), u, udot))
         found.append(closed_form_errors(ScenarioStub("small-double", model, state))[0])
     assert found[0] < 1e-6
     assert found[0] / found[1] == pytest.approx(8, rel=0.01)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from plumbline.engines.registry import load_adapter
-from plumbline.model.datatypes import StateQuantities, Trajectory
+from plumbline.model.datatypes import State, StateQuantities, Trajectory
 from plumbline.model.invariants import MOTION_UNITS, invariant_scales
-from plumbline.model.kinematics import quaternion_product, quaternion_rate, state_from_minimal
+from plumbline.model.kinematics import complete_state, quaternion_product, quaternion_rate
 from plumbline.model.sampling import random_states
 from plumbline.truth import TruthUnavailable, ground_truth
 from plumbline.truth.ground_truth import (
@@ -79,7 +79,7 @@ def test_each_perturbed_model_has_one_kind_of_error_of_one_part_in_ten_thousand(
                 assert np.array_equal(now, now.mT)
             else:
                 assert part == pytest.approx(np.full(part.shape, DETECTABLE_PARAMETER_ERROR), rel=1e-9)
-        lifted = state_from_minimal(wrong, at.p, at.omega, at.u, at.udot)
+        lifted = complete_state(wrong, State(at.p, at.omega, at.u, at.udot))
         for name in ("p", "omega", "u", "udot", "r", "v"):
             assert np.array_equal(getattr(state, name), getattr(lifted, name))
     offsets = found[3][0].proximal / model.proximal

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from plumbline.model.datatypes import State
 from plumbline.model.invariants import attitude_error, position_error
 from plumbline.model.kinematics import (
-    maximal_coordinates,
+    complete_state,
     quaternion_rate,
-    state_from_minimal,
     stretched_length,
     with_joint_coordinates,
 )
@@ -60,7 +60,7 @@ def unstable_pendulum():
     """A body standing on its pivot, and the rate λ at which it leaves there."""
     model, _ = random_chain(np.random.default_rng(0), [0])
     model = model.changed(inertia=np.diag([0.02, 0.02, 0.01])[None], proximal=np.array([[0, 0, -0.3]]))
-    state = state_from_minimal(model, np.array([[1.0, 0, 0, 0]]), *np.zeros((3, 1, 3)))
+    state = complete_state(model, State(np.array([[1.0, 0, 0, 0]]), *np.zeros((3, 1, 3))))
     return model, state, float(np.sqrt(model.mass[0] * 9.81 * 0.3 / (0.02 + model.mass[0] * 0.09)))
 
 
@@ -96,7 +96,7 @@ def test_perturbations_of_a_damped_hanging_body_do_not_grow():
     model, state, _ = unstable_pendulum()
     model = model.changed(proximal=-model.proximal, drag_moment=2 * model.mass)
     found = perturbation_growth(
-        model, state_from_minimal(model, state.p, *np.zeros((3, 1, 3))), np.linspace(0, 10, 6)
+        model, complete_state(model, State(state.p, *np.zeros((3, 1, 3)))), np.linspace(0, 10, 6)
     )
     assert np.all(found >= 1) and found[-1] < 2
 
@@ -161,7 +161,7 @@ def test_position_distances_are_relative_to_the_distance_from_the_pivot():
     """A point on a rod that stands: positions part exponentially, attitudes as time does."""
     model = pendulums.make_model("r").changed(gravity=np.array([3.0, -6, 6]), proximal=np.zeros((1, 3)))
     still = np.zeros((1, 3))
-    state = state_from_minimal(model, np.array([[1.0, 0, 0, 0]]), still, -model.gravity[None] / 9, still)
+    state = complete_state(model, State(np.array([[1.0, 0, 0, 0]]), still, -model.gravity[None] / 9, still))
     times = np.linspace(0, 1, 9)
     base, *others = (
         pendulums.reference_trajectory(model, s, times) for s in (state, *perturbed_states(model, state))

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from plumbline.engines.registry import ENGINES, load_adapter
-from plumbline.model.datatypes import Unsupported
-from plumbline.model.kinematics import state_from_minimal
+from plumbline.model.datatypes import State, Unsupported
+from plumbline.model.kinematics import complete_state
 from plumbline.model.sampling import compared_states, random_states
 from plumbline.model.welding import split_bodies
 from plumbline.scenario.loader import find_scenario_file, load_scenario, scenario_from_dict
@@ -217,7 +217,7 @@ def smallest_detected_error(what, rods):
 
         def seen(e, model=model, states=states, bounds=bounds, true=true):
             wrong = MODEL_ERRORS[what](model, e)
-            relifted = [state_from_minimal(wrong, s.p, s.omega, s.u, s.udot) for s in states]
+            relifted = [complete_state(wrong, State(s.p, s.omega, s.u, s.udot)) for s in states]
             reported = [certify_state(wrong, state).quantities for state in relifted]
             return any(
                 max(error_ratios(*each).values()) > 1 for each in zip(reported, true, bounds, strict=True)
