@@ -88,7 +88,7 @@ class _SingleSteps(_Steps):
         self.starts = [(index, h, run.angle_axes) for index, h, run in found]
         self.steps = FormulaSteps(method, model, states, self.starts)
         compared = self.steps.compare(self.runs).values()
-        pairs = [pair for c in compared for pair in zip(c.ratios, c.places, strict=True)]
+        pairs = [(x, at) for c in compared for row, at in zip(c.ratios, c.places, strict=True) for x in row]
         self.ratios = [ratio for ratio, _ in pairs]
         first = Place(*found[0][:2], 1)
         _, self.worst = max(pairs, key=lambda pair: pair[0], default=(0.0, first))
@@ -103,7 +103,7 @@ class _SingleSteps(_Steps):
         if case.read is None:
             steps = FormulaSteps(case.method, case.model, self.states, self.starts)
         compared = steps.compare([case.right_samples(run) for run in self.runs])
-        ratios = [ratio for c in compared.values() for ratio in c.ratios]
+        ratios = [ratio for c in compared.values() for ratio in c.ratios.ravel()]
         # a step that leads another formula into a singularity is compared with nothing: not explained
         return max(ratios) if len(ratios) and len(ratios) >= len(self.ratios) else np.inf
 
@@ -429,13 +429,13 @@ class _ConstrainedSteps(_Steps):
 
     def left(self, case: Case) -> float:
         found = compare_parts(case.method, case.model, self.states, self.runs)
-        return max(max(found[name].ratios) for name in self.parts)
+        return max(max(found[name].ratios.ravel()) for name in self.parts)
 
 
 def _explain_constrained_steps(
     model: Model, states: Sequence[State], declared: ConstrainedMethod, runs: Runs
 ) -> tuple[Cause, ...]:
-    ratios = {name: max(c.ratios) for name, c in compare_parts(declared, model, states, runs).items()}
+    ratios = {name: max(c.ratios.ravel()) for name, c in compare_parts(declared, model, states, runs).items()}
     parts = []
     first = ratios.pop("step_first_acceleration", 0.0)
     if first > MIN_DIAGNOSABLE_RATIO:

@@ -93,8 +93,8 @@ def _of_motion(model: Model, motion: Trajectory, differs: Mask, agrees: Mask) ->
 
 def _quantities(model: Model, motion: Trajectory) -> Iterator[tuple[str, str, Array]]:
     """Names, units and values (samples,) of positions and rates."""
-    p, omega, none = motion.p, angular_velocity(motion.p, motion.pdot), np.zeros_like(motion.r)
-    bodies = State(p, omega, none, none, motion.r, motion.v)
+    p, omega = motion.p, angular_velocity(motion.p, motion.pdot)
+    bodies = State(p, omega, r=motion.r, v=motion.v)
     _, _, coordinates, _ = coordinates_of_joints(model, bodies, range(model.n))
     for k, kind in enumerate(model.kinds[: model.n]):
         for i, (what, _) in enumerate(kind.motions):

@@ -19,7 +19,6 @@ from plumbline.truth.step_comparison import (
     CONSTRAINED_QUANTITIES,
     RUN_QUANTITIES,
     STEP_QUANTITIES,
-    Comparisons,
     FormulaSteps,
     RunSteps,
     StepDeviations,
@@ -134,14 +133,14 @@ def _single_step_rows(
 
 
 def _row(
-    context: RowContext, integrator: Integrator, quantity: str, about: tuple[str, str], found: Comparisons,
+    context: RowContext, integrator: Integrator, quantity: str, about: tuple[str, str], found: StepDeviations,
     note: str, alias: str | None, cpu_time: float,
 ) -> Row:  # fmt: skip
     """The row of one quantity: its worst ratio decides, unless most bounds are too loose."""
-    error, bound = np.array(found.errors), np.array(found.bounds)
-    ratios = error / np.maximum(bound, np.finfo(float).tiny)
-    at, looseness = int(np.argmax(ratios)), np.array(found.looseness)
-    place = f"body {found.bodies[at] + 1}, {found.places[at]}"
+    error, bound, ratios, looseness = found.errors, found.bounds, found.ratios, found.looseness
+    at = np.unravel_index(np.argmax(ratios), ratios.shape)
+    worst = found.places[at[0]]
+    place = f"body {at[1] + 1}, {worst}"
     ratio, is_sharp = float(ratios[at]), looseness <= MAX_STEP_BOUND
     name, unit = about[0].replace("_", " "), about[1]
     if ratio > 1:
@@ -165,9 +164,8 @@ def _row(
         derivation=f"{bound[at]:.2g} {unit} at {place}; in the median {np.median(looseness):.1g} "
         "of the accelerations' effect on a step; truth: the declared formula in extended precision "
         "(docs/integrators.md)",
-        extra={"comparisons": float(len(error)), "bound_relative": float(np.max(looseness)),
-               "state": float(found.places[at].state), "step": found.places[at].step,
-               "steps": float(found.places[at].count)},
+        extra={"comparisons": float(error.size), "bound_relative": float(np.max(looseness)),
+               "state": float(worst.state), "step": worst.step, "steps": float(worst.count)},
     )  # fmt: skip
 
 

@@ -253,8 +253,7 @@ def state_at_sample(run: Trajectory, at: int, sign: float = 1.0) -> State:
 
     """
     p, pdot = run.p[at], sign * run.pdot[at]
-    zeros = np.zeros_like(run.r[at])
-    return State(p, angular_velocity(p, pdot), zeros, zeros, run.r[at], sign * run.v[at])
+    return State(p, angular_velocity(p, pdot), r=run.r[at], v=sign * run.v[at])
 
 
 def relative_differences(model: Model, one: State, other: State, driven: float = 0.0) -> dict[str, float]:

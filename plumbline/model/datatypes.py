@@ -91,8 +91,8 @@ class State:
 
     p: Float[Array, "*#batch bodies 4"]
     omega: Float[Array, "*#batch bodies 3"]  # rad/s, body frame
-    u: Float[Array, "*#batch bodies 3"]  # world frame
-    udot: Float[Array, "*#batch bodies 3"]  # 1/s, world frame
+    u: Float[Array, "*#batch bodies 3"] = field(default_factory=_absent)  # world frame
+    udot: Float[Array, "*#batch bodies 3"] = field(default_factory=_absent)  # 1/s, world frame
     r: Float[Array, "*#batch bodies 3"] = field(default_factory=_absent)  # m, world frame
     v: Float[Array, "*#batch bodies 3"] = field(default_factory=_absent)  # m/s, world frame: ṙ
     # rad or m: coordinates of joint k in the order of its kind's motions, angles unwrapped; rates
@@ -101,7 +101,7 @@ class State:
 
     def __post_init__(self) -> None:
         """Put zeros of the right shape where nothing is given."""
-        for name, width in (("r", 3), ("v", 3), ("x", 2), ("xdot", 2)):
+        for name, width in (("u", 3), ("udot", 3), ("r", 3), ("v", 3), ("x", 2), ("xdot", 2)):
             if not getattr(self, name).size:
                 object.__setattr__(self, name, np.zeros((*self.p.shape[:-1], width)))
 

@@ -298,7 +298,7 @@ class StepMeasure:
                 return None
             steps = FormulaSteps(method, model, [state], [(0, h, run.angle_axes)], [count])
             ((_, _, limits, _),) = steps.limits()
-            ratio = max(max(c.ratios) for c in steps.compare([run]).values())
+            ratio = max(max(c.ratios.ravel()) for c in steps.compare([run]).values())
         except Exception:
             return None
         true = steps.true[0][count]

@@ -189,8 +189,8 @@ def project_to_manifold(model: Model, r: Array, p: Array, v: Array, pdot: Array)
     from reference_impl.fast.tree_elimination import eliminated_system
 
     q, qdot = eliminated_system([model]).project(component_first(r, p), component_first(v, pdot))
-    p, zeros = np.ascontiguousarray(q[3:].T), np.zeros((model.n, 3))
-    return State(p, angular_velocity(p, qdot[3:].T), zeros, zeros, q[:3].T, qdot[:3].T)
+    p = np.ascontiguousarray(q[3:].T)
+    return State(p, angular_velocity(p, qdot[3:].T), r=q[:3].T, v=qdot[:3].T)
 
 
 def _interpolate_states(model: Model, base: State, other: State, part: float) -> State:

@@ -310,10 +310,9 @@ def projected_residual(model: Model, run: StepRun) -> ConstrainedResidual:
     """
     q, qdot, qddot = (x[1:] for x in engine_coordinates(run))
     terms = _inertial_and_applied(model, q, qdot, qddot)
-    t, count, none = run.trajectory, len(q), np.zeros((len(q), model.n, 3))
+    t, count = run.trajectory, len(q)
     omega = angular_velocity(t.p[1:], t.pdot[1:])
-    bodies = State(p=t.p[1:], omega=omega, r=t.r[1:], v=t.v[1:], u=none, udot=none, x=none, xdot=none)
-    bodies = with_joint_coordinates(model, bodies)
+    bodies = with_joint_coordinates(model, State(t.p[1:], omega, r=t.r[1:], v=t.v[1:]))
     twists = velocity_jacobian(model, bodies).reshape(count, model.n, 6, -1)
     there = complete_state(model, bodies)
     sign = np.where(np.sum(bodies.p * there.p, -1, keepdims=True) < 0, -1.0, 1.0)
