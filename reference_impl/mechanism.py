@@ -95,47 +95,29 @@ class Mechanism:
     @classmethod
     def chain(
         cls,
-        mass: Float[Array, "bodies"],
-        inertia: Float[Array, "bodies 3 3"],
         proximal: Float[Array, "bodies 3"],
         distal: Float[Array, "bodies 3"],
         length: Float[Array, "bodies"],
-        gravity: Float[Array, "3"],
-        force: Float[Array, "bodies 3"],
-        moment: Float[Array, "bodies 3"],
-        drag_force: Float[Array, "bodies"],
-        drag_moment: Float[Array, "bodies"],
+        **fields: Any,
     ) -> Mechanism:
         """Make an open chain on rods and ball joints, hung from the world's origin.
 
         Args:
-            mass: [kg].
-            inertia: about the centres of mass, body frames [kg m²].
             proximal: the joint of body k: the notes' s_1 of body 1, s_3 of body 2; body frame [m].
             distal: the joint of body k+1 on body k: s_2; body frame, unused for the last body [m].
             length: of the rods, 0 for a ball joint [m].
-            gravity: world frame [m/s²].
-            force: constant applied forces at the centres of mass, world frame [N].
-            moment: constant applied moments n′, body frame [N m].
-            drag_force: c_t [N s/m].
-            drag_moment: c_r [N m s].
+            fields: masses, inertias, gravity, loads and drag as they are named here.
 
         """
         k = np.arange(len(length))
         far = np.concatenate([np.zeros_like(distal[:1]), distal[:-1]])
         return cls(
-            mass=mass,
-            inertia=inertia,
             kind=_chain_kinds(length),
             body=np.stack([k - 1, k], axis=1),
             point=np.stack([far, proximal], axis=1),
             turn=np.tile([1.0, 0.0, 0.0, 0.0], (len(k), 2, 1)),
             length=length,
-            gravity=gravity,
-            force=force,
-            moment=moment,
-            drag_force=drag_force,
-            drag_moment=drag_moment,
+            **fields,
         )
 
     def changed(self, **changes: Any) -> Mechanism:

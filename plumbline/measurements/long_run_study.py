@@ -212,7 +212,7 @@ def _first_doubt(
     scale = np.maximum(kinetic, reduced.invariant_scales[min(reduced.invariant_scales)]["energy_drift"])
     out = np.flatnonzero(drift > MAX_RELATIVE_DRIFT * scale)  # the step is too coarse from there on
     number = int(out[0]) if len(out) else len(run.t)
-    part = replace(run, **{name: getattr(run, name)[:number] for name in ("t", "r", "p", "v", "pdot")})
+    part = run.at(slice(number))
     found = first_doubt(model, state, part)
     if found is None and reduced.failure is not None and not leaves_range(reduced, seconds):
         return np.inf
@@ -263,7 +263,7 @@ def _reduce_run(
     scales, work_uncertainty = {}, {}
     for window_end in _window_ends(end, plan):
         number = int(np.searchsorted(run.t, window_end)) + 1
-        part = replace(run, **{name: getattr(run, name)[:number] for name in ("t", "r", "p", "v", "pdot")})
+        part = run.at(slice(number))
         invariants = compute_invariants(model, part)
         scales[window_end] = invariant_scales(model, part, length)
         work_uncertainty[window_end] = invariants.work_uncertainty

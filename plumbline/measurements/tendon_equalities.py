@@ -15,13 +15,8 @@ import numpy as np
 from plumbline.equations.arithmetic import floats
 from plumbline.equations.tree import Tree
 from plumbline.model.datatypes import Array, Model, State
-from plumbline.model.kinematics import (
-    angular_velocity,
-    joint_coordinates,
-    maximal_coordinates,
-    rotate_vectors,
-)
-from plumbline.model.loops import cut_open, determinate_projectors, wrench_length
+from plumbline.model.kinematics import angular_velocity, joint_coordinates, quaternion_rate
+from plumbline.model.loops import cut_open, determinate_wrenches
 from plumbline.model.redescription import rods_taken_out
 from reference_impl.direct import DirectSystem
 
@@ -45,18 +40,13 @@ def effects_of_missing_terms(model: Model, state: State) -> dict[str, Array]:
         defect[system.joint == k] = 2 * model.length[k] * lengthening
     right, wrong = (system.solve(*at, gamma, x) for gamma in (0.0, defect))
     assert right.joint_moment is not None and wrong.joint_moment is not None
-    wrench = np.concatenate(
-        [wrong.joint_reaction - right.joint_reaction, wrong.joint_moment - right.joint_moment], axis=1
-    )
-    projectors = determinate_projectors(model, state) if model.has_loops else None
-    if projectors is not None:
-        unit = np.repeat([1.0, wrench_length(model)], 3)
-        wrench = rotate_vectors(projectors, wrench / unit) * unit
+    force, moment = wrong.joint_reaction - right.joint_reaction, wrong.joint_moment - right.joint_moment
+    force, moment = determinate_wrenches(model, state, force, moment)
     return {
         "acceleration": wrong.acceleration - right.acceleration,
         "angular_acceleration": angular_velocity(state.p, wrong.pddot - right.pddot),
-        "joint_reaction": wrench[:, :3],
-        "joint_moment": wrench[:, 3:],
+        "joint_reaction": force,
+        "joint_moment": moment,
     }
 
 

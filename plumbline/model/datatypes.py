@@ -10,7 +10,7 @@ velocity in the body frame (the notes' ω′ = 2 L(p) ṗ). N is the number of b
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -160,6 +160,10 @@ class Trajectory:
     # the engine's own configuration and velocity, joint by joint as `JointSpaceMethod` orders them
     coordinates: Float[Array, "samples entries"] | None = None
     velocities: Float[Array, "samples rates"] | None = None
+
+    def at(self, samples: Any) -> Trajectory:
+        """Take some samples of the motion; the engine's own coordinates stay as they are."""
+        return replace(self, **{name: getattr(self, name)[samples] for name in ("t", "r", "p", "v", "pdot")})
 
 
 @dataclass(frozen=True, eq=False)

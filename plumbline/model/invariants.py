@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -256,7 +256,7 @@ def work_of_loads(
     apart, last = 0.0, len(run.t) - 1
     for first in (1, 2):
         kept = np.unique([0, *range(first, last, 2), last])
-        half = replace(run, **{name: getattr(run, name)[kept] for name in ("t", "r", "p", "v", "pdot")})
+        half = run.at(kept)
         sparse = _integrated_power(model, half, WINDOWS[-1])
         apart = max(apart, float(np.max(np.abs(sparse - work[-1, kept]))))
     between = float(np.max(np.abs(steps[-1])))

@@ -673,11 +673,23 @@ def determinate_part(model: Model, state: State, answer: StateQuantities) -> Sta
         determinate.
 
     """
-    answer = replace(answer, mass_matrix=None)
-    projectors = determinate_projectors(model, state)
-    if projectors is None or answer.joint_reaction is None or answer.joint_moment is None:
-        return answer if projectors is None else replace(answer, joint_reaction=None, joint_moment=None)
+    answer, projectors = replace(answer, mass_matrix=None), determinate_projectors(model, state)
+    force, moment = answer.joint_reaction, answer.joint_moment
+    if projectors is None:
+        return answer
+    if force is None or moment is None:
+        return replace(answer, joint_reaction=None, joint_moment=None)
+    force, moment = determinate_wrenches(model, state, force, moment)
+    return replace(answer, joint_reaction=force, joint_moment=moment)
+
+
+def determinate_wrenches(
+    model: Model, state: State, force: Float[Array, "... joints 3"], moment: Float[Array, "... joints 3"]
+) -> tuple[Float[Array, "... joints 3"], Float[Array, "... joints 3"]]:
+    """Reduce the forces and moments of joints at a state to what is unique; those of trees are."""
+    projectors = determinate_projectors(model, state) if model.has_loops else None
+    if projectors is None:
+        return force, moment
     length = wrench_length(model)
-    wrench = np.concatenate([answer.joint_reaction, answer.joint_moment / length], axis=1)
-    wrench = rotate_vectors(projectors, wrench)
-    return replace(answer, joint_reaction=wrench[:, :3], joint_moment=wrench[:, 3:] * length)
+    wrench = rotate_vectors(projectors, np.concatenate([force, moment / length], axis=-1))
+    return wrench[..., :3], wrench[..., 3:] * length

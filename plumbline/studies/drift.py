@@ -19,12 +19,11 @@ import pyarrow as pa
 
 from plumbline.model.datatypes import Array, Float, Model, Trajectory
 from plumbline.model.invariants import compute_invariants
-from plumbline.model.kinematics import joint_coordinates, maximal_coordinates
 from plumbline.scenario.loader import Scenario
 from plumbline.storage.results_store import DRIFT_TABLE
 from plumbline.studies.parquet_files import make_table
-from reference_impl.fast.collocation import BatchIntegrationResult, integrate_collocation
-from reference_impl.fast.tree_elimination import eliminated_system
+from plumbline.truth.notes_motion import integrate_batch
+from reference_impl.fast.collocation import BatchIntegrationResult
 
 BAUMGARTE_RATE = 10.0  # 1/s
 VARIANTS: dict[str, dict[str, Any]] = {  # by name the options of the integration
@@ -104,9 +103,7 @@ def _measure_variant(
 def _drifts(s: Scenario, variant: str, rtol: float, times: Sequence[float]) -> list[dict[str, Any]]:
     """By the end of each interval the largest errors until then, and the share of the steps."""
     grid = np.unique(np.concatenate([np.linspace(0, end, SAMPLES + 1) for end in times]))
-    start = maximal_coordinates(s.state)
-    system = eliminated_system([s.model], joint_coordinates(s.model, s.state)[2])
-    run = integrate_collocation(system, *start, grid, rtol, **VARIANTS[variant])
+    run = integrate_batch([(s.model, s.state)], grid, rtol, **VARIANTS[variant])
     errors = drift_errors(s.model, run, s.state.x)
     return [
         {"time": end, "steps": round(run.steps * end / times[-1])}

@@ -21,14 +21,12 @@ from plumbline.judging.trajectory_level import judge_trajectory
 from plumbline.measurements.order_and_limit import refinement_resolutions
 from plumbline.model.datatypes import Integrator, Trajectory
 from plumbline.model.invariants import compute_invariants, position_error
-from plumbline.model.kinematics import joint_coordinates, maximal_coordinates
 from plumbline.processes.worker_pool import Outcome, Task, WorkerPool
 from plumbline.scenario.loader import Scenario
 from plumbline.studies.parquet_files import make_table
 from plumbline.studies.sweep_file import REFINEMENT_LEVELS, Sweep, SweepCell
 from plumbline.truth.ground_truth import MotionTruth, motion_truth
-from reference_impl.fast import collocation
-from reference_impl.fast.tree_elimination import eliminated_system
+from plumbline.truth.notes_motion import integrate_batch, trajectories
 
 REFERENCE_RTOLS = (1e-9, 1e-11)  # of the reference: a run, and the tighter run that gives its uncertainty
 MAX_REFERENCE_STEPS = 1e6  # about 20 min
@@ -149,27 +147,18 @@ def _run_references(counted: _Progress, valid: Mapping[int, Scenario]) -> Iterat
 
 def _run_reference_batch(group: Sequence[tuple[int, Scenario]]) -> list[Record]:
     """The reference's rows of one batch, in a worker; raise ArithmeticError where a cell fails."""
-    x = np.concatenate([joint_coordinates(s.model, s.state)[2] for _, s in group])
-    start = maximal_coordinates(*(s.state for _, s in group))
-    times = group[0][1].times
-    coarse, fine = (
-        collocation.integrate_collocation(
-            eliminated_system([s.model for _, s in group], x), *start, times, rtol,
-            max_steps=MAX_REFERENCE_STEPS,
-        )
+    cases, times, records = [(s.model, s.state) for _, s in group], group[0][1].times, []
+    runs = (
+        trajectories(integrate_batch(cases, times, rtol, max_steps=MAX_REFERENCE_STEPS), cases)
         for rtol in REFERENCE_RTOLS
-    )  # fmt: skip
-    records, first = [], 0
-    for index, scenario in group:
-        body = slice(first, first := first + scenario.model.n)
-        r, p, v, pdot = (getattr(fine, name)[:, body] for name in ("r", "p", "v", "pdot"))
-        motion = Trajectory(times, r, p, v, pdot, fine.steps, scenario.state.x)
+    )
+    for (index, scenario), coarse, motion in zip(group, *runs, strict=True):
         reason = "the reference; its uncertainty is the change to the tighter tolerance"
         records.append(
             {
                 **_reference_record(index, Verdict.AGREES, reason),
                 "integrator": "collocation",
-                "uncertainty": float(np.max(position_error(coarse.r[:, body], motion.r))),
+                "uncertainty": float(np.max(position_error(coarse.r, motion.r))),
                 **_measure_motion(scenario, motion),
             }
         )

@@ -7,17 +7,30 @@ radius, by what they are proved for.
 
 from __future__ import annotations
 
+import contextlib
 import gzip
 import hashlib
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from itertools import islice
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from plumbline.model.datatypes import Array, Model, State
+from plumbline.model.datatypes import Array, Model, State, Trajectory
+from plumbline.model.invariants import motion_samples
+from plumbline.model.kinematics import quaternion_rate
+from plumbline.processes.record_encoding import UnfitRecord, decode_record, encode_record
+from plumbline.processes.user_cache import (
+    CheckedFiles,
+    DamagedFile,
+    content_key,
+    describe_failure,
+    user_cache_folder,
+)
 from plumbline.truth import TruthUnavailable, import_truth_tool
 from plumbline.truth.certificate_file import (
     FORMAT,
@@ -29,28 +42,6 @@ from plumbline.truth.certificate_file import (
     parse_certificate,
 )
 from plumbline.truth.taylor import taylor_series
-
-if TYPE_CHECKING:
-    from plumbline.truth.certificate_checker import Enclosure
-
-
-import contextlib
-from collections.abc import Mapping
-from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING
-
-from plumbline.model.datatypes import Trajectory
-from plumbline.model.invariants import motion_samples
-from plumbline.model.kinematics import quaternion_rate
-from plumbline.processes.record_encoding import UnfitRecord, decode_record, encode_record
-from plumbline.processes.user_cache import (
-    CheckedFiles,
-    DamagedFile,
-    content_key,
-    describe_failure,
-    user_cache_folder,
-)
 
 if TYPE_CHECKING:
     from plumbline.truth.certificate_checker import Enclosure

@@ -157,55 +157,6 @@ def _is_sharp(name: str, balls: dict[str, Any]) -> bool:
     return all(float(x.rad()) <= MAX_RELATIVE_RADIUS * balls["scale"][name] for x in flatten(balls[name]))
 
 
-def term_scales(
-    model: Model,
-    balls: dict[str, Any],
-    lever: float,
-    rate: float,
-    element_sizes: tuple[float, float, float] = (0.0, 0.0, 0.0),
-) -> dict[str, float]:
-    """Estimate the sizes of the terms of each quantity.
-
-    Radii are compared with them, because a quantity itself may be zero.
-
-    Args:
-        balls: entries of each quantity, by name.
-        lever: largest distance of a body from the world's origin [m].
-        rate: largest rate of rotation [rad/s].
-        element_sizes: forces [N], moments [N m] and potential energy [J] of springs and their like, before
-            they cancel.
-
-    Returns:
-        By quantity the size, in its unit.
-
-    """
-    size = {name: float(np.max(np.abs(midpoints(ball)), initial=0.0)) for name, ball in balls.items()}
-    g = float(np.linalg.norm(model.gravity))
-    mass, inertia = float(np.sum(model.mass)), float(np.sum(np.linalg.norm(model.inertia, axis=(1, 2))))
-    push = float(np.sum(np.linalg.norm(model.force, axis=1))) + element_sizes[0]
-    torque = float(np.sum(np.linalg.norm(model.moment, axis=1))) + element_sizes[1]
-    a = max(size["acceleration"], g, rate**2 * lever, push / mass)
-    a = max(a, torque / (mass * lever) if lever else 0.0)
-    force = max(size["joint_reaction"], mass * a)
-    scales = {
-        "acceleration": a,
-        "angular_acceleration": max(
-            size["angular_acceleration"], rate**2, a / lever if lever else torque / inertia
-        ),
-        "joint_reaction": force,
-        "joint_moment": max(size.get("joint_moment", 0.0), force * lever),
-        "kinetic_energy": size["kinetic_energy"],
-        "potential_energy": max(size["potential_energy"], mass * g * lever + element_sizes[2]),
-        "angular_momentum": max(size["angular_momentum"], (mass * lever**2 + inertia) * rate),
-        "r": max(size["r"], lever),
-        "v": max(size["v"], lever * rate),
-        "mass_matrix": size.get("mass_matrix", 0.0),
-        "attitude": 1.0,
-        "angular_velocity": max(size["angular_velocity"], rate),
-    }
-    return {name: scale for name, scale in scales.items() if name in balls}
-
-
 def tree_quantities(tree: Tree, solution: Solution) -> dict[str, Any]:
     """List the balls of a solved tree.
 
@@ -223,14 +174,10 @@ def tree_quantities(tree: Tree, solution: Solution) -> dict[str, Any]:
     return found | {name: [entries(x) for x in each] for name, each in vectors.items()}
 
 
-def quantity_scales(c: Any, balls: dict[str, Any]) -> dict[str, float]:
-    """Estimate the sizes of the terms of each quantity, see `term_scales`.
+def quantity_scales(c: Tree, balls: dict[str, Any]) -> dict[str, float]:
+    """Estimate the sizes of the terms of each quantity, in its unit.
 
-    Args:
-        c: the tree.
-
-    Returns:
-        Sizes by quantity.
+    Radii are compared with them, because a quantity itself may be zero.
 
     """
     norm, model = np.linalg.norm, c.model
@@ -238,14 +185,37 @@ def quantity_scales(c: Any, balls: dict[str, Any]) -> dict[str, float]:
     lever = max(lever, float(np.max(np.abs(midpoints(balls["r"])))))
     rate = float(np.max(norm(midpoints([entries(w) for w in c.w]), axis=1)))
     rate = max(rate, float(np.max(np.abs(c.state.xdot))), float(np.max(np.abs(c.state.udot))))
-    sizes = (0.0, 0.0, 0.0)
+    # forces [N], moments [N m] and potential energy [J] of springs and their like, before they cancel
+    pushes = turns = stored = 0.0
     if model.has_elements:
         state = c.state[None]
         elements, springs = joint_elements(model, state, np.zeros((1, model.n))), spring_terms(model, state)
-        push, turn = (
-            float(sum(np.sum(e.size) for e in elements if e.is_slide == is_slide))
-            for is_slide in (True, False)
+        pushes, turns = (
+            float(sum(np.sum(e.size) for e in elements if e.is_slide == is_slide)) + float(np.sum(own))
+            for is_slide, own in ((True, springs.size), (False, springs.moment_size))
         )
-        potential = float(sum((np.sum(e.potential) for e in elements), np.sum(springs.potential)))
-        sizes = push + float(np.sum(springs.size)), turn + float(np.sum(springs.moment_size)), potential
-    return term_scales(model, balls, lever, rate, sizes)
+        stored = float(sum((np.sum(e.potential) for e in elements), np.sum(springs.potential)))
+    size = {name: float(np.max(np.abs(midpoints(ball)), initial=0.0)) for name, ball in balls.items()}
+    g = float(norm(model.gravity))
+    mass, inertia = float(np.sum(model.mass)), float(np.sum(norm(model.inertia, axis=(1, 2))))
+    push = float(np.sum(norm(model.force, axis=1))) + pushes
+    torque = float(np.sum(norm(model.moment, axis=1))) + turns
+    a = max(size["acceleration"], g, rate**2 * lever, push / mass)
+    a = max(a, torque / (mass * lever) if lever else 0.0)
+    force = max(size["joint_reaction"], mass * a)
+    turning = max(size["angular_acceleration"], rate**2, a / lever if lever else torque / inertia)
+    scales = {
+        "acceleration": a,
+        "angular_acceleration": turning,
+        "joint_reaction": force,
+        "joint_moment": max(size.get("joint_moment", 0.0), force * lever),
+        "kinetic_energy": size["kinetic_energy"],
+        "potential_energy": max(size["potential_energy"], mass * g * lever + stored),
+        "angular_momentum": max(size["angular_momentum"], (mass * lever**2 + inertia) * rate),
+        "r": max(size["r"], lever),
+        "v": max(size["v"], lever * rate),
+        "mass_matrix": size.get("mass_matrix", 0.0),
+        "attitude": 1.0,
+        "angular_velocity": max(size["angular_velocity"], rate),
+    }
+    return {name: scale for name, scale in scales.items() if name in balls}

@@ -18,7 +18,6 @@ Of dependent rows λ is one of many: only the determinate parts of joint wrenche
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -157,15 +156,6 @@ def _tangents(tree: Tree, u: Any, k: int) -> list[Any]:
     return [first, tree.num.cross(u, first)]
 
 
-@dataclass(frozen=True, eq=False)
-class _Selection:
-    """Which rows are kept, and which coordinates they determine."""
-
-    rows: NDArray[np.intp]
-    dependent: NDArray[np.intp]
-    inverse: NDArray[np.floating[Any]]  # double inverse of the block
-
-
 def solve_loop(flint: Any, model: Model, state: State) -> tuple[Tree, Solution, CutMechanism, float]:
     """Enclose the pose, the rates, and the accelerations and wrenches at the working precision.
 
@@ -187,20 +177,21 @@ def solve_loop(flint: Any, model: Model, state: State) -> tuple[Tree, Solution, 
     none = _per_joint([flint.arb(0)] * sum(sizes), sizes)
     here = _LoopTree(flint, cut.model, start, none, none)
     J = here.rates_jacobian(cut.ends, True) * here.chart_matrix()
-    chosen = _select(cut, midpoints(J.tolist()), sizes)
-    z = _prove_pose(flint, cut, start, sizes, chosen)
+    doubles = midpoints(J.tolist())
+    rows = independent_rows(doubles, cut.row_scale)
+    z = _prove_pose(flint, cut, start, sizes, rows, doubles[rows])
     posed = _LoopTree(flint, cut.model, start, z, none)
     J = posed.rates_jacobian(cut.ends, False)
-    kept = flint.arb_mat([[J[int(i), j] for j in range(J.ncols())] for i in chosen.rows])
-    moving = _dependent_columns(cut, midpoints(kept.tolist()), chosen.rows, sizes)
+    kept = flint.arb_mat([[J[int(i), j] for j in range(J.ncols())] for i in rows])
+    moving = _dependent_columns(cut, midpoints(kept.tolist()), rows, sizes)
     nu = _closed_rates(flint, given, kept, moving)
     c = _LoopTree(flint, cut.model, start, z, _per_joint(nu, sizes))
     if model.lacks_inertia:
         c.shifted = _shifted_inertia(cut)
-    dropped = np.setdiff1d(np.arange(J.nrows()), chosen.rows)
+    dropped = np.setdiff1d(np.arange(J.nrows()), rows)
     gap, rate = c.gap(cut.ends), entries(J * flint.arb_mat(len(nu), 1, nu))
     widest = max((float(abs(x[int(i)]).upper()) for x in (gap, rate) for i in dropped), default=0.0)
-    return c, _constrained_motion(flint, c, cut, chosen.rows), cut, widest
+    return c, _constrained_motion(flint, c, cut, rows), cut, widest
 
 
 def _rate_count(kind: str) -> int:
@@ -231,13 +222,6 @@ def _per_joint(values: list[Any], sizes: list[int]) -> list[list[Any]]:
     return [values[ends[k] : ends[k + 1]] for k in range(len(sizes))]
 
 
-def _select(cut: CutMechanism, J: Array, sizes: list[int]) -> _Selection:
-    """Choose independent rows, and the coordinates that they determine."""
-    rows = independent_rows(J, cut.row_scale)
-    dependent = _dependent_columns(cut, J[rows], rows, sizes)
-    return _Selection(rows, dependent, np.linalg.inv(J[np.ix_(rows, dependent)]))
-
-
 def _dependent_columns(
     cut: CutMechanism, kept: Array, rows: NDArray[np.intp], sizes: list[int]
 ) -> NDArray[np.intp]:
@@ -258,11 +242,11 @@ def _dependent_columns(
 
 
 def _prove_pose(
-    flint: Any, cut: CutMechanism, start: State, sizes: list[int], chosen: _Selection
+    flint: Any, cut: CutMechanism, start: State, sizes: list[int], rows: NDArray[np.intp], kept: Array
 ) -> list[list[Any]]:
-    """Enclose the coordinates of the only pose near the doubles."""
-    count, dependent = sum(sizes), chosen.dependent
-    Y = flint.arb_mat([[flint.arb(float(x)) for x in row] for row in chosen.inverse])
+    """Enclose the coordinates of the only pose near the doubles, by rows of J, ``kept`` in doubles."""
+    count, dependent = sum(sizes), _dependent_columns(cut, kept, rows, sizes)
+    Y = flint.arb_mat([[flint.arb(float(x)) for x in row] for row in np.linalg.inv(kept[:, dependent])])
     none = _per_joint([flint.arb(0)] * count, sizes)
 
     def loop_at(values: list[Any]) -> _LoopTree:
@@ -273,7 +257,7 @@ def _prove_pose(
 
     def correction(values: list[Any]) -> list[Any]:
         gap = loop_at(values).gap(cut.ends)
-        return entries(Y * flint.arb_mat(len(chosen.rows), 1, [gap[int(i)] for i in chosen.rows]))
+        return entries(Y * flint.arb_mat(len(rows), 1, [gap[int(i)] for i in rows]))
 
     middle = [flint.arb(0)] * len(dependent)
     target = 2.0 ** (40 - flint.ctx.prec)
@@ -289,7 +273,7 @@ def _prove_pose(
         box = [m + flint.arb(0, radius) for m in middle]
         there = loop_at(box)
         J = there.rates_jacobian(cut.ends, True) * there.chart_matrix()
-        block = flint.arb_mat([[J[int(i), int(j)] for j in dependent] for i in chosen.rows])
+        block = flint.arb_mat([[J[int(i), int(j)] for j in dependent] for i in rows])
         one = flint.arb_mat([[int(i == j) for j in range(len(box))] for i in range(len(box))])
         spread = flint.arb_mat(len(box), 1, [flint.arb(0, radius)] * len(box))
         change = entries((one - Y * block) * spread)

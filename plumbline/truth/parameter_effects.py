@@ -36,7 +36,7 @@ from plumbline.model.kinematics import (
     spring_vectors,
     stack_states,
 )
-from plumbline.model.loops import determinate_projectors, wrench_length
+from plumbline.model.loops import determinate_wrenches
 from plumbline.truth.parameters import (
     FRAME_KINDS,
     STATE_KINDS,
@@ -301,12 +301,9 @@ class ChangedModels:
             "joint_moment": found.joint_moment,
         }
         values = {name: value.reshape(count, -1, 3) for name, value in per_copy.items()}
-        projectors = determinate_projectors(self.model, base) if self.model.has_loops else None
-        if projectors is not None:
-            length = wrench_length(self.model)
-            wrench = np.concatenate([values["joint_reaction"], values["joint_moment"] / length], axis=-1)
-            wrench = rotate_vectors(projectors, wrench)
-            values |= {"joint_reaction": wrench[..., :3], "joint_moment": wrench[..., 3:] * length}
+        names = "joint_reaction", "joint_moment"
+        wrenches = determinate_wrenches(self.model, base, *(values[name] for name in names))
+        values |= zip(names, wrenches, strict=True)
         return values | self._energies(r, p, v, omega, elements)
 
     def _energies(

@@ -18,8 +18,6 @@ from plumbline.model.kinematics import (
     angular_velocity,
     complete_state,
     cross,
-    joint_coordinates,
-    maximal_coordinates,
     quaternion_conjugate,
     quaternion_product,
     quaternion_rate,
@@ -95,10 +93,9 @@ def perturbation_growth_and_runs(
 
     """
     neighbours = range(1, PERTURBATION_COUNT + 1)
-    states = [state, *perturbed_states(model, state), *(s for _, s in other_models)]
-    models = [model] * (PERTURBATION_COUNT + 1) + [m for m, _ in other_models]
-    r, p, v, pdot, x = _integrate_batch(models, states, times)
-    unperturbed = [0, *range(PERTURBATION_COUNT + 1, len(states))]
+    cases = [(model, one) for one in (state, *perturbed_states(model, state))] + [*other_models]
+    r, p, v, pdot, x = _integrate_batch(cases, times)
+    unperturbed = [0, *range(PERTURBATION_COUNT + 1, len(cases))]
     runs = [Trajectory(times, r[k], p[k], v[k], pdot[k], 0) for k in unperturbed]
     size, growth = np.full(PERTURBATION_COUNT, PERTURBATION_SIZE), np.empty((PERTURBATION_COUNT, len(times)))
     earlier_growth, done, arm = np.ones(PERTURBATION_COUNT), 0, 1e-3
@@ -123,8 +120,8 @@ def perturbation_growth_and_runs(
         parts = size / distance[:, stop]
         near = [_interpolate_states(model, base, at, part) for at, part in zip(moved, parts, strict=True)]
         done += stop
-        same = [model] * (PERTURBATION_COUNT + 1)
-        r, p, v, pdot, x = _integrate_batch(same, [base, *near], times[done : done + 2 * stop + 1])
+        some = times[done : done + 2 * stop + 1]
+        r, p, v, pdot, x = _integrate_batch([(model, one) for one in (base, *near)], some)
 
 
 def perturbed_states(
@@ -161,16 +158,12 @@ def perturbed_states(
     return found
 
 
-def _integrate_batch(models: list[Model], states: list[State], times: Array) -> list[Array]:
+def _integrate_batch(cases: Sequence[tuple[Model, State]], times: Array) -> list[Array]:
     """r, p, ṙ, ṗ, x (runs, T, N, ·) of a batch of mechanisms of as many bodies, from times[0]."""
-    # with SciPy: not in a run's own process
-    from reference_impl.fast.collocation import integrate_collocation
-    from reference_impl.fast.tree_elimination import eliminated_system
+    from plumbline.truth.notes_motion import integrate_batch  # with SciPy: not in a run's own process
 
-    pairs = zip(models, states, strict=True)
-    system = eliminated_system(models, np.concatenate([joint_coordinates(*pair)[2] for pair in pairs]))
-    run = integrate_collocation(system, *maximal_coordinates(*states), times, RTOL)
-    return [np.array(np.split(y, len(states), axis=1)) for y in (run.r, run.p, run.v, run.pdot, run.x)]
+    run = integrate_batch(cases, times, RTOL)
+    return [np.array(np.split(y, len(cases), axis=1)) for y in (run.r, run.p, run.v, run.pdot, run.x)]
 
 
 def project_to_manifold(model: Model, r: Array, p: Array, v: Array, pdot: Array) -> State:

@@ -20,7 +20,7 @@ Arrays have leading axes ``...`` for many states at once.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from itertools import islice
 from typing import Any, Literal
@@ -106,9 +106,9 @@ class StepCharts:
             angle_axes: for "joint angles", the axes (angles, 3) of the turns of balls and rods at each state.
 
         """
-        self.cut = cut_open(model) if model.has_loops else None
-        if self.cut:
-            model, states = self.cut.model, [self.cut.state(state) for state in states]
+        cut = cut_open(model)
+        self.place, self.ends = cut.place[: model.n], cut.ends  # of the mechanism's bodies, of loops' ends
+        model, states = cut.model, [cut.state(state) for state in states]
         # by joint which of the coordinates here are the mechanism's, and the pitches at which slides are held
         self.given = [slice(None, len(kind.motions)) for kind in model.kinds]
         self.held: dict[int, float] = {}
@@ -117,7 +117,7 @@ class StepCharts:
             tree, model = model, joints_as_cylinders(model, PITCHED_KINDS)
             states = [state_of_cylinders(tree, model, state) for state in states]
             self.given = [slice(1, 2) if k in self.held else own for k, own in enumerate(self.given)]
-        self.model, self.method, self.ends = model, method, self.cut.ends if self.cut else ()
+        self.model, self.method = model, method
         self.is_held = bool(self.ends or self.held)
         self.state = s = State(
             **{name: np.array([getattr(x, name) for x in states], LongDouble) for name in vars(states[0])}
@@ -206,18 +206,22 @@ class StepCharts:
             EngineFailure: they are not as many as the mechanism has.
 
         """
-        ends = np.cumsum([chart.q.shape[-1] for chart in self.charts])
-        for name, array, size in (
-            ("coordinates", coordinates, ends[-1]),
+        size = sum(chart.q.shape[-1] for chart in self.charts)
+        for name, array, expected in (
+            ("coordinates", coordinates, size),
             ("velocities", velocities, self.nv),
         ):
-            if array.shape[-1] != size:
-                raise EngineFailure(f"{name} has {array.shape[-1]} entries per sample, expected {size}")
-        q = np.split(coordinates.astype(LongDouble), ends[:-1], axis=-1)
+            if array.shape[-1] != expected:
+                raise EngineFailure(f"{name} has {array.shape[-1]} entries per sample, expected {expected}")
+        q = self._by_chart(coordinates)
         for at, chart in zip(q, self.charts, strict=True):
             if chart.is_group:
                 at[..., :4] = _unit(at[..., :4])
         return q, velocities.astype(LongDouble)
+
+    def _by_chart(self, coordinates: Array) -> list[Array]:
+        ends = np.cumsum([chart.q.shape[-1] for chart in self.charts])
+        return np.split(coordinates.astype(LongDouble), ends[:-1], axis=-1)
 
     def middle_cosine(self, q: list[Array]) -> Array:
         """Return the smallest cosine (...,) of the second of a turn's angles; 1 where turns have none."""
@@ -238,8 +242,7 @@ class StepCharts:
             quaternions are not of length 1.
 
         """
-        ends = np.cumsum([chart.q.shape[-1] for chart in self.charts])
-        q, shape = np.split(coordinates.astype(LongDouble), ends[:-1], axis=-1), coordinates.shape[:-1]
+        q, shape = self._by_chart(coordinates), coordinates.shape[:-1]
         turned, stretched = np.zeros((2, *shape, self.model.n))
         for k, kind in enumerate(self.model.kinds):
             for at in (self.of_rod.get(k), self.of_body[k]):
@@ -253,8 +256,7 @@ class StepCharts:
                 turns = [i for i, (what, _) in enumerate(kind.motions) if what == "turn"]
                 angles = own[..., 3 * chart.is_point :] if chart.axes else own[..., turns]
                 turned[..., k] += np.asarray(np.sum(np.abs(angles), axis=-1), float)
-        place = self.cut.place[: self.cut.source.n] if self.cut else slice(None)
-        return {"turned": turned[..., place], "stretched": stretched[..., place]}
+        return {"turned": turned[..., self.place], "stretched": stretched[..., self.place]}
 
     def move(self, q: list[Array], displacement: Array) -> list[Array]:
         """Displace the coordinates.
@@ -316,14 +318,8 @@ class StepCharts:
         if not len(self.turns):
             return v
         terms = self.method.correction_terms
-        once = self.bracket(theta, v)
-        total, power = v + (terms is None or terms > 0) * once / 2, once
-        if terms is not None and terms < 2:
-            return total
-        for weight in BERNOULLI[: None if terms is None else 1]:
-            power = self.bracket(theta, power)
-            total, power = total + weight * power, self.bracket(theta, power)
-        return total
+        weights = BERNOULLI if terms is None else BERNOULLI[: int(terms > 1)]
+        return _bernoulli_series(self.bracket, theta, v, 0.5 if terms != 0 else 0.0, weights)
 
     # -- accelerations -------------------------------------------------------------------------------
 
@@ -507,9 +503,8 @@ class StepCharts:
         kinetic, potential, momentum = tree.totals()
         energy = np.broadcast_to((kinetic + potential)[..., 0, 0], lead)
         every = r, np.stack(tree.p, -2), velocity, omega_, u, udot, x, xdot
-        place = self.cut.place[: self.cut.source.n] if self.cut else slice(None)
         momentum = np.broadcast_to(momentum[..., 0], (*lead, 3))
-        r, p, velocity, omega_, u, udot, x, xdot = (one[..., place, :] for one in every)
+        r, p, velocity, omega_, u, udot, x, xdot = (one[..., self.place, :] for one in every)
         return BodyStates(r, p, velocity, omega_, u, udot, x, xdot, energy, momentum)
 
     def body_accelerations(self) -> tuple[Array, Array]:
@@ -522,9 +517,8 @@ class StepCharts:
         q, v = self.start()
         _, found, tree = self._solved(q, v)
         turning = [A.mT @ alpha for A, alpha in zip(tree.A, found.turning, strict=True)]
-        place = self.cut.place[: self.cut.source.n] if self.cut else slice(None)
-        linear, angular = (_stacked(x, v.shape[:-1])[..., place, :] for x in (found.acceleration, turning))
-        return linear, angular
+        linear, angular = (_stacked(x, v.shape[:-1]) for x in (found.acceleration, turning))
+        return linear[..., self.place, :], angular[..., self.place, :]
 
 
 class _MovingTree(Tree):
@@ -794,14 +788,21 @@ def _rate_of_vector(e: Array, spins: Array) -> Array:
     return np.asarray(np.swapaxes(e[..., None, :1] * spins.mT + cross(spins.mT, x), -1, -2) / 2)
 
 
+def _bernoulli_series(
+    bracket: Callable[[Array, Array], Array], by: Array, v: Array, first: float, weights: Sequence[Any]
+) -> Array:
+    """V + B₁ [by, v] + Σ weights × the brackets of even order."""
+    power = bracket(by, v)
+    total = v + first * power
+    for weight in weights:
+        power = bracket(by, power)
+        total, power = total + weight * power, bracket(by, power)
+    return total
+
+
 def _log_shift(turn: Array, shift: Array) -> Array:
     """The linear part of log of a pose: Σ Bₖ/k! (turn ×)ᵏ shift, B₁ = −½; turns of less than 2 rad."""
-    once = cross(turn, shift)
-    total, power = shift - once / 2, once
-    for weight in BERNOULLI:
-        power = cross(turn, power)
-        total, power = total + weight * power, cross(turn, power)
-    return total
+    return _bernoulli_series(cross, turn, shift, -0.5, BERNOULLI)
 
 
 def _left_jacobian(t: Array) -> Array:

@@ -13,41 +13,36 @@ falls, and beyond the pose another branch may go on.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
-from plumbline.model.datatypes import Array, Model, State, Trajectory
-from plumbline.model.invariants import motion_error, motion_errors, motion_samples
-from plumbline.model.kinematics import angular_velocity, maximal_coordinates, quaternion_rate
-from plumbline.truth import TruthUnavailable
-from plumbline.truth.certificate_proof import ProvedMotion, prove_motion, round_enclosure
-from plumbline.truth.taylor import Precision, simulate_taylor
-
-if TYPE_CHECKING:
-    from plumbline.truth.certificate_checker import Enclosure
-
-
-from collections.abc import Iterator, Sequence
-from functools import partial
-from typing import Literal, NamedTuple
-
 from plumbline.engines.integrators import runge_kutta_4
-from plumbline.model.datatypes import EngineFailure
-from plumbline.model.invariants import attitude_error
+from plumbline.model.datatypes import Array, EngineFailure, Model, State, Trajectory
+from plumbline.model.invariants import attitude_error, motion_error, motion_errors, motion_samples
 from plumbline.model.kinematics import (
+    angular_velocity,
     joint_coordinates,
+    quaternion_rate,
     with_joint_coordinates,
 )
 from plumbline.model.loops import MIN_MOTION_SINGULAR_VALUE, regular_rank, smallest_singular_value
+from plumbline.truth import TruthUnavailable
+from plumbline.truth.certificate_proof import ProvedMotion, prove_motion, round_enclosure
+from plumbline.truth.notes_motion import integrate_batch, side_by_side, trajectories
 from plumbline.truth.parameters import Parameter, perturb
 from plumbline.truth.step_formulas import fastest_rates
+from plumbline.truth.taylor import Precision, simulate_taylor
 from reference_impl.fast.chain_elimination import component_first
 from reference_impl.fast.collocation import integrate_collocation
-from reference_impl.fast.tree_elimination import TreeSystem, eliminated_system, fastest_acceleration
+from reference_impl.fast.tree_elimination import eliminated_system, fastest_acceleration
 from reference_impl.integrate import IntegrationResult, integrate_dop853
+
+if TYPE_CHECKING:
+    from plumbline.truth.certificate_checker import Enclosure
 
 NOTES_RTOL = 1e-13  # of the notes' form: at 1e-14 it is no closer to extended precision, the rest is rounding
 # In double precision both methods round alike: of seven and eight bodies (squeezer, tree-of-seven-sprung)
@@ -212,17 +207,15 @@ def simulate_notes_form(
         EngineFailure: the integrator stops early.
 
     """
-    start, x = maximal_coordinates(state), joint_coordinates(model, state)[2]
     run: IntegrationResult
     try:
-        if (
-            method == "dop853"
-        ):  # absolute tolerances of 1 m, 1, 1 m/s and 1 1/s: those by default are too coarse
-            form = fastest_acceleration(model)
+        # absolute tolerances of 1 m, 1, 1 m/s and 1 1/s: those by default are too coarse
+        if method == "dop853":
+            form, x = fastest_acceleration(model), joint_coordinates(model, state)[2]
+            start = state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
             run = integrate_dop853(model, *start, times, rtol, form, x=x, atol=rtol)
         else:
-            system = eliminated_system([model], x)
-            run = integrate_collocation(system, *start, times, rtol, project=True)
+            run = integrate_batch([(model, state)], times, rtol, project=True)
     except ArithmeticError as error:
         raise EngineFailure(str(error)) from None
     return Trajectory(times, run.r, run.p, run.v, run.pdot, run.steps, state.x)
@@ -280,8 +273,7 @@ def accurate_motion(model: Model, state: State, times: Array, substeps: int) -> 
 
     """
     stages = np.linspace(times[0], times[-1], 2 * substeps * (len(times) - 1) + 1)
-    start = maximal_coordinates(state)
-    run = integrate_collocation(eliminated_system([model], state.x), *start, stages, MOTION_RTOL)
+    run = integrate_batch([(model, state)], stages, MOTION_RTOL)
     y = np.stack([np.concatenate([run.r, run.p], axis=-1), np.concatenate([run.v, run.pdot], axis=-1)], 1)
     return AccurateMotion(model, state, times, substeps, y.swapaxes(-1, -2))
 
@@ -303,15 +295,8 @@ def accurate_runs(
         ArithmeticError: as `integrate_collocation`.
 
     """
-    system = eliminated_system([model for model, _ in cases], np.concatenate([s.x for _, s in cases]))
-    r, p, v, w = (np.concatenate([getattr(s, name) for _, s in cases]) for name in ("r", "p", "v", "omega"))
-    start = r, p, v, quaternion_rate(p, w)
-    run = integrate_collocation(system, *start, times, MOTION_RTOL, project=True, max_steps=max_steps)
-    parts = zip(*(np.split(x, len(cases), axis=1) for x in (run.r, run.p, run.v, run.pdot)), strict=True)
-    return [
-        Trajectory(times, r, p, v, pdot, run.steps, state.x)
-        for (_, state), (r, p, v, pdot) in zip(cases, parts, strict=True)
-    ]
+    run = integrate_batch(cases, times, MOTION_RTOL, project=True, max_steps=max_steps)
+    return trajectories(run, cases)
 
 
 def resolved_motions(
@@ -378,22 +363,17 @@ def perturbed_motions(
 def _simulate_batch(motion: AccurateMotion, cases: Sequence[tuple[Model, State]]) -> list[Trajectory]:
     """Runs of all cases by their deviations from the first, the accurate motion, each on its joints."""
     times, substeps, n = motion.times, motion.substeps, motion.model.n
-    system = eliminated_system([model for model, _ in cases], np.concatenate([s.x for _, s in cases]))
-    r, p, v, pdot = maximal_coordinates(*(state for _, state in cases))
+    system, (r, p, v, pdot) = side_by_side(cases)
 
     def true(stage: int) -> Array:
         return np.tile(motion.y[stage], len(cases))  # (2, 7, M)
 
     delta = np.stack([component_first(r, p), component_first(v, pdot)]) - true(0)
-    winding = system.winding if isinstance(system, TreeSystem) else None
-    x = system.x if isinstance(system, TreeSystem) else None
+    x = system.x
 
     def slope(stages: Iterator[int], delta: Array) -> Array:
         q, rate = true(next(stages)) + delta
-        if isinstance(system, TreeSystem):
-            acceleration = system.acceleration(q, rate, x=x)
-        else:
-            acceleration = system.acceleration(q, rate)
+        acceleration = system.acceleration(q, rate, x=x)
         return np.stack([delta[1], acceleration - np.tile(acceleration[:, :n], len(cases))])
 
     samples, stage = [true(0) + delta], 0
@@ -402,9 +382,9 @@ def _simulate_batch(motion: AccurateMotion, cases: Sequence[tuple[Model, State]]
             visited = iter((stage, stage + 1, stage + 1, stage + 2))
             delta = runge_kutta_4(partial(slope, visited), delta, h / substeps)
             stage += 2
-            if winding:  # full turns of springs' angles go on from step to step
+            if system.winding:  # full turns of springs' angles go on from step to step
                 r, p, v, pdot = (part.T for q in true(stage) + delta for part in (q[:3], q[3:]))
-                x = winding.coordinates(r, p, v, pdot, x)[0]
+                x = system.winding.coordinates(r, p, v, pdot, x)[0]
         y = true(stage) + delta
         samples.append(np.stack(system.project(y[0], y[1])))
     # (cases, 2, T, N, 7)
@@ -450,28 +430,22 @@ def regular_motion(model: Model, state: State, times: Array) -> RegularMotion:
     rank = regular_rank(model, state)
     t, last, value = 0.0, float(times[-1]), smallest_singular_value(model, state, rank)
     longest = stride = float(np.min(np.diff(times)))
-    here, x = maximal_coordinates(state), joint_coordinates(model, state)[2]
+    system, here = side_by_side([(model, state)])
     while t < last * (1 - 1e-12) and value >= MIN_MOTION_SINGULAR_VALUE:
         stride = min(stride, last - t)
         grid = t + stride * np.linspace(0, 1, STRIDE_PARTS + 1)
         try:
-            run = integrate_collocation(
-                eliminated_system([model], x), *here, grid, REGULARITY_RTOL, project=True
-            )
+            run = integrate_collocation(system, *here, grid, REGULARITY_RTOL, project=True)
             poses = zip(run.r[1:], run.p[1:], run.v[1:], run.pdot[1:], strict=True)
-            values = np.array(
-                [
-                    value,
-                    *(smallest_singular_value(model, _sample_state(model, state, *y), rank) for y in poses),
-                ]
-            )
+            found = (smallest_singular_value(model, _sample_state(model, state, *y), rank) for y in poses)
+            values = np.array([value, *found])
             is_safe = bool(np.all(2 * values[1:] - values[:-1] > 0))  # the next value as the last two go on
         except ArithmeticError:
             if stride < SHORTEST_STRIDE * longest and value > 10 * MIN_MOTION_SINGULAR_VALUE:
                 raise
             is_safe = False
         if is_safe:
-            t, value, x = float(grid[-1]), float(values[-1]), run.x[-1]
+            t, value, system = float(grid[-1]), float(values[-1]), eliminated_system([model], run.x[-1])
             here, stride = (run.r[-1], run.p[-1], run.v[-1], run.pdot[-1]), min(2 * stride, longest)
         elif stride < SHORTEST_STRIDE * longest:
             return RegularMotion(t, True, value)

@@ -25,6 +25,7 @@ import numpy as np
 from scipy.linalg import lapack
 
 from reference_impl.direct import EPS, Solution, check_state_solvable, joint_forces
+from reference_impl.elements import Elements
 from reference_impl.euler_parameters import G, L, tilde
 from reference_impl.joints import constraint_rows
 from reference_impl.mechanism import Array, Float, Mechanism, side_by_side
@@ -90,7 +91,9 @@ class StructuredSystem:
     what they call take the component-first q = (r; p), v = (ṙ; ṗ), (7, M) each.
     """
 
-    winding = None  # there are no springs
+    # as of `TreeSystem`: there are no springs on angles
+    x: Array | None = None
+    winding: Elements | None = None
 
     def __init__(self, chains: Sequence[Mechanism]) -> None:
         self.chains = tuple(chains)
@@ -358,7 +361,11 @@ class StructuredSystem:
         return self.body_count
 
     def acceleration(
-        self, q: Float[Array, "7 bodies"], v: Float[Array, "7 bodies"], baumgarte: float = 0.0
+        self,
+        q: Float[Array, "7 bodies"],
+        v: Float[Array, "7 bodies"],
+        baumgarte: float = 0.0,
+        x: Array | None = None,
     ) -> Float[Array, "7 bodies"]:
         """Return the accelerations, on or off the constraints.
 

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.polynomial.legendre import leggauss, legvander
 
 from reference_impl.fast.chain_elimination import component_first
-from reference_impl.fast.tree_elimination import EliminatedSystem, TreeSystem, eliminated_system
+from reference_impl.fast.tree_elimination import EliminatedSystem, eliminated_system
 from reference_impl.integrate import IntegrationResult, state_scales
 from reference_impl.mechanism import Array, Float, Mechanism
 
@@ -243,7 +243,7 @@ class _Stepper:
         self.dense, self.baumgarte = dense, baumgarte
         # joint coordinates near which the angles of springs are taken, carried on by their rates
         self.x = np.zeros((forest.joint_count, 2))
-        if isinstance(forest, TreeSystem) and forest.winding:
+        if forest.winding:
             self.x = forest.winding.coordinates(q[:3].T, q[3:].T, v[:3].T, v[3:].T, forest.x)[0]
         self.x_rate = np.zeros((len(table.c), *self.x.shape))
         self.q_compensation, self.v_compensation = (
@@ -318,7 +318,7 @@ class _Stepper:
     def _accelerations(self, Q: Array, V: Array, hA: Array) -> Array:
         """The accelerations (7, S, M) at all nodes."""
         new = np.empty_like(Q)
-        if isinstance(self.forest, TreeSystem) and self.forest.winding:
+        if self.forest.winding:
             self._carry_angles(Q, V, hA)
         for nodes, tile in self.tiles:
             part = tile.acceleration(Q[:, nodes].reshape(7, -1), V[:, nodes].reshape(7, -1), self.baumgarte)
@@ -327,15 +327,14 @@ class _Stepper:
 
     def _carry_angles(self, Q: Array, V: Array, hA: Array) -> None:
         """Set the coordinates near which springs take their angles at the nodes: x₀ + h A ẋ."""
-        systems = [(nodes, tile) for nodes, tile in self.tiles if isinstance(tile, TreeSystem)]
-        for nodes, tile in systems:
+        for nodes, tile in self.tiles:
             (r, p), (v, pdot) = (
                 (y[:3].reshape(3, -1).T, y[3:].reshape(4, -1).T) for y in (Q[:, nodes], V[:, nodes])
             )
             if tile.winding:
                 rate = tile.winding.rates(r, p, v, pdot)
                 self.x_rate[nodes] = rate.reshape(-1, *self.x.shape)
-        for nodes, tile in systems:
+        for nodes, tile in self.tiles:
             tile.x = (self.x + np.tensordot(hA[nodes], self.x_rate, 1)).reshape(-1, self.x.shape[1])
 
     def _extrapolated_acceleration(self, ratio: float) -> Array:

@@ -15,9 +15,9 @@ def symbolic_chain(rods):
     """A chain of symbols (lengths 2, 3 where there are rods), its symbols and its rows."""
     n = len(rods)
     x = Symbols(bodies=n, attachments=2 * n)
-    none = np.zeros(n)
+    names = "mass", "inertia", "gravity", "force", "moment", "drag_force", "drag_moment"
     length = np.where(rods, np.arange(2, 2 + n), 0)
-    chain = Mechanism.chain(none, none, x.s[:n], x.s[n:], length, none, none, none, none, none)
+    chain = Mechanism.chain(x.s[:n], x.s[n:], length, **dict.fromkeys(names, np.zeros(n)))
     return x, chain, constraint_rows(chain, x.r, x.p, x.v, x.pdot)
 
 

@@ -11,7 +11,7 @@ azimuth.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 from plumbline.model.datatypes import Array, Model, State
 from plumbline.truth.closed_form.linear_and_steady_motions import (
@@ -28,10 +28,10 @@ from plumbline.truth.closed_form.tops_and_pendulums import (
     spherical_pendulum,
 )
 
-__all__ = [
-    "CLOSED_FORMS", "ClosedFormMismatch", "ClosedFormMotion", "ClosedFormScenario", "closed_form_motion",
-    "exact_samples",
-]  # fmt: skip
+if TYPE_CHECKING:
+    from plumbline.scenario.loader import Scenario
+
+__all__ = ["CLOSED_FORMS", "ClosedFormMismatch", "ClosedFormMotion", "closed_form_motion", "exact_samples"]
 
 CLOSED_FORMS: dict[str, Callable[[Model, State], ClosedFormMotion]] = {
     "planar-pendulum": planar_pendulum,
@@ -47,23 +47,7 @@ CLOSED_FORMS: dict[str, Callable[[Model, State], ClosedFormMotion]] = {
 }
 
 
-class ClosedFormScenario(Protocol):
-    """The part of a scenario that `closed_form_motion` reads."""
-
-    @property
-    def closed_form(self) -> str | None:
-        """Key of `CLOSED_FORMS`, or None where the scenario has no closed form."""
-
-    @property
-    def model(self) -> Model:
-        """Mechanism of the scenario."""
-
-    @property
-    def state(self) -> State:
-        """Initial state."""
-
-
-def closed_form_motion(scenario: ClosedFormScenario) -> ClosedFormMotion | None:
+def closed_form_motion(scenario: Scenario) -> ClosedFormMotion | None:
     """Return the closed-form motion that a scenario names.
 
     Args:
@@ -81,7 +65,7 @@ def closed_form_motion(scenario: ClosedFormScenario) -> ClosedFormMotion | None:
     return CLOSED_FORMS[scenario.closed_form](scenario.model, scenario.state)
 
 
-def exact_samples(scenario: ClosedFormScenario, times: Array) -> tuple[Array, Array, str] | None:
+def exact_samples(scenario: Scenario, times: Array) -> tuple[Array, Array, str] | None:
     """Sample the closed form that a scenario names, unless it is asymptotic.
 
     Args:
