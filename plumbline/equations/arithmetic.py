@@ -10,16 +10,17 @@ differences and products with scalars are the operators + − * of the matrices;
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Protocol, cast
+from typing import Any
 
 import numpy as np
 
 from plumbline.model.datatypes import Array
+from plumbline.model.kinematics import cross_matrix
 
 _NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])  # of each axis the next and the one after
 
 
-class Arithmetic(Protocol):
+class Arithmetic:
     """Operations on matrices of one kind of numbers."""
 
     scalar: Callable[[Any], Any]  # of doubles (...,)
@@ -37,26 +38,19 @@ class Arithmetic(Protocol):
     cross: Callable[[Any, Any], Any]  # a × b
     cross_matrix: Callable[[Any], Any]  # ã: ã b = a × b
     inverse: Callable[[Any], Any]  # of a symmetric 3×3 matrix
-    inverse_parts: Callable[[Any], tuple[Any, Any]]  # a matrix X and a scalar d with X/d the inverse
     sqrt: Callable[[Any], Any]  # of a scalar that is not negative, but for rounding
     sin_cos: Callable[[Any], tuple[Any, Any]]  # of a scalar
     turn_over_sine: Callable[[Any, Any], Any]  # θ/sin θ by sin θ and cos θ, 0 ≤ θ < π
 
-
-def floats(dtype: Any = np.float64) -> Arithmetic:
-    """Take NumPy's floating-point numbers, in batches.
-
-    Returns:
-        Operations on arrays (..., rows, columns); scalars are (..., 1, 1).
-
-    """
-    return cast(Arithmetic, _Floats(dtype))
+    def inverse_parts(self, a: Any) -> tuple[Any, Any]:
+        """Return a matrix X and a scalar d with X/d the inverse."""
+        return self.inverse(a), self.scalar(1.0)
 
 
-class _Floats:
-    """As `floats`."""
+class _Floats(Arithmetic):
+    """NumPy's floating-point numbers, in batches: arrays (..., rows, columns); scalars are (..., 1, 1)."""
 
-    def __init__(self, dtype: Any) -> None:
+    def __init__(self, dtype: Any = np.float64) -> None:
         self.dtype = dtype
 
     def scalar(self, x: Any) -> Any:
@@ -108,18 +102,12 @@ class _Floats:
         return a.take(_NEXT, -2) * b.take(_LAST, -2) - a.take(_LAST, -2) * b.take(_NEXT, -2)
 
     def cross_matrix(self, a: Any) -> Any:
-        out = np.zeros((*a.shape[:-1], 3), self.dtype)
-        for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-            out[..., k, j], out[..., j, k] = a[..., i, 0], -a[..., i, 0]
-        return out
+        return cross_matrix(a[..., 0])
 
     def inverse(self, a: Any) -> Any:
         cofactors = self.cross(a.take(_NEXT, -1), a.take(_LAST, -1))
         with np.errstate(divide="ignore", invalid="ignore"):
             return self.symmetric(cofactors / self.dot(a[..., :1], cofactors[..., :1]))
-
-    def inverse_parts(self, a: Any) -> tuple[Any, Any]:
-        return self.inverse(a), self.scalar(1.0)
 
     def sqrt(self, x: Any) -> Any:
         return np.sqrt(x)
@@ -132,26 +120,22 @@ class _Floats:
         return np.where(sine > 0, theta / np.where(sine > 0, sine, 1), 1)
 
 
-def objects(functions: Any, number: Callable[[Any], Any] = lambda x: x) -> Arithmetic:
-    """Take objects that can be added and multiplied.
+floats = _Floats
+
+
+class _Objects(Arithmetic):
+    """Objects that can be added and multiplied, in arrays (rows, columns); scalars are the objects.
 
     Expressions that are 0 have to be Python's 0.0, which costs nothing: heyoka does not simplify a − a.
-
-    Args:
-        functions: a module with ``sqrt``, ``sin``, ``cos`` and, of numbers, ``atan2`` and ``sinc``.
-        number: what makes an object of a double.
-
-    Returns:
-        Operations on arrays of objects (rows, columns); scalars are the objects.
-
     """
-    return cast(Arithmetic, _Objects(functions, number))
 
+    def __init__(self, functions: Any, number: Callable[[Any], Any] = lambda x: x) -> None:
+        """Take a module with ``sqrt``, ``sin``, ``cos`` and, of numbers, ``atan2`` and ``sinc``.
 
-class _Objects:
-    """As `objects`."""
+        Args:
+            number: what makes an object of a double.
 
-    def __init__(self, functions: Any, number: Callable[[Any], Any]) -> None:
+        """
         self.functions, self.number, self.sqrt = functions, number, functions.sqrt
 
     def scalar(self, x: Any) -> Any:
@@ -215,18 +199,11 @@ class _Objects:
         return 1 / self.functions.sinc(self.functions.atan2(sine, cosine))
 
 
-def balls(flint: Any) -> Arithmetic:
-    """Take balls at the working precision of ``flint.ctx``.
-
-    Returns:
-        Operations on ``arb_mat``; scalars are ``arb``.
-
-    """
-    return cast(Arithmetic, _Balls(flint))
+objects = _Objects
 
 
-class _Balls:
-    """As `balls`."""
+class _Balls(Arithmetic):
+    """Balls of python-flint at the working precision of ``flint.ctx``: ``arb_mat``; scalars are ``arb``."""
 
     def __init__(self, flint: Any) -> None:
         self.mat, self.arb = flint.arb_mat, flint.arb
@@ -289,9 +266,6 @@ class _Balls:
     def inverse(self, a: Any) -> Any:
         return a.inv()
 
-    def inverse_parts(self, a: Any) -> tuple[Any, Any]:
-        return a.inv(), self.arb(1)
-
     def sqrt(self, x: Any) -> Any:
         return x.nonnegative_part().sqrt()
 
@@ -301,6 +275,9 @@ class _Balls:
 
     def turn_over_sine(self, sine: Any, cosine: Any) -> Any:
         return 1 / self.arb.atan2(sine, cosine).sinc()
+
+
+balls = _Balls
 
 
 def entries(v: Any) -> list[Any]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -76,16 +76,6 @@ def with_slopes(model: Model, states: State, derivatives: Sequence[Mapping[str, 
     return replace(model, **fields(model)), State(**(every | fields(states)))
 
 
-def jets() -> Arithmetic:
-    """Take values in doubles with first derivatives.
-
-    Returns:
-        Operations on `Jet`; the derivative of a norm is given as 0 where the norm is 0.
-
-    """
-    return cast(Arithmetic, _Jets())
-
-
 def bilinear(product: Callable[[Any, Any], Any], a: Jet, b: Jet) -> Jet:
     """Apply a product of two factors."""
     left = None if a.slope is None else product(a.slope, b.value)
@@ -97,8 +87,8 @@ def _sum(a: Any, b: Any) -> Any:
     return b if a is None else a if b is None else a + b
 
 
-class _Jets:
-    """As `jets`."""
+class _Jets(Arithmetic):
+    """Values in doubles with first derivatives."""
 
     def __init__(self) -> None:
         self.num = floats()
@@ -166,9 +156,6 @@ class _Jets:
         x = self.num.inverse(a.value)
         return Jet(x, None if a.slope is None else self.num.symmetric(-(x @ a.slope @ x)))
 
-    def inverse_parts(self, a: Jet) -> tuple[Jet, Jet]:
-        return self.inverse(a), self.scalar(1.0)
-
     def sqrt(self, x: Jet) -> Jet:
         root = self.num.sqrt(x.value)
         if x.slope is None:
@@ -190,3 +177,6 @@ class _Jets:
         left = None if sine.slope is None else by_sine * sine.slope
         right = None if cosine.slope is None else -cosine.slope / squared
         return Jet(ratio, _sum(left, right))
+
+
+jets = _Jets

@@ -138,9 +138,9 @@ def _row(
 ) -> Row:  # fmt: skip
     """The row of one quantity: its worst ratio decides, unless most bounds are too loose."""
     error, bound, ratios, looseness = found.errors, found.bounds, found.ratios, found.looseness
-    at = np.unravel_index(np.argmax(ratios), ratios.shape)
-    worst = found.places[at[0]]
-    place = f"body {at[1] + 1}, {worst}"
+    row, body = at = tuple(int(x) for x in np.unravel_index(np.argmax(ratios), ratios.shape))
+    worst = found.places[row]
+    place = f"body {body + 1}, {worst}"
     ratio, is_sharp = float(ratios[at]), looseness <= MAX_STEP_BOUND
     name, unit = about[0].replace("_", " "), about[1]
     if ratio > 1:

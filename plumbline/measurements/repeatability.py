@@ -17,10 +17,10 @@ from plumbline.engines.metamorphic_hooks import MetamorphicHooks
 from plumbline.measurements.relation_result import REPEATABILITY, RelationResult
 from plumbline.measurements.run_relations import (
     RUN_STEPS,
-    STEP_DIVISORS,
-    STEPS_PER_RADIAN,
-    fastest_rate,
     refused_result,
+    run_or_refusal,
+    short_steps,
+    with_shorter_steps,
 )
 from plumbline.measurements.state_relations import LONG_CHAIN_BODIES, MAX_STATES, evaluate_or_refusal
 from plumbline.model.datatypes import (
@@ -54,14 +54,11 @@ def check_repeatability(
     """
     count = MAX_STATES if model.n <= LONG_CHAIN_BODIES else MAX_STATES // 2
     yield _check_states(engine, model, states[:count])
-    step = 2.0 ** float(np.floor(-np.log2(STEPS_PER_RADIAN * fastest_rate(model, states[0]))))
-    for integrator in (one for one in engine.integrators if one.has_motions):
-        for divisor in STEP_DIVISORS:
-            result = _check_run(engine, integrator, model, states[0], step / divisor)
-            if result is None or result.ratio is not None or integrator.kind == "tolerance":
-                break
-        if result is not None:
-            yield result
+    yield from with_shorter_steps(
+        engine,
+        short_steps(model, states[0]),
+        lambda integrator, step: _check_run(engine, integrator, model, states[0], step),
+    )
 
 
 def _check_states(engine: MetamorphicHooks, model: Model, states: Sequence[State]) -> RelationResult:
@@ -97,16 +94,13 @@ def _check_states(engine: MetamorphicHooks, model: Model, states: Sequence[State
 
 def _check_run(
     engine: MetamorphicHooks, integrator: Integrator, model: Model, state: State, step: float
-) -> RelationResult | None:
-    """Compare a short run with the same run after another one; None where the engine refuses it each time."""
+) -> Iterator[RelationResult]:
+    """Compare a short run with the same run after another one; nothing where the engine refuses both."""
     resolution = step if integrator.kind == "step" else integrator.min_rtol
     times = np.array([0.0, RUN_STEPS // 2 * step, RUN_STEPS * step])
 
     def simulate(of: Model, start: State) -> Trajectory | Unsupported | EngineFailure:
-        try:
-            return engine.simulate(of, start, times, integrator.name, resolution)
-        except (Unsupported, EngineFailure) as refusal:
-            return refusal
+        return run_or_refusal(engine, of, start, times, integrator.name, resolution)
 
     def run_result(size: float, where: str, reason: str = "") -> RelationResult:
         return RelationResult(
@@ -119,15 +113,12 @@ def _check_run(
     again = simulate(model, state)
     if isinstance(first, Trajectory) and isinstance(again, Trajectory):
         size, name = _largest_difference(first, again)
-        where = f"{name} of a run, asked after another run" if name else ""
-        return run_result(size, where)
-    if isinstance(first, Unsupported) and isinstance(again, Unsupported):
-        return None
-    if isinstance(first, EngineFailure) and isinstance(again, EngineFailure):
-        return refused_result(REPEATABILITY, integrator, again)
-    refusal = first if not isinstance(first, Trajectory) else again
-    reason = f"one of two equal runs was refused or failed: {refusal}"
-    return run_result(np.inf, "", reason)
+        yield run_result(size, f"{name} of a run, asked after another run" if name else "")
+    elif isinstance(first, EngineFailure) and isinstance(again, EngineFailure):
+        yield refused_result(REPEATABILITY, integrator, again)
+    elif not (isinstance(first, Unsupported) and isinstance(again, Unsupported)):
+        refusal = first if not isinstance(first, Trajectory) else again
+        yield run_result(np.inf, "", f"one of two equal runs was refused or failed: {refusal}")
 
 
 def _other_question(model: Model, state: State) -> tuple[Model, State]:

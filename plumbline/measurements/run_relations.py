@@ -9,14 +9,14 @@ perturbations of the motion grow.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 
 from plumbline.engines.adapter import Adapter
 from plumbline.engines.metamorphic_hooks import MetamorphicHooks
 from plumbline.measurements.relation_result import OPTION_PREFIX, Refusal, RelationResult
-from plumbline.model.datatypes import EngineFailure, Integrator, Model, State, Trajectory, Unsupported
+from plumbline.model.datatypes import Array, EngineFailure, Integrator, Model, State, Trajectory, Unsupported
 from plumbline.model.invariants import attitude_error, position_error
 from plumbline.model.kinematics import angular_velocity, stretched_length
 from plumbline.processes.exceptions import describe_exception
@@ -66,12 +66,31 @@ def check_run_relations(
         if reason := engine.unmoved_options.get(option):
             words = f"not compared: {reason}"
             yield RelationResult(f"motions by {option}", None, "", 0, 0, words, "not compared")
-    step = _first_step(model, state)
+    grown = dict(zip(short_steps(model, state), growth, strict=True))
+    yield from with_shorter_steps(
+        engine,
+        grown,
+        lambda integrator, step: check_integrator_relations(
+            engine, integrator, model, state, step, grown[step]
+        ),
+    )
+
+
+def short_steps(model: Model, state: State) -> list[float]:
+    """Return the steps [s] that are tried one after the other."""
+    return [_first_step(model, state) / divisor for divisor in STEP_DIVISORS]
+
+
+def with_shorter_steps(
+    engine: MetamorphicHooks,
+    steps: Iterable[float],
+    check: Callable[[Integrator, float], Iterator[RelationResult]],
+) -> Iterator[RelationResult]:
+    """Check short runs of every integrator; where an implicit one fails, with the next step."""
     for integrator in (one for one in engine.integrators if one.has_motions):
         results: list[RelationResult] = []
-        for divisor, grown in zip(STEP_DIVISORS, growth, strict=True):
-            shorter = step / divisor
-            results = list(check_integrator_relations(engine, integrator, model, state, shorter, grown))
+        for step in steps:
+            results = [*check(integrator, step)]
             if integrator.kind == "tolerance" or all(r.refusal != "failed" for r in results):
                 break
         yield from results
@@ -159,17 +178,12 @@ def _check_options(
     """Compare the same run with each of the engine's options."""
     end = RUN_STEPS * step
 
-    def simulate(adapter: Adapter) -> Trajectory | Unsupported | EngineFailure:
-        try:
-            return adapter.simulate(model, state, np.array([0.0, end]), integrator.name, step)
-        except (Unsupported, EngineFailure) as refusal:
-            return refusal
-
-    usual = simulate(engine)
+    question = model, state, np.array([0.0, end]), integrator.name, step
+    usual = run_or_refusal(engine, *question)
     limit = 2 * run_tolerance(integrator, model, state, end, RUN_STEPS, growth)
     driven = _loop_acceleration(model, state) * end
     for option in options:
-        name, other = OPTION_PREFIX + option, simulate(engine.with_option(option))
+        name, other = OPTION_PREFIX + option, run_or_refusal(engine.with_option(option), *question)
         if not isinstance(usual, Trajectory):
             yield refused_result(name, integrator, usual)
         elif not isinstance(other, Trajectory):
@@ -178,6 +192,16 @@ def _check_options(
             ends = state_at_sample(usual, -1), state_at_sample(other, -1)
             differences = relative_differences(model, *ends, driven)
             yield worst_difference_result(name, integrator, differences, limit, RUN_STEPS, step, end)
+
+
+def run_or_refusal(
+    engine: Adapter, model: Model, state: State, times: Array, integrator: str, resolution: float
+) -> Trajectory | Unsupported | EngineFailure:
+    """Simulate a run, or return the exception with which the engine refused it or failed."""
+    try:
+        return engine.simulate(model, state, times, integrator, resolution)
+    except (Unsupported, EngineFailure) as refusal:
+        return refusal
 
 
 def refused_result(name: str, integrator: Integrator, refusal: Unsupported | EngineFailure) -> RelationResult:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from plumbline.model.datatypes import Array, Float, JointKind, Model, State
+from plumbline.model.datatypes import Array, Bool, Flags, Float, JointKind, Model, State
 
 _NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])  # of each axis the next and the one after
 
@@ -680,6 +680,15 @@ def _coordinates(motions: tuple[tuple[str, int], ...], shift: Array, relative: A
         angles.append(np.arctan2(relative[..., row, column], relative[..., *over]))
     found = iter(angles)
     return [shift[..., axis] if what == "slide" else next(found) for what, axis in motions]
+
+
+def bodies_beyond(model: Model) -> Bool[Flags, "bodies bodies"]:
+    """Return [k, b]: whether body b is k or beyond it."""
+    found = np.eye(model.n, dtype=bool)
+    for k, far in reversed([*enumerate(model.body[: model.n, 0])]):
+        if far >= 0:
+            found[far] |= found[k]
+    return found
 
 
 def stretched_length(model: Model) -> Float[Array, "bodies"]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import pyarrow as pa
 
@@ -67,18 +68,36 @@ def measure_coverage(
         for first in range(0, len(list_parameters(s.model, s.state)), PARAMETERS_PER_TASK):
             part = slice(first, first + PARAMETERS_PER_TASK)
             tasks.append(Task((s.name, first), scenario_coverage, (*arguments, part), executor.limits))
-    found: dict[tuple[str, int], list[CoverageEntry]] = {}
+    found = run_all(executor, tasks, "coverage", progress, cpu_times)
+    order = {s.name: k for k, s in enumerate(scenarios)}
+    entries: list[CoverageEntry] = [
+        entry for key in sorted(found, key=lambda key: key[1]) for entry in found[key]
+    ]
+    return sorted(entries, key=lambda entry: (order[entry.scenario], COVERED_LEVELS.index(entry.level)))
+
+
+def run_all(
+    executor: Executor,
+    tasks: Sequence[Task],
+    what: str,
+    progress: Callable[[int, int, str], None],
+    cpu_times: CpuTimes | None,
+) -> dict[Any, Any]:
+    """Run tasks, whose keys begin with a scenario's name: values by key.
+
+    Raises:
+        CoverageFailure: a call failed.
+
+    """
+    found: dict[Any, Any] = {}
     for outcome in executor.run(tasks):
-        name, _ = outcome.key
         if cpu_times is not None:
             cpu_times.add_outcome(outcome, "judging")
         if outcome.failure:
-            raise CoverageFailure(f"no coverage of {name}: {outcome.failure}")
+            raise CoverageFailure(f"no {what} of {outcome.key[0]}: {outcome.failure}")
         found[outcome.key] = outcome.value
-        progress(len(found), len(tasks), name)
-    order = {s.name: k for k, s in enumerate(scenarios)}
-    entries = [entry for key in sorted(found, key=lambda key: key[1]) for entry in found[key]]
-    return sorted(entries, key=lambda entry: (order[entry.scenario], COVERED_LEVELS.index(entry.level)))
+        progress(len(found), len(tasks), outcome.key[0])
+    return found
 
 
 def coverage_table(entries: Iterable[CoverageEntry]) -> pa.Table:

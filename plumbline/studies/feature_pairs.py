@@ -22,7 +22,7 @@ from plumbline.processes.worker_pool import Executor, Task
 from plumbline.scenario.line_and_column_errors import ScenarioError
 from plumbline.scenario.loader import Scenario, scenario_from_dict
 from plumbline.scenario.mechanism_document import mechanism_document
-from plumbline.studies.coverage_study import CoverageFailure
+from plumbline.studies.coverage_study import run_all
 from plumbline.truth.parameter_effects import evaluate_models, evaluate_to_first_order
 from plumbline.truth.rounding_bound import state_rounding_bound
 
@@ -128,22 +128,15 @@ def measure_features(
     """
     tasks = [
         Task(
-            s.name,
+            (s.name,),
             shown_features,
             (s.model, compared_states(s.model, s.state, s.seed, STATES)),
             executor.limits,
         )
         for s in sorted(scenarios, key=lambda s: -s.model.n)
     ]
-    found: dict[str, list[Feature]] = {}
-    for outcome in executor.run(tasks):
-        if cpu_times is not None:
-            cpu_times.add_outcome(outcome, "judging")
-        if outcome.failure:
-            raise CoverageFailure(f"no features of {outcome.key}: {outcome.failure}")
-        found[outcome.key] = outcome.value
-        progress(len(found), len(tasks), outcome.key)
-    return found
+    found = run_all(executor, tasks, "features", progress, cpu_times)
+    return {name: shown for (name,), shown in found.items()}
 
 
 def count_triples(

@@ -42,5 +42,6 @@ def trajectories(run: BatchIntegrationResult, cases: Cases) -> list[Trajectory]:
     ends = np.cumsum([model.n for model, _ in cases])[:-1]
     parts = zip(*(np.split(y, ends, axis=1) for y in (run.r, run.p, run.v, run.pdot)), strict=True)
     return [
-        Trajectory(run.t, *part, run.steps, state.x) for (_, state), part in zip(cases, parts, strict=True)
+        Trajectory(run.t, r, p, v, pdot, run.steps, state.x)
+        for (_, state), (r, p, v, pdot) in zip(cases, parts, strict=True)
     ]

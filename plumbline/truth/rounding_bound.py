@@ -42,6 +42,7 @@ from plumbline.equations.responses import Responses
 from plumbline.model.datatypes import JOINT_ELEMENTS, ZERO_INERTIA, Array, Model, State
 from plumbline.model.kinematics import (
     ball_spring_rest,
+    bodies_beyond,
     cross,
     cross_matrix,
     joint_vectors,
@@ -288,10 +289,7 @@ class _Terms:
         state = found.state
         self.far = model.body[:, 0]
         self.children = self.far == np.arange(model.n)[:, None]  # [k, b]: body b is next beyond k
-        self.below = np.eye(model.n, dtype=bool)  # body b is k or beyond it
-        for k in reversed(range(model.n)):
-            if self.far[k] >= 0:
-                self.below[self.far[k]] |= self.below[k]
+        self.below = bodies_beyond(model)
         self.d = joint_vectors(model, state.r, state.p)
         self.springs = spring_terms(model, state)
         self.elements = joint_elements(model, state, norm(found.velocity_terms(), axis=-1))

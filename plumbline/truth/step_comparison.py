@@ -32,6 +32,7 @@ from plumbline.equations.tree import Tree
 from plumbline.model.datatypes import KINDS, Array, Model, State, StepRun, Trajectory
 from plumbline.model.kinematics import (
     angular_velocity,
+    bodies_beyond,
     complete_state,
     stack_states,
     stretched_length,
@@ -128,7 +129,7 @@ class StepDeviations:
     effects: Array  # (steps, K) of the accelerations on the quantity; 0 where they have none
     # (steps,) why a step has no bound, by the condition of the motion alone; empty where all have one
     left_out: NDArray[np.str_] = field(default_factory=lambda: np.array([], str))
-    places: Sequence[Place] = ()  # of each, where they are not those of a run
+    places: Sequence[Place] = field(default=(), kw_only=True)  # of each, where it is not one of a run
 
     @property
     def ratios(self) -> Array:
@@ -365,7 +366,7 @@ def step_bound(
     rate, speed, turning, acceleration = (
         sizes[name] for name in ("rate", "speed", "angular_acceleration", "acceleration")
     )
-    kinds, path = model.kind[: model.n], _paths(model.body[: model.n, 0])  # of the joints of the tree
+    kinds, path = model.kind[: model.n], _paths(model)  # of the joints of the tree
     # an angle of x rad is rounded to ε |x|
     turned = ANGLE_ROUNDINGS * EPS * (sizes.get("turned", np.zeros(model.n)) @ path.T)
     W, V = (np.max(np.where(path, x[..., None, :], 0.0), -1) for x in (rate, speed))
@@ -398,7 +399,7 @@ def step_bound(
 
 def _arms(model: Model, sizes: dict[str, Array]) -> Array:
     """Lengths (..., N) [m] from the world to each body."""
-    path, slides = _paths(model.body[: model.n, 0]), [kind.is_unbounded for kind in model.kinds[: model.n]]
+    path, slides = _paths(model), [kind.is_unbounded for kind in model.kinds[: model.n]]
     place = np.max(np.where(path, sizes["place"][..., None, :], 0.0), -1)
     return np.asarray(path @ stretched_length(model) + place * any(slides))
 
@@ -412,7 +413,7 @@ def _passed_on(
     reaches those beyond it once they have turned against it.
     """
     far = model.body[: model.n, 0]
-    path, slides = _paths(far), np.array([kind.is_unbounded for kind in model.kinds[: model.n]])
+    path, slides = _paths(model), np.array([kind.is_unbounded for kind in model.kinds[: model.n]])
     W, torque = np.max(np.where(path, sizes["rate"][..., None, :], 0.0), -1), sizes["rod_torque"]
     above, shifted = (
         np.where(far >= 0, x[..., far], 0.0)
@@ -443,7 +444,7 @@ def _sample_bound(method: JointSpaceMethod, model: Model, sizes: dict[str, Array
 
     """
     bound = step_bound(method, model, sizes, 0.0, 0)
-    far, path = model.body[: model.n, 0], _paths(model.body[: model.n, 0])
+    far, path = model.body[: model.n, 0], _paths(model)
     relative = sizes["rate"] + np.where(far >= 0, sizes["rate"][..., far], 0.0)
     turned = (bound["step_attitude"] * relative) @ path.T
     lever = bound["step_position"] / np.maximum(bound["step_attitude"], TINY)
@@ -486,12 +487,9 @@ def _spread(values: Array, some: NDArray[np.intp]) -> Array:
     return np.maximum(values[at], values[np.maximum(at - 1, 0)])
 
 
-def _paths(far: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """[k, b] whether body b is k or between k and the world, from each body's far body."""
-    path = np.eye(len(far), dtype=bool)
-    for k, above in enumerate(far):
-        path[k] |= path[above] & (above >= 0)
-    return path
+def _paths(model: Model) -> NDArray[np.bool_]:
+    """[k, b] whether body b is k or between k and the world."""
+    return np.ascontiguousarray(bodies_beyond(model).T)
 
 
 def _disturbed(model: Model, state: State, bound: RoundingBound) -> State:

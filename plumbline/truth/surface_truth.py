@@ -19,6 +19,7 @@ import numpy as np
 
 from plumbline.model.datatypes import Array, Float, Model, State, StateQuantities
 from plumbline.model.kinematics import (
+    bodies_beyond,
     cross,
     minimal_rates,
     rotate_vectors,
@@ -120,11 +121,7 @@ class Motion:
         self.point_velocity = self.v.plus(self.w.cross(self.arm))
         self.swing = swing = self.alpha.cross(self.arm).plus(self.w.cross(self.w.cross(self.arm)))
         self.point_acceleration = self.a.plus(swing)
-        far, n = model.tree.body[:, 0], model.n
-        self.below = np.eye(n)  # [k, b]: body b is k or beyond it
-        for k in reversed(range(n)):
-            if far[k] >= 0:
-                self.below[far[k]] = np.maximum(self.below[far[k]], self.below[k])
+        self.below = bodies_beyond(model).astype(float)
 
     def local(self, vectors: Rounded) -> Rounded:
         """Vectors in the axes of the probe frames."""
