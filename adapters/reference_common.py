@@ -24,6 +24,7 @@ from plumbline.model.datatypes import (
     Trajectory,
 )
 from plumbline.model.kinematics import velocity_jacobian
+from reference_impl.arrays import Motion
 from reference_impl.euler_parameters import A, L, euler_parameter_rate
 from reference_impl.integrate import IntegrationResult
 
@@ -56,11 +57,7 @@ class NotesAdapter(MetamorphicHooks):
             raise EngineFailure(f"{self.title}: {error}") from error
 
 
-Vectors = Float[Array, "... bodies 3"]
-Quaternions = Float[Array, "... bodies 4"]
-
-
-def notes_state(state: State) -> tuple[Vectors, Quaternions, Vectors, Quaternions]:
+def notes_state(state: State) -> Motion:
     """Convert a state to the notes' variables.
 
     Returns:

@@ -52,7 +52,7 @@ class Reference(NotesAdapter):
         S, _ = system.assemble(*at)
         joint_x = joint_coordinates(system.chain, state)[2]
         x = solve(*at, x=joint_x) if elements else solve(*at)
-        energy = elements.evaluate(*at, joint_x).potential if elements else 0.0
+        energy = elements.evaluate(*at, x=joint_x).potential if elements else 0.0
         solved = x.acceleration, x.pddot, x.joint_reaction, S, x.joint_moment, system.rotor_count
         return state_quantities(system.chain, state, *solved, spring_energy=energy)
 

@@ -88,7 +88,7 @@ def true_slider_height(scenario: Scenario, times: Array) -> Array:
         (T, 1) [m].
 
     """
-    run = simulate_taylor(scenario.model, scenario.state, times, "extended")
+    run, _ = simulate_taylor(scenario.model, scenario.state, times, "extended")
     return np.asarray(run.r[:, 3, 2:], dtype=float)
 
 
@@ -102,7 +102,7 @@ def true_rod_end(scenario: Scenario, times: Array) -> Array:
         (T, 3) [m].
 
     """
-    run = simulate_taylor(scenario.model, scenario.state, times, "extended")
+    run, _ = simulate_taylor(scenario.model, scenario.state, times, "extended")
     turn = rotation_matrix(np.asarray(run.p[:, 2], dtype=float))
     return np.asarray(np.asarray(run.r[:, 2], dtype=float) - np.matvec(turn, scenario.model.proximal[2]))
 

@@ -30,3 +30,11 @@ else:
             return item[0]
 
     Bool = Float = Int = Shaped
+
+# r [m] and ṙ [m/s] in the world frame, p and ṗ [1/s], as r, p, ṙ, ṗ
+Motion = tuple[
+    Shaped[AnyArray, "bodies 3"],
+    Shaped[AnyArray, "bodies 4"],
+    Shaped[AnyArray, "bodies 3"],
+    Shaped[AnyArray, "bodies 4"],
+]

@@ -17,6 +17,7 @@ from scipy.linalg import lapack, qr
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
+from reference_impl.arrays import Motion
 from reference_impl.elements import ElementForces, Elements
 from reference_impl.euler_parameters import A, L, angular_velocity, dot
 from reference_impl.joints import ConstraintRows, constraint_rows, joint_of_rows, of_far_body
@@ -105,42 +106,32 @@ class DirectSystem:
 
     def assemble(
         self,
-        r: Float[Array, "bodies 3"],
-        p: Float[Array, "bodies 4"],
-        v: Float[Array, "bodies 3"],
-        pdot: Float[Array, "bodies 4"],
+        *motion: *Motion,
         x: Float[Array, "joints coordinates"] | None = None,
     ) -> tuple[Float[Array, "unknowns unknowns"], Float[Array, "unknowns"]]:
         """Assemble S and b of (N5), on or off the constraints.
 
         Args:
-            r: positions [m], world frame.
-            v: velocities ṙ [m/s], world frame.
-            pdot: rates ṗ [1/s].
+            motion: r, p, ṙ and ṗ.
             x: as for `solve`.
 
         Returns:
             S (m, m) and b (m,), m = 8 N + c, for x = (r̈, p̈, λ, λ_E).
 
         """
-        values, b, *_ = self._entries(r, p, v, pdot, x)
+        values, b, *_ = self._entries(motion, x)
         return self._dense(values), b
 
     def solve(
         self,
-        r: Float[Array, "bodies 3"],
-        p: Float[Array, "bodies 4"],
-        v: Float[Array, "bodies 3"],
-        pdot: Float[Array, "bodies 4"],
+        *motion: *Motion,
         gamma_defect: float | Float[Array, "c"] = 0.0,
         x: Float[Array, "bodies 2"] | None = None,
     ) -> Solution:
         """Solve (N5).
 
         Args:
-            r: positions [m], world frame.
-            v: velocities ṙ [m/s], world frame.
-            pdot: rates ṗ [1/s].
+            motion: r, p, ṙ and ṗ.
             gamma_defect: added to γ, one number or one per row: a planted fault of known growth (E4).
             x: joint coordinates near which angles of springs are taken; absent: principal values.
 
@@ -152,16 +143,14 @@ class DirectSystem:
 
         """
         if self.chain.has_loops:
-            found, kept = self._loop_unknowns(r, p, v, pdot, gamma_defect, x, is_run=False)
-            return replace(self._solution_from_unknowns(p, *found), kept=kept)
-        return self._solution_from_unknowns(p, *self.solve_unknowns(r, p, v, pdot, gamma_defect, x))
+            found, kept = self._loop_unknowns(motion, gamma_defect, x, is_run=False)
+            return replace(self._solution_from_unknowns(motion[1], *found), kept=kept)
+        found = self.solve_unknowns(*motion, gamma_defect=gamma_defect, x=x)
+        return self._solution_from_unknowns(motion[1], *found)
 
     def solve_unknowns(
         self,
-        r: Float[Array, "bodies 3"],
-        p: Float[Array, "bodies 4"],
-        v: Float[Array, "bodies 3"],
-        pdot: Float[Array, "bodies 4"],
+        *motion: *Motion,
         gamma_defect: float | Float[Array, "c"] = 0.0,
         x: Float[Array, "joints coordinates"] | None = None,
     ) -> tuple[Float[Array, "unknowns"], ConstraintRows, ElementForces | None]:
@@ -173,9 +162,7 @@ class DirectSystem:
         830 ε without the refinement; more passes of equilibration change nothing.
 
         Args:
-            r: positions [m], world frame.
-            v: velocities ṙ [m/s], world frame.
-            pdot: rates ṗ [1/s].
+            motion: r, p, ṙ and ṗ.
             gamma_defect: added to γ, one number or one per row: a planted fault of known growth (E4).
             x: as for `solve`.
 
@@ -187,12 +174,12 @@ class DirectSystem:
 
         """
         if self.chain.has_loops:
-            return self._loop_unknowns(r, p, v, pdot, gamma_defect, x, is_run=True)[0]
+            return self._loop_unknowns(motion, gamma_defect, x, is_run=True)[0]
         with np.errstate(all="ignore"):  # an overflow raises SingularSystem below
-            values, b, joints, elements = self._entries(r, p, v, pdot, x)
+            values, b, joints, elements = self._entries(motion, x)
             n, c = self.chain.n, len(self.joint)
             b[7 * n : 7 * n + c] += gamma_defect
-            check_state_solvable(self.chain, r, p, joints.d, self._rods, (values, b, v))
+            check_state_solvable(self.chain, *motion[:2], joints.d, self._rods, (values, b, motion[2]))
 
         entries = values[self._by_row]
         scale = power_of_two_scale(np.maximum.reduceat(np.abs(entries), self._row_start))
@@ -211,34 +198,25 @@ class DirectSystem:
 
     def solve_with_dense_factors(
         self,
-        r: Float[Array, "bodies 3"],
-        p: Float[Array, "bodies 4"],
-        v: Float[Array, "bodies 3"],
-        pdot: Float[Array, "bodies 4"],
-        *,
+        *motion: *Motion,
         x: Float[Array, "joints coordinates"] | None = None,
     ) -> Solution:
         """Solve (N5) by dense factors of the assembled S, an independent way to the x of `solve`.
 
         Args:
-            r: positions [m], world frame.
-            v: velocities ṙ [m/s], world frame.
-            pdot: rates ṗ [1/s].
+            motion: r, p, ṙ and ṗ.
             x: as for `solve`.
 
         Returns:
             As `solve`.
 
         """
-        values, b, joints, elements = self._entries(r, p, v, pdot, x)
-        return self._solution_from_unknowns(p, solve_dense(self._dense(values), b), joints, elements)
+        values, b, joints, elements = self._entries(motion, x)
+        return self._solution_from_unknowns(motion[1], solve_dense(self._dense(values), b), joints, elements)
 
     def corrected(
         self,
-        r: Float[Array, "bodies 3"],
-        p: Float[Array, "bodies 4"],
-        v: Float[Array, "bodies 3"],
-        pdot: Float[Array, "bodies 4"],
+        *motion: *Motion,
         x: Float[Array, "joints coordinates"] | None,
         unknowns: Float[Array, "m"],
         correction: Callable[[Array], Array],
@@ -246,9 +224,7 @@ class DirectSystem:
         """Correct unknowns that nearly solve (N5): x + S₀⁻¹ (b − S x), with the S₀ of a system nearby.
 
         Args:
-            r: positions [m], world frame.
-            v: velocities ṙ [m/s], world frame.
-            pdot: rates ṗ [1/s].
+            motion: r, p, ṙ and ṗ.
             x: as for `solve`.
             unknowns: in the printed order.
             correction: from b − S x to S₀⁻¹ (b − S x).
@@ -257,26 +233,25 @@ class DirectSystem:
             The corrected solution, and what elements there are.
 
         """
-        values, b, joints, elements = self._entries(r, p, v, pdot, x)
+        values, b, joints, elements = self._entries(motion, x)
         lack = b - np.bincount(self._i, values * unknowns[self._j], self.size)
-        return self._solution_from_unknowns(p, unknowns + correction(lack), joints, elements), elements
+        unknowns = unknowns + correction(lack)
+        return self._solution_from_unknowns(motion[1], unknowns, joints, elements), elements
 
     def _loop_unknowns(
         self,
-        r: Array,
-        p: Array,
-        v: Array,
-        pdot: Array,
+        motion: Motion,
         gamma_defect: float | Float[Array, "c"],
         x: Array | None,
         is_run: bool,
     ) -> tuple[tuple[Array, ConstraintRows, ElementForces | None], NDArray[np.bool_]]:
         """As `solve_unknowns`, by dense factors; and which of the rows are kept."""
         n, c, plain = self.chain.n, len(self.joint), len(self.joint) - self.rotor_count
-        values, b, joints, elements = self._entries(r, p, v, pdot, x)
+        p = motion[1]
+        values, b, joints, elements = self._entries(motion, x)
         S = self._dense(values)
         b[7 * n : 7 * n + c] += gamma_defect
-        check_state_solvable(self.chain, r, p, joints.d, self._rods, (values, b, v))
+        check_state_solvable(self.chain, *motion[:2], joints.d, self._rods, (values, b, motion[2]))
         rows = S[7 * n : 7 * n + plain, : 7 * n].copy()
         of_p = rows[:, 3 * n :].reshape(plain, n, 4)
         of_p -= p * (dot(of_p, p) / dot(p, p))[..., None]
@@ -308,13 +283,14 @@ class DirectSystem:
         return S
 
     def _entries(
-        self, r: Array, p: Array, v: Array, pdot: Array, x: Float[Array, "joints coordinates"] | None = None
+        self, motion: Motion, x: Float[Array, "joints coordinates"] | None
     ) -> tuple[Array, Array, ConstraintRows, ElementForces | None]:
         """The entries of S in the order of `_i`, `_j`, then b, and the rows and elements they come from."""
         chain, elements, rotors = self.chain, None, np.zeros(0)
-        joints = constraint_rows(chain, r, p, v, pdot)
+        _, p, v, pdot = motion
+        joints = constraint_rows(chain, *motion)
         if self.elements:
-            elements = self.elements.evaluate(r, p, v, pdot, x)
+            elements = self.elements.evaluate(*motion, x=x)
             rotors = self.elements.armature[self.elements.rotors]
             joints = self.elements.with_rotors(joints, elements)
         L_, L_rate = L(p), L(pdot)

@@ -26,6 +26,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from reference_impl.arrays import Motion
 from reference_impl.euler_parameters import A, G, L, cross, dot
 from reference_impl.joints import ConstraintRows
 from reference_impl.mechanism import Array, Float, Mechanism
@@ -97,46 +98,36 @@ class Elements:
 
     def coordinates(
         self,
-        r: Float[Array, "bodies 3"],
-        p: Float[Array, "bodies 4"],
-        v: Float[Array, "bodies 3"],
-        pdot: Float[Array, "bodies 4"],
+        *motion: *Motion,
         x: Float[Array, "joints coordinates"] | None = None,
     ) -> tuple[Float[Array, "joints coordinates"], Float[Array, "joints coordinates"]]:
         """Return the joint coordinates that have elements, and their rates.
 
         Args:
-            r: positions [m], world frame.
-            v: velocities ṙ [m/s], world frame.
-            pdot: rates ṗ [1/s].
+            motion: r, p, ṙ and ṗ.
             x: as for `evaluate`.
 
         Returns:
             [rad or m, and 1/s of it]; zeros where there are no elements.
 
         """
-        found, values = self.evaluate(r, p, v, pdot, x), np.zeros((2, *self.mechanism.armature.shape))
+        found, values = self.evaluate(*motion, x=x), np.zeros((2, *self.mechanism.armature.shape))
         values[:, self.joint, self.column] = found.stretch + self.rest, found.rate
         return values[0], values[1]
 
     def evaluate(
         self,
-        r: Float[Array, "bodies 3"],
-        p: Float[Array, "bodies 4"],
-        v: Float[Array, "bodies 3"],
-        pdot: Float[Array, "bodies 4"],
+        *motion: *Motion,
         x: Float[Array, "joints coordinates"] | None = None,
     ) -> ElementForces:
         """Evaluate all elements.
 
         Args:
-            r: positions [m], world frame.
-            v: velocities ṙ [m/s], world frame.
-            pdot: rates ṗ [1/s].
+            motion: r, p, ṙ and ṗ.
             x: joint coordinates near which angles are taken [rad]; absent: principal values.
 
         """
-        state = _with_world(r, p, v, pdot)
+        state = _with_world(motion)
         at = self._motion(state)
         (wb, wa), (b, a), w, d = at.spin, at.arm, at.axis, at.d
         push, n_near, n_far, rate, rates = at.push, at.n_near, at.n_far, at.rate, at.turning
@@ -151,7 +142,8 @@ class Elements:
         torque = self.effort - self.stiffness * stretch - self.damping * rate
         wrench = torque[:, None] * np.stack([np.hstack([push, n_near]), -np.hstack([push, n_far])])
         potential = lost = 0.0
-        total = np.zeros((len(r) + 1, 6))  # force, and moment about the centre of mass; the world last
+        # force, and moment about the centre of mass; the world last
+        total = np.zeros((len(motion[0]) + 1, 6))
         np.add.at(total, self.bodies, wrench)
         if len(self.mechanism.spring_body):
             spring_wrench, potential, lost = self._point_springs(state)
@@ -165,21 +157,18 @@ class Elements:
             rate=rate,
             torque=torque,
             force=total[:-1, :3],
-            p_force=np.vecmat(total[:-1, 3:], 2 * G(p)),
+            p_force=np.vecmat(total[:-1, 3:], 2 * G(motion[1])),
             potential=potential + float(self.stiffness @ stretch**2) / 2,
             dissipation=lost + float(self.damping @ rate**2),
         )
 
     def rates(
         self,
-        r: Float[Array, "bodies 3"],
-        p: Float[Array, "bodies 4"],
-        v: Float[Array, "bodies 3"],
-        pdot: Float[Array, "bodies 4"],
+        *motion: *Motion,
     ) -> Float[Array, "joints coordinates"]:
         """Return the rates of `coordinates` alone."""
         found = np.zeros(self.mechanism.armature.shape)
-        found[self.joint, self.column] = self._motion(_with_world(r, p, v, pdot)).rate
+        found[self.joint, self.column] = self._motion(_with_world(motion)).rate
         return found
 
     def _motion(self, state: tuple[Array, ...]) -> _Motion:
@@ -238,10 +227,10 @@ class Elements:
         return np.concatenate([pull, cross(arm, pull)], axis=-1), float(potential), float(lost)
 
 
-def _with_world(r: Array, p: Array, v: Array, pdot: Array) -> tuple[Array, ...]:
+def _with_world(motion: Motion) -> tuple[Array, ...]:
     """The state with the world as the last body, where index −1 finds it."""
     found = list[Array]()
-    for y, world in zip((r, p, v, pdot), _WORLD, strict=True):
+    for y, world in zip(motion, _WORLD, strict=True):
         padded = np.empty((len(y) + 1, y.shape[1]), y.dtype)
         padded[:-1], padded[-1] = y, world
         found.append(padded)

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.integrate import DOP853
 
 from reference_impl import notes
+from reference_impl.arrays import Motion
 from reference_impl.direct import DirectSystem
 from reference_impl.elements import Elements
 from reference_impl.euler_parameters import angular_velocity
@@ -32,27 +33,13 @@ class IntegrationResult:
 
 
 def pack_state(
-    r: Float[Array, "bodies 3"],
-    p: Float[Array, "bodies 4"],
-    v: Float[Array, "bodies 3"],
-    pdot: Float[Array, "bodies 4"],
+    *motion: *Motion,
 ) -> Float[Array, "14*bodies"]:
-    """Concatenate y = (r, p, ṙ, ṗ) (N6).
-
-    Args:
-        r: positions [m].
-        v: velocities ṙ [m/s].
-        pdot: rates ṗ [1/s].
-
-    """
-    return np.concatenate([x.ravel() for x in (r, p, v, pdot)])
+    """Concatenate y = (r, p, ṙ, ṗ) (N6)."""
+    return np.concatenate([x.ravel() for x in motion])
 
 
-def unpack_state(
-    y: Float[Array, "... entries"], n: int
-) -> tuple[
-    Float[Array, "... n 3"], Float[Array, "... n 4"], Float[Array, "... n 3"], Float[Array, "... n 4"]
-]:
+def unpack_state(y: Float[Array, "... entries"], n: int) -> Motion:
     """Split y = (r, p, ṙ, ṗ) (N6) into its parts.
 
     Returns:
@@ -77,7 +64,7 @@ def direct_acceleration(chain: Mechanism, gamma_defect: float | Float[Array, "c"
     system = DirectSystem(chain)
 
     def acceleration(r: Array, p: Array, v: Array, pdot: Array, x: Array | None = None) -> Array:
-        return system.solve_unknowns(r, p, v, pdot, gamma_defect, x)[0][: 7 * chain.n]
+        return system.solve_unknowns(r, p, v, pdot, gamma_defect=gamma_defect, x=x)[0][: 7 * chain.n]
 
     return acceleration
 
@@ -101,10 +88,7 @@ def notes_acceleration(chain: Mechanism) -> Acceleration:
 
 def state_scales(
     chain: Mechanism,
-    r: Float[Array, "bodies 3"],
-    p: Float[Array, "bodies 4"],
-    v: Float[Array, "bodies 3"],
-    pdot: Float[Array, "bodies 4"],
+    *motion: *Motion,
 ) -> Float[Array, "14*bodies"]:
     """Return the size that each part of y has in this motion, for absolute tolerances.
 
@@ -113,15 +97,13 @@ def state_scales(
     falling through the chain's own length reaches.
 
     Args:
-        r: initial positions [m].
-        p: initial Euler parameters.
-        v: initial velocities ṙ [m/s].
-        pdot: initial rates ṗ [1/s].
+        motion: initial r, p, ṙ and ṗ.
 
     Returns:
         In the units of y.
 
     """
+    r, p, v, pdot = motion
     span = float(np.sum(chain.length + np.linalg.norm(chain.proximal, axis=1)))
     span += float(np.sum(np.linalg.norm(chain.point[1:, 0], axis=1)) + np.linalg.norm(chain.point[0, 0]))
     span = max(span, float(np.max(np.abs(r)))) or 1.0
@@ -184,7 +166,7 @@ def integrate_dop853(
     solver = DOP853(rate, times[0], y0, times[-1], rtol=rtol, atol=limits)
     while done < len(times):
         if elements.has_winding_angles:  # no angle changes by half a turn within a step
-            x = elements.coordinates(*unpack_state(solver.y, n), x)[0]
+            x = elements.coordinates(*unpack_state(solver.y, n), x=x)[0]
         message = solver.step()
         if solver.status == "failed":
             raise ArithmeticError(f"DOP853 stopped at t = {solver.t} s: {message}")

@@ -35,6 +35,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from reference_impl.arrays import Motion
 from reference_impl.euler_parameters import I3, A, B, G, L, dot, outer
 from reference_impl.mechanism import AnyArray, Indices, Int, Mechanism, Shaped
 
@@ -193,22 +194,18 @@ def _row_layout(mechanism: Mechanism) -> _RowLayout:
 
 def constraint_rows(
     mechanism: Mechanism,
-    r: Shaped[AnyArray, "bodies 3"],
-    p: Shaped[AnyArray, "bodies 4"],
-    v: Shaped[AnyArray, "bodies 3"],
-    pdot: Shaped[AnyArray, "bodies 4"],
+    *motion: *Motion,
 ) -> ConstraintRows:
     """Evaluate C, C_r, C_p and γ of every joint (S1–S4, D2–D6 for rods; L1–L3 for the others).
 
     Args:
-        r: positions [m], world frame.
-        v: velocities ṙ [m/s], world frame.
-        pdot: rates ṗ [1/s].
+        motion: r, p, ṙ and ṗ.
 
     Returns:
         The rows in the order of the joints, on or off the constraints.
 
     """
+    r, p, v, pdot = motion
     fixed = _row_layout(mechanism)
     s, (far, near) = fixed.s, mechanism.body.T
     q, qdot = p[fixed.bodies], pdot[fixed.bodies]  # (2, J, 4): near and far body of each joint

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -22,6 +22,14 @@ from reference_impl.joint_kinds import BALL, KINDS, ROD, JointKind, Kind, column
 ZERO_INERTIA = 1e-14  # a principal moment that is this part of the largest is the rounding of 0
 JOINT_ELEMENTS = ("armature", "damping", "stiffness", "rest", "effort")
 SPRING_FIELDS = ("spring_body", "spring_point", "spring_stiffness", "spring_damping", "spring_length")
+
+
+_Found = TypeVar("_Found")
+
+
+def _remembered(find: Callable[[Mechanism], _Found]) -> Callable[[Mechanism], _Found]:
+    """Remember what is computed of a mechanism by its identity, outside of its fields."""
+    return lru_cache(maxsize=64)(find)
 
 
 def _no_pairs() -> Array:
@@ -179,9 +187,12 @@ class Mechanism:
         return self.has_joint_elements or not all(kind.holds_no_turn for kind in self.kinds)
 
     @property
+    @_remembered
     def has_chain_joints(self) -> bool:
         """Whether every body hangs from the one before, the first from the world, by a bare rod or ball."""
-        return _has_chain_joints(self)
+        if self.has_loops or self.has_elements or not all(kind.holds_no_turn for kind in self.kinds):
+            return False
+        return bool(np.all(self.body[:, 0] == np.arange(self.n) - 1))
 
     @property
     def has_loops(self) -> bool:
@@ -189,9 +200,13 @@ class Mechanism:
         return len(self.kind) > self.n
 
     @property
+    @_remembered
     def lacks_inertia(self) -> bool:
         """Whether a body has no inertia about some axis: a point mass, or a thin rod."""
-        return _lacks_inertia(self)
+        if not np.all(np.isfinite(self.inertia)):
+            return False
+        principal = np.linalg.eigvalsh(self.inertia)
+        return bool(np.any(principal[:, 0] <= ZERO_INERTIA * principal[:, 2]))
 
     @property
     def tree(self) -> Mechanism:
@@ -224,9 +239,10 @@ class Mechanism:
         return np.array([kind.holds_nothing for kind in self.kinds], bool)
 
     @property
+    @_remembered
     def has_joint_elements(self) -> bool:
         """Whether any joint has a rotor, a damper, a spring or an effort."""
-        return _has_joint_elements(self)
+        return any(np.any(getattr(self, name)) for name in JOINT_ELEMENTS)
 
     @property
     def has_elements(self) -> bool:
@@ -277,7 +293,7 @@ def side_by_side(mechanisms: Sequence[Mechanism]) -> Mechanism:
     return Mechanism(**fields)
 
 
-@lru_cache(maxsize=64)  # what is computed of a mechanism is remembered by its identity
+@_remembered
 def _tree_of(mechanism: Mechanism) -> Mechanism:
     return replace(mechanism, **{name: getattr(mechanism, name)[: mechanism.n] for name in JOINT_FIELDS})
 
@@ -285,26 +301,6 @@ def _tree_of(mechanism: Mechanism) -> Mechanism:
 @lru_cache(maxsize=64)
 def _entries(kinds: tuple[Kind, ...]) -> tuple[JointKind, ...]:
     return tuple(KINDS[kind] for kind in kinds)
-
-
-@lru_cache(maxsize=64)
-def _has_joint_elements(mechanism: Mechanism) -> bool:
-    return any(np.any(getattr(mechanism, name)) for name in JOINT_ELEMENTS)
-
-
-@lru_cache(maxsize=64)
-def _has_chain_joints(mechanism: Mechanism) -> bool:
-    if mechanism.has_loops or mechanism.has_elements or not all(x.holds_no_turn for x in mechanism.kinds):
-        return False
-    return bool(np.all(mechanism.body[:, 0] == np.arange(mechanism.n) - 1))
-
-
-@lru_cache(maxsize=64)
-def _lacks_inertia(mechanism: Mechanism) -> bool:
-    if not np.all(np.isfinite(mechanism.inertia)):
-        return False
-    principal = np.linalg.eigvalsh(mechanism.inertia)
-    return bool(np.any(principal[:, 0] <= ZERO_INERTIA * principal[:, 2]))
 
 
 def _chain_kinds(length: Array) -> tuple[Kind, ...]:

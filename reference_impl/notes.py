@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from reference_impl.arrays import Motion
 from reference_impl.direct import check_state_solvable, solve_dense
 from reference_impl.euler_parameters import A, A_rate, B, G, H, L, outer
 from reference_impl.mechanism import AnyArray, Array, Float, Mechanism, Shaped
@@ -147,18 +148,13 @@ def block_diagonal(blocks: Shaped[AnyArray, "n i j"]) -> Shaped[AnyArray, "n*i n
 
 def assemble_system(
     chain: Mechanism,
-    r: Shaped[AnyArray, "bodies 3"],
-    p: Shaped[AnyArray, "bodies 4"],
-    v: Shaped[AnyArray, "bodies 3"],
-    pdot: Shaped[AnyArray, "bodies 4"],
+    *motion: *Motion,
 ) -> tuple[Shaped[AnyArray, "9*bodies 9*bodies"], Shaped[AnyArray, "9*bodies"]]:
     """Assemble S and b of (N5) for one body (S1–S5) or two (D1–D6); every joint is read as a rod.
 
     Args:
         chain: the pendulum, N = 1 or 2.
-        r: positions [m], world frame.
-        v: velocities ṙ [m/s], world frame.
-        pdot: rates ṗ [1/s].
+        motion: r, p, ṙ and ṗ.
 
     Returns:
         S and b, for x = (r̈, p̈, λ, λ_E).
@@ -167,7 +163,7 @@ def assemble_system(
         ValueError: the chain has more than two bodies.
 
     """
-    n = chain.n
+    n, (r, p, v, pdot) = chain.n, motion
     if n == 1:
         one = SinglePendulum(r[0], p[0], v[0], pdot[0], chain.proximal[0], chain.length[0])
         bodies, C_r, C_p, gamma = [one], one.C_r[None], one.C_p[None], np.array([one.gamma])
@@ -203,18 +199,13 @@ def assemble_system(
 
 def solve_system(
     chain: Mechanism,
-    r: Float[Array, "bodies 3"],
-    p: Float[Array, "bodies 4"],
-    v: Float[Array, "bodies 3"],
-    pdot: Float[Array, "bodies 4"],
+    *motion: *Motion,
 ) -> Float[Array, "9*bodies"]:
     """Solve (N5) for x = (r̈, p̈, λ, λ_E).
 
     Args:
         chain: the pendulum, N = 1 or 2.
-        r: positions [m], world frame.
-        v: velocities ṙ [m/s], world frame.
-        pdot: rates ṗ [1/s].
+        motion: r, p, ṙ and ṗ.
 
     Returns:
         r̈ [m/s²], p̈ [1/s²], λ [N/m] and λ_E.
@@ -224,7 +215,7 @@ def solve_system(
 
     """
     n = chain.n
-    S, b = assemble_system(chain, r, p, v, pdot)
+    S, b = assemble_system(chain, *motion)
     d = np.array([S[7 * n + k, 3 * k : 3 * k + 3] / 2 for k in range(n)])  # by (S2, D3), up to its sign
-    check_state_solvable(chain, r, p, d, np.full(n, True), (S, b))
+    check_state_solvable(chain, *motion[:2], d, np.full(n, True), (S, b))
     return solve_dense(S, b)

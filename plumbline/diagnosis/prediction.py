@@ -272,7 +272,7 @@ def maximal_quantities(model: Model, state: State, missing_gamma: Sequence[int])
     system, rows = DirectSystem(model), constraint_rows(model, *at)
     change = np.zeros(len(system.joint))
     change[: len(rows.gamma)] = np.where(np.isin(rows.joint, missing_gamma), -rows.gamma, 0.0)
-    found = system.solve(*at, change, joint_coordinates(model, state)[2])
+    found = system.solve(*at, gamma_defect=change, x=joint_coordinates(model, state)[2])
     assert found.joint_moment is not None
     return {
         "acceleration": found.acceleration,

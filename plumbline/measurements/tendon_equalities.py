@@ -38,7 +38,7 @@ def effects_of_missing_terms(model: Model, state: State) -> dict[str, Array]:
     defect = np.zeros(len(system.joint))
     for k, lengthening in _lengthening(model, state, u, udot).items():
         defect[system.joint == k] = 2 * model.length[k] * lengthening
-    right, wrong = (system.solve(*at, gamma, x) for gamma in (0.0, defect))
+    right, wrong = (system.solve(*at, gamma_defect=gamma, x=x) for gamma in (0.0, defect))
     assert right.joint_moment is not None and wrong.joint_moment is not None
     force, moment = wrong.joint_reaction - right.joint_reaction, wrong.joint_moment - right.joint_moment
     force, moment = determinate_wrenches(model, state, force, moment)

@@ -229,7 +229,7 @@ class _Base:
         at = maximal_coordinates(state)
         plain = DirectSystem(model).solve(*at, x=self.coordinates)
         system = DirectSystem(_with_rotor_rows(model) if has_elements else model)
-        S, b = system.assemble(*at, self.coordinates)
+        S, b = system.assemble(*at, x=self.coordinates)
         c = len(system.joint) - system.rotor_count  # rows of constraints
         used = np.ones(len(b), bool)
         if plain.kept is not None:
@@ -292,7 +292,7 @@ class ChangedModels:
         r, p, v, omega = (getattr(states, name).reshape(-1, size) for name, size in _SIZES)
         at = r, p, v, quaternion_rate(p, omega)
         coordinates = np.tile(solved.coordinates, (count, 1))
-        found, elements = system.corrected(*at, coordinates, unknowns, correction)
+        found, elements = system.corrected(*at, x=coordinates, unknowns=unknowns, correction=correction)
         assert found.joint_moment is not None
         per_copy = {
             "acceleration": found.acceleration,

@@ -98,7 +98,7 @@ def coordinates_after(
     with np.errstate(all="ignore"):
         for _ in range(method.substeps):
             tree.is_new_step = True
-            q, v = _STEPS[method.formula](tree, method, q, v, h)
+            q, v = _STEPS[method.formula](tree, q, v, h)
     return q, v * LongDouble(method.rate_factor)
 
 
@@ -149,9 +149,8 @@ class _ReusingCharts(StepCharts):
 # -- steps -------------------------------------------------------------------------------------------
 
 
-def _semi_implicit_euler(
-    system: StepCharts, method: JointSpaceMethod, q: Coordinates, v: Array, h: Array
-) -> tuple[Coordinates, Array]:
+def _semi_implicit_euler(system: StepCharts, q: Coordinates, v: Array, h: Array) -> tuple[Coordinates, Array]:
+    method = system.method
     if method.implicit_forces == "none":
         new = v + h * system.acceleration(q, v)
     else:
@@ -164,26 +163,20 @@ def _semi_implicit_euler(
     return system.move(q, h * mover), new
 
 
-def _positions_first(
-    system: StepCharts, method: JointSpaceMethod, q: Coordinates, v: Array, h: Array
-) -> tuple[Coordinates, Array]:
+def _positions_first(system: StepCharts, q: Coordinates, v: Array, h: Array) -> tuple[Coordinates, Array]:
     q = system.move(q, h * v)
     return q, v + h * system.acceleration(q, v)
 
 
-def _velocity_verlet(
-    system: StepCharts, method: JointSpaceMethod, q: Coordinates, v: Array, h: Array
-) -> tuple[Coordinates, Array]:
+def _velocity_verlet(system: StepCharts, q: Coordinates, v: Array, h: Array) -> tuple[Coordinates, Array]:
     a = system.acceleration(q, v)
     q = system.move(q, h * v + h * h * a / 2)
     return q, v + h / 2 * (a + system.acceleration(q, v + h / 2 * a))
 
 
-def _runge_kutta(
-    system: StepCharts, method: JointSpaceMethod, q: Coordinates, v: Array, h: Array
-) -> tuple[Coordinates, Array]:
-    rates: list[Array] = []
-    accelerations: list[Array] = []
+def _runge_kutta(system: StepCharts, q: Coordinates, v: Array, h: Array) -> tuple[Coordinates, Array]:
+    method, rates = system.method, list[Array]()
+    accelerations = list[Array]()
 
     def weighted(weights: Sequence[float], values: list[Array]) -> Array:
         return sum(((h * LongDouble(w)) * x for w, x in zip(weights, values, strict=True)), np.zeros_like(v))

@@ -19,7 +19,6 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable, Generator, Sequence
-from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -66,23 +65,9 @@ class Structure(NamedTuple):
     numbers: tuple[tuple[str, tuple[int, ...], tuple[float | None, ...]], ...]
 
 
-@dataclass(frozen=True, eq=False)
-class MinimalCoordinateRun:
-    """A motion in minimal coordinates; arrays hold numbers of the precision's own type, at most extended."""
-
-    t: Array  # (T,) s
-    p: Any  # (T, N, 4)
-    omega: Any  # (T, N, 3) rad/s, body frame
-    u: Any  # (T, N, 3), world frame; 0 for ball joints
-    udot: Any  # (T, N, 3) 1/s, world frame
-    r: Any  # (T, N, 3) m, world frame, computed from the coordinates
-    v: Any  # (T, N, 3) m/s, world frame
-    steps: int
-
-
 def simulate_taylor(
     model: Model, state: State, times: Array, precision: Precision = "extended"
-) -> MinimalCoordinateRun:
+) -> tuple[State, int]:
     """Integrate the motion from a state.
 
     Args:
@@ -90,7 +75,8 @@ def simulate_taylor(
         times: (T,) [s] of the samples, times[0] = 0.
 
     Returns:
-        The motion at ``times``.
+        The motion at ``times``, arrays (T, ...) of the precision's own type, at most extended; and the number
+        of steps.
 
     Raises:
         TruthUnavailable: heyoka (Linux only) or mpmath is not installed.
@@ -102,14 +88,13 @@ def simulate_taylor(
         return _simulate(model, state, times, precision)
     cut = cut_open(model)
     there, bodies = cut.state(state), cut.place[: model.n]
-    run = _simulate(cut.model, there, times, precision, _closures(cut, there))
-    names = ("p", "omega", "u", "udot", "r", "v")
-    return replace(run, **{name: getattr(run, name)[:, bodies] for name in names})
+    run, steps = _simulate(cut.model, there, times, precision, _closures(cut, there))
+    return run[:, bodies], steps
 
 
 def _simulate(
     model: Model, state: State, times: Array, precision: Precision, closures: tuple[Closure, ...] = ()
-) -> MinimalCoordinateRun:
+) -> tuple[State, int]:
     """Integrate a tree, its loops closed."""
     integrator, number = _prepared_integrator(model, state, precision, closures=closures)
     outcome, _, _, steps, _, samples = integrator.propagate_grid([number(float(t)) for t in times])
@@ -129,11 +114,10 @@ def _simulate(
         for name, size in _coordinate_names(kind):
             parts[name][:, k, :size] = y[:, at : at + size]
             at += size
-    p, omega, r, v = forward_kinematics(model, *parts.values())
-    u, udot = parts["u"], parts["udot"]
+    parts |= zip(("p", "omega", "r", "v"), forward_kinematics(model, *parts.values()), strict=True)
     if y.dtype == object:
-        p, omega, u, udot, r, v = (np.array(a.tolist(), samples.dtype) for a in (p, omega, u, udot, r, v))
-    return MinimalCoordinateRun(times, p, omega, u, udot, r, v, int(steps))
+        parts = {name: np.array(x.tolist(), samples.dtype) for name, x in parts.items()}
+    return State(**parts), int(steps)
 
 
 def _closures(cut: CutMechanism, state: State) -> tuple[Closure, ...]:

@@ -176,9 +176,9 @@ def _simulate_minimal_coordinates(
     if model.n > max_compiled_bodies:
         raise TruthUnavailable(f"not used for more than {max_compiled_bodies} bodies")
     precision: Precision = "extended" if model.n <= MAX_EXTENDED_PRECISION_BODIES else "double"
-    found = simulate_taylor(model, state, times, precision)
+    found, steps = simulate_taylor(model, state, times, precision)
     r, p, v, omega = (np.asarray(getattr(found, name), float) for name in ("r", "p", "v", "omega"))
-    run = Trajectory(times, r, p, v, quaternion_rate(p, omega), found.steps, state.x)
+    run = Trajectory(times, r, p, v, quaternion_rate(p, omega), steps, state.x)
     coordinates = (
         "coordinates of the tree without its closing joints" if model.has_loops else "minimal coordinates"
     )
@@ -384,7 +384,7 @@ def _simulate_batch(motion: AccurateMotion, cases: Sequence[tuple[Model, State]]
             stage += 2
             if system.winding:  # full turns of springs' angles go on from step to step
                 r, p, v, pdot = (part.T for q in true(stage) + delta for part in (q[:3], q[3:]))
-                x = system.winding.coordinates(r, p, v, pdot, x)[0]
+                x = system.winding.coordinates(r, p, v, pdot, x=x)[0]
         y = true(stage) + delta
         samples.append(np.stack(system.project(y[0], y[1])))
     # (cases, 2, T, N, 7)

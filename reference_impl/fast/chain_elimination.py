@@ -24,6 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import lapack
 
+from reference_impl.arrays import Motion
 from reference_impl.direct import EPS, Solution, check_state_solvable, joint_forces
 from reference_impl.elements import Elements
 from reference_impl.euler_parameters import G, L, tilde
@@ -461,17 +462,12 @@ class StructuredSystem:
 
     def solve(
         self,
-        r: Float[Array, "bodies 3"],
-        p: Float[Array, "bodies 4"],
-        v: Float[Array, "bodies 3"],
-        pdot: Float[Array, "bodies 4"],
+        *motion: *Motion,
     ) -> Solution:
         """Solve (N5) for every chain.
 
         Args:
-            r: positions [m], world frame.
-            v: velocities ṙ [m/s], world frame.
-            pdot: rates ṗ [1/s].
+            motion: r, p, ṙ and ṗ.
 
         Returns:
             r̈, p̈, λ, λ_E and the forces at the joints; its ``joint`` counts the bodies of all chains.
@@ -480,10 +476,11 @@ class StructuredSystem:
             SingularSystem: S is singular; the message names the body of its chain and the cause (E1, E7).
 
         """
+        r, p, v, pdot = motion
         q, qdot = component_first(r, p), component_first(v, pdot)
         if not np.isfinite(q).all():
             self._raise_singular(q, None)
-        motion, mu, joints, omega = self._solve_motion(q, qdot, 0.0)
+        found, mu, joints, omega = self._solve_motion(q, qdot, 0.0)
         Rs, As = self._attachment_points(*self._norm_and_rotation(q))
         reaction = self._joint_force(joints, mu)
         turn_near, turn_far = reaction, self._at_child(reaction)  # C_pᵀμ = Wᵀ of these
@@ -496,10 +493,10 @@ class StructuredSystem:
         kept = np.ones((self.body_count, self.rows_per_joint), dtype=bool)
         kept[self.rods, 1:] = False
         forest, multiplier = side_by_side(self.chains), -mu.T[kept]
-        rows = constraint_rows(forest, r, p, v, pdot)
+        rows = constraint_rows(forest, *motion)
         return Solution(
-            acceleration=motion[:3].T,
-            pddot=motion[3:].T,
+            acceleration=found[:3].T,
+            pddot=found[3:].T,
             multiplier=multiplier,
             norm_multiplier=spin + _dot(Rs[0] + self.s[0], turn_near) - _dot(Rs[1] + self.s[1], turn_far),
             joint=rows.joint,

@@ -244,7 +244,7 @@ class _Stepper:
         # joint coordinates near which the angles of springs are taken, carried on by their rates
         self.x = np.zeros((forest.joint_count, 2))
         if forest.winding:
-            self.x = forest.winding.coordinates(q[:3].T, q[3:].T, v[:3].T, v[3:].T, forest.x)[0]
+            self.x = forest.winding.coordinates(q[:3].T, q[3:].T, v[:3].T, v[3:].T, x=forest.x)[0]
         self.x_rate = np.zeros((len(table.c), *self.x.shape))
         self.q_compensation, self.v_compensation = (
             np.zeros_like(q),

@@ -29,6 +29,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from reference_impl.arrays import Motion
 from reference_impl.direct import (
     RUN_RANK_TOLERANCE,
     Solution,
@@ -165,19 +166,13 @@ class TreeSystem:
 
     def solve(
         self,
-        r: Float[Array, "bodies 3"],
-        p: Float[Array, "bodies 4"],
-        v: Float[Array, "bodies 3"],
-        pdot: Float[Array, "bodies 4"],
-        *,
+        *motion: *Motion,
         x: Float[Array, "joints coordinates"] | None = None,
     ) -> Solution:
         """Solve (N5) for every tree.
 
         Args:
-            r: positions [m], world frame.
-            v: velocities ṙ [m/s], world frame.
-            pdot: rates ṗ [1/s].
+            motion: r, p, ṙ and ṗ.
             x: joint coordinates in place of those of the constructor.
 
         Returns:
@@ -187,13 +182,14 @@ class TreeSystem:
             SingularSystem: S is singular.
 
         """
+        r, p, v, pdot = motion
         q, qdot = component_first(r, p), component_first(v, pdot)
-        motion, multiplier, rows, elements = self._solve_motion(q, qdot, 0.0, x, refine=True)
+        found, multiplier, rows, elements = self._solve_motion(q, qdot, 0.0, x, refine=True)
         c = len(self.joint) - np.count_nonzero(self.compliance)
         of_elements = (self.elements.joint, elements) if self.elements and elements else None
         return Solution(
-            acceleration=motion[:3].T,
-            pddot=motion[3:].T,
+            acceleration=found[:3].T,
+            pddot=found[3:].T,
             multiplier=multiplier[:c],
             norm_multiplier=np.full(self.body_count, np.nan),
             joint=self.joint[:c],
@@ -237,7 +233,7 @@ class TreeSystem:
         state = q[:3].T, q[3:].T, v[:3].T, v[3:].T
         rows = constraint_rows(self.forest, *state)
         rate = rows.constraint_rate(*state[2:])
-        found = self.elements.evaluate(*state, self.x if x is None else x)
+        found = self.elements.evaluate(*state, x=self.x if x is None else x)
         rotors = np.zeros(len(self.elements.rotors))
         return self.elements.with_rotors(rows, found), np.concatenate([rate, rotors]), found
 

@@ -71,7 +71,7 @@ def test_a_compiled_integrator_is_recalled_with_equal_bits(own_cells):
     runs = []
     for count in (1, 1):
         taylor._compiled_integrator.cache_clear()
-        runs.append(np.asarray(taylor.simulate_taylor(s.model, s.state, s.times[:5]).r, float))
+        runs.append(np.asarray(taylor.simulate_taylor(s.model, s.state, s.times[:5])[0].r, float))
         names = [path for path in stored_files(own_cells) if path.stat().st_size > 1e5]
         assert len(names) == count
     taylor._compiled_integrator.cache_clear()

@@ -81,7 +81,7 @@ def test_a_correction_ends_at_the_solution():
         return found
 
     off = np.where(used, unknowns + 1.0, 0.0)
-    found, elements = system.corrected(*parts, None, off, correction)
+    found, elements = system.corrected(*parts, x=None, unknowns=off, correction=correction)
     assert elements is None
     for name in ("acceleration", "pddot", "joint_moment"):
         np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-9, atol=1e-9)
@@ -148,7 +148,7 @@ def test_angles_go_on_beyond_half_a_turn():
     principal, rate = elements.coordinates(*parts)
     turns = np.zeros_like(principal)
     turns[elements.joint[~elements.is_slide], elements.column[~elements.is_slide]] = 3.0
-    found, same = elements.coordinates(*parts, principal + 2 * np.pi * turns + 0.4)
+    found, same = elements.coordinates(*parts, x=principal + 2 * np.pi * turns + 0.4)
     np.testing.assert_allclose(found, principal + 2 * np.pi * turns, rtol=1e-15)
     assert np.array_equal(same, rate)
     assert np.any(turns)
@@ -172,7 +172,7 @@ def test_a_spring_that_is_wound_up_pulls_by_all_its_turns():
     for run in runs:
         for k, expected in enumerate(angle):
             sample = run.r[k], run.p[k], run.v[k], run.pdot[k]
-            found = elements.coordinates(*sample, np.array([[expected, 0.0]]))[0]
+            found = elements.coordinates(*sample, x=np.array([[expected, 0.0]]))[0]
             assert found[0, 0] == pytest.approx(expected, abs=1e-8)
 
 

@@ -65,7 +65,7 @@ def closed_form_errors(case, times=TIMES):
     try:
         from plumbline.truth.taylor import simulate_taylor
 
-        run = simulate_taylor(case.model, case.state, times, "extended")
+        run, _ = simulate_taylor(case.model, case.state, times, "extended")
         true_r, true_p = np.asarray(run.r, dtype=float), np.asarray(run.p, dtype=float)
     except ImportError:
         run = load_adapter("reference").simulate(case.model, case.state, times, "collocation", 1e-14)

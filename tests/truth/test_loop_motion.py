@@ -99,7 +99,7 @@ def test_both_methods_agree_on_random_loops():
     for seed in (2, 5):
         model, state = random_loop_mechanism(seed, 5, ("hinge",), tree=("hinge", "universal", "ball"))
         notes = simulate_notes_form(model, state, times, 1e-13)
-        run = simulate_taylor(model, state, times)
+        run, _ = simulate_taylor(model, state, times)
         # 100 tolerances: over 1/8 s at rates of some rad/s errors grow by less
         assert np.max(position_error(np.asarray(run.r, float), notes.r)) < 1e-11
         assert np.max(attitude_error(np.asarray(run.p, float), notes.p)) < 1e-11
@@ -115,7 +115,7 @@ def test_a_motion_ends_before_its_singular_pose(motions):
     assert truth.singular.startswith("singular: from t = ") and not truth.conflict
     regular = catalogue_scenarios()["four-bar"]
     times = regular.times[:5]
-    run = simulate_taylor(regular.model, regular.state, times)
+    run, _ = simulate_taylor(regular.model, regular.state, times)
     value = smallest_singular_value(regular.model, state_at(regular, run, 4))
     near = pytest.approx(value, rel=1e3 * REGULARITY_RTOL)  # of a motion followed with this tolerance
     assert regular_motion(regular.model, regular.state, times) == (times[4], False, near)
@@ -152,7 +152,7 @@ def test_a_loop_moved_on_its_manifold_is_the_same_motion():
     """Started at a later sample, the motion goes on as before."""
     s = catalogue_scenarios()["slider-crank"]
     times = np.arange(9) / 16
-    whole = simulate_taylor(s.model, s.state, times)
+    whole, _ = simulate_taylor(s.model, s.state, times)
     there = state_at(s, whole, 4)
-    rest = simulate_taylor(s.model, assembled(s.model, complete_state(s.model, there)), times[:5])
+    rest, _ = simulate_taylor(s.model, assembled(s.model, complete_state(s.model, there)), times[:5])
     assert np.max(position_error(np.asarray(rest.r[-1], float), np.asarray(whole.r[-1], float))) < 1e-13

@@ -282,7 +282,7 @@ def count_divergences(name, precision, duration):
     scenario = load_scenario(find_scenario_file(name))
     times = np.arange(20 * duration + 1) * 0.05
     double, fine = (
-        simulate_taylor(scenario.model, scenario.state, times, kind) for kind in ("double", precision)
+        simulate_taylor(scenario.model, scenario.state, times, kind)[0] for kind in ("double", precision)
     )
     observed = position_error(double.r, np.asarray(fine.r, dtype=float))
     rounding = EPS * np.max(np.linalg.norm(double.r, axis=-1))

@@ -30,7 +30,7 @@ pytestmark = pytest.mark.skipif(
 
 
 def taylor(model, state, times=TIMES, precision="extended"):
-    run = simulate_taylor(model, state, times, precision)
+    run, _ = simulate_taylor(model, state, times, precision)
     return np.asarray(run.r, float), np.asarray(run.p, float), run
 
 
