@@ -37,9 +37,8 @@ class Solution:
     pddot: Float[Array, "bodies 4"]  # 1/s², p̈
     # λ by row of `joint`: N/m for a rod's row, N for a ball's three, a φ̈ for a rotor's at the end
     multiplier: Float[Array, "c"]
-    norm_multiplier: Float[
-        Array, "bodies"
-    ]  # λ_E: no physical meaning, not comparable across formulations (E2)
+    # λ_E: no physical meaning, not comparable across formulations (E2)
+    norm_multiplier: Float[Array, "bodies"]
     joint: Int[Indices, "c"]  # the joint of each row
     tension: Float[Array, "joints"]  # N, 2 ℓ λ of the rods, positive in tension; NaN at ball joints
     # N, force on the near body at the near point, world frame: −C_rᵀ λ, with elements

@@ -20,9 +20,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
 
-AxesKind = Literal[
-    "hinge", "universal", "slide", "cylindrical", "planar", "helical", "weld"
-]  # joints with axes in both bodies
+# joints with axes in both bodies
+AxesKind = Literal["hinge", "universal", "slide", "cylindrical", "planar", "helical", "weld"]
 Kind = Literal["rod", "ball", "free"] | AxesKind
 
 

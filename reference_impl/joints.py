@@ -224,9 +224,8 @@ def constraint_rows(
     )
     if len(fixed.rod_rows):
         k, row = fixed.rods, fixed.rod_rows
-        bdot, adot = 2 * _matrix_vector(
-            turn[0][:, k], _vector_matrix(s[:, k], L(qdot[:, k]))
-        )  # Ȧ s, Ȧ = 2 G L̇ᵀ (N10)
+        # Ȧ s, Ȧ = 2 G L̇ᵀ (N10)
+        bdot, adot = 2 * _matrix_vector(turn[0][:, k], _vector_matrix(s[:, k], L(qdot[:, k])))
         y, ydot, z, zdot = x[k] - a[k], xdot[k] - adot, x[k] + b[k], xdot[k] + bdot
         C[row] = dot(x[k], x[k]) + 2 * dot(x[k], b[k] - a[k]) - 2 * dot(a[k], b[k]) + fixed.point_squares[k]
         near_rate = _vector_matrix(ydot, H_near[k]) + _vector_matrix(y, H_near_rate[k])

@@ -26,16 +26,10 @@ LONG_RUN_STEP_EXPONENTS = {1: (9, 11), 2: (7, 9), 4: (7, 9)}
 RTOL_FACTORS = (1e6, 1e4)  # relative tolerances of a method with step control, over its tightest
 # By order: most steps × bodies of the finest run; a step of order 1 is cheap.
 MAX_BODY_STEPS = {1: 2**18, 2: 2**17, 4: 2**17}
-MAX_BODY_SECONDS = (
-    100.0  # most time, in the unit of s, × bodies with step control, whose steps are not known beforehand
-)
-WINDOW_ENDS = (
-    0.1,
-    1.0,
-    10.0,
-    100.0,
-    1000.0,
-)  # of `time_unit`: largest drifts are kept up to each, and the end
+# most time, in the unit of s, × bodies with step control, whose steps are not known beforehand
+MAX_BODY_SECONDS = 100.0
+# of `time_unit`: largest drifts are kept up to each, and the end
+WINDOW_ENDS = (0.1, 1.0, 10.0, 100.0, 1000.0)
 MIN_WINDOW = 1.0  # of `time_unit`: shortest run that is tried, decade by decade, where longer ones fail
 MAX_RELATIVE_DRIFT = 0.1  # of an invariant's scale: beyond, the step is too coarse for this motion
 BLOCK_COUNT = 16  # blocks of time in each window

@@ -237,9 +237,8 @@ def run_tolerance(
 
     """
     of_step = integrator.min_rtol
-    if (
-        integrator.kind == "step"
-    ):  # a residual is small compared with the heaviest body's, F = m a of a light one
+    # a residual is small compared with the heaviest body's, F = m a of a light one
+    if integrator.kind == "step":
         of_step = integrator.solver_rtol * float(np.max(model.mass) / np.min(model.mass))
     driven = _loop_acceleration(model, state) * end
     bound = remembered_rounding_bound(model, state)

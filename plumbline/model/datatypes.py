@@ -124,9 +124,8 @@ class StateQuantities:
     # kinetic energy = ½ νᵀ M ν with ν = (udot of the rods in order, then body by body omega, or
     # (v, omega) of a free body, or the xdot of its joint); a rod's 3×3 part acts on udot through u × udot.
     mass_matrix: Float[Array, "nu nu"] | None = None
-    joint_moment: Float[Array, "joints 3"] | None = (
-        None  # N m, moment on that body about that point, world frame
-    )
+    # N m, moment on that body about that point, world frame
+    joint_moment: Float[Array, "joints 3"] | None = None
     # by quantity the uncertainty of a limit that the engine's answers were extrapolated to, in its unit
     limit_error: Mapping[str, float] | None = None
 

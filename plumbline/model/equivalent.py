@@ -26,12 +26,8 @@ from plumbline.model.kinematics import (
     rotation_matrix,
 )
 
-WORLD_VECTORS = (
-    "acceleration",
-    "joint_reaction",
-    "joint_moment",
-    "angular_momentum",
-)  # state quantities in world axes
+# state quantities in world axes
+WORLD_VECTORS = ("acceleration", "joint_reaction", "joint_moment", "angular_momentum")
 BODY_VECTORS = ("angular_acceleration",)  # … in body axes
 
 

@@ -133,9 +133,8 @@ def _values(model: Model) -> Iterator[_Value]:
 def _joint_values(model: Model, k: int) -> Iterator[tuple[str, str, Index, Array | float]]:
     """Of joint k and the body that it holds in the tree: field, array, index and neutral value."""
     far, near = model.body[k]
-    if far >= 0 or (
-        near and not model.kinds[k].holds_nothing
-    ):  # another parent: the world, or the body before
+    # another parent: the world, or the body before
+    if far >= 0 or (near and not model.kinds[k].holds_nothing):
         yield "parent", "body", (k, 0), -1 if far >= 0 else near - 1
     # What follows from the state of a closing joint: of a rod its length, of a turn with a pitch that number
     # and the far point, on which neither its angle nor a rate depends.

@@ -55,9 +55,8 @@ MIN_MASS_RATIO = 1e-12  # of eigenvalues of a mass matrix of unit diagonal: belo
 NEARBY = 1e-2  # [rad, m]: how far a pose nearby is, where what holds at one pose alone does not
 STABILISATION = 50.0  # 1/s, of engines' motions: gaps that steps open die as (1 + a t) e^{-a t}
 NEWTON_STEPS, MAX_HALVINGS = 30, 6
-SHARE_ROUNDING = (
-    64 * np.finfo(float).eps
-)  # of a rate in unit motions of the loops, times nu and the condition
+# of a rate in unit motions of the loops, times nu and the condition
+SHARE_ROUNDING = 64 * np.finfo(float).eps
 NEARLY_CLOSED = 1e-11  # of a gap [m, rad]: the next step of Newton's method leaves only rounding
 PER_BODY = ("acceleration", "angular_acceleration")  # quantities with one row per body
 

@@ -21,9 +21,8 @@ from plumbline.studies.parquet_files import make_table
 from plumbline.truth.parameters import list_parameters
 
 FILE = "coverage.parquet"
-PARAMETERS_PER_TASK = (
-    160  # those of a chain of 100 bodies take minutes, and no worker has them all at the end
-)
+# those of a chain of 100 bodies take minutes, and no worker has them all at the end
+PARAMETERS_PER_TASK = 160
 # Kinds of parameters that few scenarios have: those of first and of later bodies are looked for together.
 _RARE_KINDS = (*JOINT_ELEMENTS, "anchor", "frame", "body_frame")
 

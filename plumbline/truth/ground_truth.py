@@ -211,9 +211,8 @@ def perturbed_models(model: Model, state: State) -> list[tuple[Model, State]]:
     def perturbed(x: Array) -> Array:
         return np.asarray(x * (1 + DETECTABLE_PARAMETER_ERROR * rng.choice([-1.0, 1.0], size=x.shape)))
 
-    factors = perturbed(
-        np.ones((model.n, 3, 3))
-    )  # entry by entry: a common factor does not affect a free body
+    # entry by entry: a common factor does not affect a free body
+    factors = perturbed(np.ones((model.n, 3, 3)))
     models = [
         replace(model, gravity=model.gravity * (1 + DETECTABLE_PARAMETER_ERROR)),
         replace(model, mass=perturbed(model.mass)),

@@ -275,9 +275,8 @@ class ChangedModels:
         sizes[2] = len(solved.unknowns) - sizes.sum()
         ends = np.cumsum(sizes)[:-1]
         own = np.split(np.arange(count * sizes.sum()), count * ends)
-        place = np.concatenate(
-            [part.reshape(count, -1) for part in own], axis=1
-        )  # (K, m) in the printed order
+        # (K, m) in the printed order
+        place = np.concatenate([part.reshape(count, -1) for part in own], axis=1)
         unknowns, rotors = np.empty(place.size), place[:, ends[2] : ends[3]]
         unknowns[place] = solved.unknowns
         factor = np.ones(place.size)

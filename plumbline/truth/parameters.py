@@ -53,9 +53,8 @@ class Parameter:
     body: int  # 0 … N − 1, and its joint, or a closing joint; −1: gravity; of "spring_…" the spring's number
     entry: str  # component: x, y, z, or xx … yz of the inertia; turn or slide of a joint; empty for scalars
     value: float  # in the unit of the kind; 0 for the angles of attitudes and directions
-    scale: (
-        float  # what a relative mistake is relative to, same unit: |value|, or a natural size where that is 0
-    )
+    # what a relative mistake is relative to, same unit: |value|, or a natural size where that is 0
+    scale: float
 
     @property
     def name(self) -> str:

@@ -27,9 +27,8 @@ from plumbline.model.sampling import derive_seed
 
 PERTURBATION_SIZE = 1e-7  # of each angle [rad], of each rate relative to the largest rate of the motion
 PERTURBATION_COUNT = 4  # random directions
-RENORMALISATION_GROWTH = (
-    1e4  # growth after which a neighbour is moved back, while its distance is still small
-)
+# growth after which a neighbour is moved back, while its distance is still small
+RENORMALISATION_GROWTH = 1e4
 RTOL = 1e-10  # the steps are common, so that motion and neighbours have nearly the same error
 
 HORIZON_TOLERANCE = 1e-9  # m: positions are compared while the error to be expected stays below this

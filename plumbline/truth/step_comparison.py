@@ -464,10 +464,8 @@ def _formula_errors(model: Model, states: Sequence[State]) -> Array:
     for dtype in (np.float64, LongDouble):
         tree = Tree(floats(dtype), model, state)
         solution = tree.solve()
-        each = [
-            *solution.acceleration,
-            *tree.in_bodies(solution.turning),
-        ]  # of a held body one for all states
+        # of a held body one for all states
+        each = [*solution.acceleration, *tree.in_bodies(solution.turning)]
         found.append(np.stack([np.broadcast_to(x, (len(some), 3, 1)) for x in each]))
     size = np.linalg.norm(np.asarray(found[0] - found[1], float)[..., 0], axis=-1).reshape(2, model.n, -1)
     share = float(np.finfo(LongDouble).eps / np.finfo(float).eps)

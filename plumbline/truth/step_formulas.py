@@ -391,9 +391,8 @@ def first_acceleration_bound(model: Model, method: ConstrainedMethod, state: Sta
     np.add.at(levers, model.body[on_body], np.linalg.norm(model.point, axis=-1)[on_body])
     sizes = np.ones((n, 7))
     sizes[:, :3] = np.abs(state.r) + levers[:, None]
-    h = 1e-4 * np.eye(7 * n).reshape(
-        -1, n, 7
-    )  # the derivatives vary over lengths and angles of order 1: exact to 1e-8
+    # the derivatives vary over lengths and angles of order 1: exact to 1e-8
+    h = 1e-4 * np.eye(7 * n).reshape(-1, n, 7)
     C = _constraint_rows(model, q)[0]
     after, before = (_constraint_rows(model, q + change)[0] @ rates for change in (h, -h))
     first, second = np.abs(after - before).T / 2e-4, np.abs(after - 2 * C @ rates + before).T / 1e-8

@@ -162,13 +162,11 @@ class StructuredSystem:
         self.is_linked[self.first_body[:-1]] = 0
         self.slack = np.where(self.rods, 0, np.inf)  # of d, which may be 0 at a ball
         self.pair_inverse_mass = self.inverse_mass + self._at_parent(self.inverse_mass)  # (M,) 1/kg
-        self.child_inverse_mass = self.inverse_mass * self._at_child(
-            np.ones(self.body_count)
-        )  # 0 where nothing is attached to a body
+        # 0 where nothing is attached to a body
+        self.child_inverse_mass = self.inverse_mass * self._at_child(np.ones(self.body_count))
         self.rows_per_joint = 1 if np.all(self.rods) else 3  # c
-        self.constant_blocks = np.zeros(
-            (2 * self.rows_per_joint**2 + 1, self.body_count)
-        )  # D's blocks, see _joints
+        # D's blocks, see _joints
+        self.constant_blocks = np.zeros((2 * self.rows_per_joint**2 + 1, self.body_count))
         if self.has_only_balls:  # I/m, the part that never changes
             self.constant_blocks[0:9:4], self.constant_blocks[9:18:4] = (
                 self.pair_inverse_mass,
@@ -325,9 +323,8 @@ class StructuredSystem:
 
     def _raise_singular(self, q: Array, d: Array | None, certain: bool = True) -> None:
         """Raise SingularSystem that names the chain's body and the cause (E1, E7)."""
-        d = (
-            np.ones((3, self.body_count)) if d is None else np.where(np.isfinite(d), d, 1.0)
-        )  # R is not, where p = 0
+        # R is not, where p = 0
+        d = np.ones((3, self.body_count)) if d is None else np.where(np.isfinite(d), d, 1.0)
         for chain, at in zip(self.chains, self.first_body, strict=False):
             part = slice(at, at + chain.n)
             check_state_solvable(

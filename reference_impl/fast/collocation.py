@@ -246,10 +246,8 @@ class _Stepper:
         if forest.winding:
             self.x = forest.winding.coordinates(q[:3].T, q[3:].T, v[:3].T, v[3:].T, x=forest.x)[0]
         self.x_rate = np.zeros((len(table.c), *self.x.shape))
-        self.q_compensation, self.v_compensation = (
-            np.zeros_like(q),
-            np.zeros_like(v),
-        )  # what rounding took from the sums
+        # what rounding took from the sums
+        self.q_compensation, self.v_compensation = (np.zeros_like(q), np.zeros_like(v))
         self.copies: dict[int, EliminatedSystem] = {}  # by number
         self.modes: Array = np.empty(0)  # (7, S, M) Legendre modes of the last step's accelerations
         self.sweeps = 0
