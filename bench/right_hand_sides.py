@@ -127,7 +127,7 @@ def direct_call(model: Model, state: State) -> tuple[sparse.csc_matrix, Array, C
 
     """
     system, at = DirectSystem(model), maximal_coordinates(state)
-    values, b, *_ = system._entries(*at)
+    values, b, *_ = system._entries(at, None)
     S = sparse.csc_matrix((values, (system._i, system._j)), shape=(system.size, system.size))
     return S, b, lambda: system.solve(*at)
 

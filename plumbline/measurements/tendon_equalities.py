@@ -15,7 +15,7 @@ import numpy as np
 from plumbline.equations.arithmetic import floats
 from plumbline.equations.tree import Tree
 from plumbline.model.datatypes import Array, Model, State
-from plumbline.model.kinematics import angular_velocity, joint_coordinates
+from plumbline.model.kinematics import angular_velocity, joint_coordinates, maximal_coordinates
 from plumbline.model.loops import cut_open, determinate_wrenches
 from plumbline.model.redescription import rods_taken_out
 from reference_impl.direct import DirectSystem

@@ -21,6 +21,8 @@ from plumbline.model.datatypes import (
 )
 from plumbline.model.kinematics import (
     complete_state,
+    depth_first,
+    normalised,
     quaternion_conjugate,
     quaternion_product,
     rotation_matrix,
@@ -48,11 +50,11 @@ def rotate_world(model: Model, state: State, q: Float[Array, "4"]) -> tuple[Mode
         gravity=turn @ model.gravity,
         force=model.force @ turn.T,
         point=np.where(fixed[..., None], model.point @ turn.T, model.point),
-        turn=np.where(fixed[..., None], _normalised(quaternion_product(q, model.turn)), model.turn),
+        turn=np.where(fixed[..., None], normalised(quaternion_product(q, model.turn)), model.turn),
         spring_point=np.where(spring_end[..., None], model.spring_point @ turn.T, model.spring_point),
     )
     vectors = {name: getattr(state, name) @ turn.T for name in ("u", "udot", "r", "v")}
-    p = _normalised(quaternion_product(q, state.p))
+    p = normalised(quaternion_product(q, state.p))
     return rotated, complete_state(rotated, replace(state, p=p, **vectors))
 
 
@@ -73,11 +75,11 @@ def rotate_body_frames(model: Model, state: State, q: Float[Array, "4"]) -> tupl
         model,
         inertia=(inertia + inertia.mT) / 2,
         point=np.where(moving[..., None], model.point @ turn.T, model.point),
-        turn=np.where(moving[..., None], _normalised(quaternion_product(q, model.turn)), model.turn),
+        turn=np.where(moving[..., None], normalised(quaternion_product(q, model.turn)), model.turn),
         moment=model.moment @ turn.T,
         spring_point=np.where(spring_end[..., None], model.spring_point @ turn.T, model.spring_point),
     )
-    p = _normalised(quaternion_product(state.p, quaternion_conjugate(q)))
+    p = normalised(quaternion_product(state.p, quaternion_conjugate(q)))
     return rotated, complete_state(rotated, replace(state, p=p, omega=state.omega @ turn.T))
 
 
@@ -96,10 +98,6 @@ def unrotate(answers: dict[str, Array], vectors: Sequence[str], q: Float[Array, 
     return {name: x @ rotation_matrix(q) if name in vectors else x for name, x in answers.items()}
 
 
-def _normalised(q: Array) -> Array:
-    return np.asarray(q / np.linalg.norm(q, axis=-1, keepdims=True))
-
-
 def siblings_reversed(model: Model) -> Int[Indices, "bodies"]:
     """Order the bodies depth first with the branches on every body, and on the world, in reverse.
 
@@ -107,13 +105,7 @@ def siblings_reversed(model: Model) -> Int[Indices, "bodies"]:
         The bodies in the new order; ascending where no two joints have the same far body.
 
     """
-    order: list[int] = []
-    far = model.body[: model.n, 0]
-    waiting = np.flatnonzero(far < 0).tolist()
-    while waiting:
-        order.append(waiting.pop())
-        waiting += np.flatnonzero(far == order[-1]).tolist()
-    return np.array(order, np.intp)
+    return np.array(depth_first(model.body[: model.n, 0], is_reversed=True), np.intp)
 
 
 def reorder_bodies(model: Model, state: State, order: Int[Indices, "bodies"]) -> tuple[Model, State]:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from plumbline.model.datatypes import Array, Bool, Flags, Float, JointKind, Model, State
+from plumbline.model.datatypes import Array, Bool, Flags, Float, Indices, Int, JointKind, Model, State
 
 _NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])  # of each axis the next and the one after
 
@@ -39,6 +39,11 @@ def rotation_matrix(p: Float[Array, "... 4"]) -> Float[Array, "... 3 3"]:
     A[..., 1, 0], A[..., 1, 1], A[..., 1, 2] = 2 * (xy + wz), s - 2 * (xx + zz), 2 * (yz - wx)
     A[..., 2, 0], A[..., 2, 1], A[..., 2, 2] = 2 * (xz - wy), 2 * (yz + wx), s - 2 * (xx + yy)
     return A / s[..., None, None]
+
+
+def normalised(x: Float[Array, "... n"]) -> Float[Array, "... n"]:
+    """Return vectors or quaternions divided by their lengths."""
+    return np.asarray(x / np.linalg.norm(x, axis=-1, keepdims=True))
 
 
 def rotate_vectors(A: Float[Array, "... m n"], v: Float[Array, "... n"]) -> Float[Array, "... m"]:
@@ -292,7 +297,7 @@ def forward_kinematics(
             )
             d_rate = d_rate + cross(spin, d)
             own = quaternion_product(p[..., far, :], relative) if far >= 0 else relative
-            p[..., k, :] = own / np.linalg.norm(own, axis=-1, keepdims=True)
+            p[..., k, :] = normalised(own)
             A[..., k, :, :] = rotation_matrix(p[..., k, :])
             omega[..., k, :] = rotate_vectors(A[..., k, :, :].mT, spin + turning)
         near = cross(omega[..., k, :], own_point)
@@ -630,9 +635,9 @@ def coordinates_of_joints(
         ]
         rate = ends[1] - ends[0]
         if model.kinds[k].holds_distance:
-            unit = own / np.linalg.norm(own, axis=-1, keepdims=True)
-            along = np.sum(unit * rate, axis=-1, keepdims=True)
-            u[..., at, :], udot[..., at, :] = unit, (rate - unit * along) / model.length[..., k, None]
+            rod = normalised(own)
+            along = np.sum(rod * rate, axis=-1, keepdims=True)
+            u[..., at, :], udot[..., at, :] = rod, (rate - rod * along) / model.length[..., k, None]
             continue
         motions = model.kinds[k].motions
         frame = rotation_matrix(model.turn[..., k, 0, :]).mT @ above.mT
@@ -689,6 +694,19 @@ def bodies_beyond(model: Model) -> Bool[Flags, "bodies bodies"]:
         if far >= 0:
             found[far] |= found[k]
     return found
+
+
+def depth_first(
+    above: Int[Indices, "bodies"], first: int | None = None, is_reversed: bool = False
+) -> list[int]:
+    """Order bodies by their parents (−1: the world), branch by branch, one root before all."""
+    order, step = list[int](), 1 if is_reversed else -1
+    waiting = [int(k) for k in np.flatnonzero(above < 0)[::step] if k != first]
+    waiting += [] if first is None else [first]
+    while waiting:
+        order.append(waiting.pop())
+        waiting += np.flatnonzero(above == order[-1])[::step].tolist()
+    return order
 
 
 def stretched_length(model: Model) -> Float[Array, "bodies"]:

@@ -25,6 +25,7 @@ from plumbline.model.datatypes import (
 from plumbline.model.features import Place, Role
 from plumbline.model.kinematics import (
     complete_state,
+    normalised,
     quaternion_conjugate,
     quaternion_product,
     rotation_matrix,
@@ -93,7 +94,7 @@ def _with_numbers(
         kind=tuple(chosen),
         body=np.stack([np.array(far), np.arange(n)], axis=1),
         point=point,
-        turn=_unit(rng.normal(size=(n, 2, 4))),
+        turn=normalised(rng.normal(size=(n, 2, 4))),
         length=np.where([bool(KINDS[kind].own_number) for kind in chosen], rng.uniform(0.2, 1.0, n), 0.0),
         gravity=np.array([0.7, -0.4, -9.7]),
         force=loads * rng.normal(size=(n, 3)),
@@ -325,7 +326,3 @@ def _moves(model: Model, state: State) -> bool:
     values = np.linalg.svd(J / size)[1]
     moving = J.shape[1] - int(np.sum(cut.model.rods))  # a rod has two rates in three columns
     return J.shape[0] < moving and bool(values[-1] > MIN_FIRST_SINGULAR_VALUE)
-
-
-def _unit(q: Array) -> Array:
-    return np.asarray(q / np.linalg.norm(q, axis=-1, keepdims=True))

@@ -47,6 +47,7 @@ from plumbline.model.datatypes import (
 from plumbline.model.kinematics import (
     complete_state,
     cross,
+    depth_first,
     quaternion_product,
     rotate_vectors,
     rotation_matrix,
@@ -109,7 +110,7 @@ def moved_root(model: Model) -> Rearranged | None:
     for k in path[:-1]:
         above[far[k]] = k
     above[last] = -1
-    place = np.argsort(_depth_first(above, last))
+    place = np.argsort(depth_first(above, last))
     count = len(model.kind)
     joint = np.concatenate([place, np.arange(n, count)])
     is_reversed = np.zeros(count, bool)
@@ -129,21 +130,10 @@ def rods_taken_out(model: Model) -> Rearranged:
 
     """
     n, is_rod = model.n, model.rods
-    place = np.argsort(_depth_first(np.where(is_rod[:n], -1, model.body[:n, 0])))
+    place = np.argsort(depth_first(np.where(is_rod[:n], -1, model.body[:n, 0])))
     closing = n + np.cumsum(~is_rod[n:]) - 1
     joint = np.where(is_rod, -1, np.concatenate([place, closing]))
     return _rearranged(model, joint, np.zeros(len(joint), bool), place)
-
-
-def _depth_first(above: NDArray[np.intp], first: int | None = None) -> list[int]:
-    """Order bodies by their parents (−1: the world), branch by branch, one root before all."""
-    order: list[int] = []
-    waiting = [int(k) for k in np.flatnonzero(above < 0)[::-1] if k != first]
-    waiting += [] if first is None else [first]
-    while waiting:
-        order.append(waiting.pop())
-        waiting += np.flatnonzero(above == order[-1])[::-1].tolist()
-    return order
 
 
 def _rearranged(

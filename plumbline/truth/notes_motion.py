@@ -11,18 +11,19 @@ from typing import Any
 import numpy as np
 
 from plumbline.model.datatypes import Array, Model, State, Trajectory
-from plumbline.model.kinematics import joint_coordinates, quaternion_rate
+from plumbline.model.kinematics import joint_coordinates, maximal_coordinates
+from reference_impl.arrays import Motion
 from reference_impl.fast.collocation import BatchIntegrationResult, integrate_collocation
 from reference_impl.fast.tree_elimination import EliminatedSystem, eliminated_system
 
 Cases = Sequence[tuple[Model, State]]  # of loops all with the same joints between the same bodies
 
 
-def side_by_side(cases: Cases) -> tuple[EliminatedSystem, tuple[Array, Array, Array, Array]]:
+def side_by_side(cases: Cases) -> tuple[EliminatedSystem, Motion]:
     """Return the notes' system of all mechanisms, and r, p, ṙ and ṗ of all bodies."""
     x = np.concatenate([joint_coordinates(*case)[2] for case in cases])
-    r, p, v, w = (np.concatenate([getattr(s, name) for _, s in cases]) for name in ("r", "p", "v", "omega"))
-    return eliminated_system([model for model, _ in cases], x), (r, p, v, quaternion_rate(p, w))
+    start = maximal_coordinates(*(state for _, state in cases))
+    return eliminated_system([model for model, _ in cases], x), start
 
 
 def integrate_batch(cases: Cases, times: Array, rtol: float, **options: Any) -> BatchIntegrationResult:

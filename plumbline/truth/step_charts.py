@@ -34,6 +34,7 @@ from plumbline.model.datatypes import KINDS, EngineFailure, Model, State
 from plumbline.model.kinematics import (
     cross,
     cross_matrix,
+    normalised,
     quaternion_conjugate,
     quaternion_exponential,
     quaternion_product,
@@ -122,8 +123,8 @@ class StepCharts:
         self.state = s = State(
             **{name: np.array([getattr(x, name) for x in states], LongDouble) for name in vars(states[0])}
         )
-        u = _unit(np.where(model.rods[:, None], s.u, UNIT[:3]))
-        attitudes, rods = _unit(s.p), _unit(turn_of_z(u))
+        u = normalised(np.where(model.rods[:, None], s.u, UNIT[:3]))
+        attitudes, rods = normalised(s.p), normalised(turn_of_z(u))
         spins, rod_spins = rotate_vectors(rotation_matrix(attitudes), s.omega), cross(s.u, s.udot)
         axes = np.array([a for a in angle_axes if a is not None], LongDouble).reshape(len(u), -1, 3)
         rest = iter(np.moveaxis(axes, 1, 0) if method.coordinates == "joint angles" else ())
@@ -216,7 +217,7 @@ class StepCharts:
         q = self._by_chart(coordinates)
         for at, chart in zip(q, self.charts, strict=True):
             if chart.is_group:
-                at[..., :4] = _unit(at[..., :4])
+                at[..., :4] = normalised(at[..., :4])
         return q, velocities.astype(LongDouble)
 
     def _by_chart(self, coordinates: Array) -> list[Array]:
@@ -283,7 +284,7 @@ class StepCharts:
     def _turned(self, q: Array, turn: Array) -> Array:
         if self.method.is_rotation_exact:
             return quaternion_product(q, quaternion_exponential(turn / 2))
-        return _unit(quaternion_product(q, np.concatenate([np.ones_like(turn[..., :1]), turn / 2], -1)))
+        return normalised(quaternion_product(q, np.concatenate([np.ones_like(turn[..., :1]), turn / 2], -1)))
 
     def bracket(self, a: Array, b: Array) -> Array:
         """Return the Lie bracket of displacements, chart by chart: a × b of rotations, 0 of numbers.
@@ -467,7 +468,7 @@ class StepCharts:
             if KINDS[name].has_attitude:
                 here = _turned_by(here, self.charts[self.of_body[k]], own)
             else:
-                first, last = _unit(self.model.turn[k].astype(LongDouble))
+                first, last = normalised(self.model.turn[k].astype(LongDouble))
                 here = quaternion_product(here, first)
                 for i, (what, axis) in enumerate(KINDS[name].motions):
                     if what == "turn":
@@ -819,10 +820,6 @@ def _left_jacobian(t: Array) -> Array:
     )
     skew = cross_matrix(t)
     return np.asarray(np.eye(3, dtype=LongDouble) + first * skew + second * (skew @ skew))
-
-
-def _unit(x: Array) -> Array:
-    return np.asarray(x / np.sqrt(np.sum(x * x, -1, keepdims=True)))
 
 
 def solve_definite(S: Array, b: Array) -> Array:

@@ -26,6 +26,7 @@ from plumbline.model.invariants import attitude_error, motion_error, motion_erro
 from plumbline.model.kinematics import (
     angular_velocity,
     joint_coordinates,
+    maximal_coordinates,
     quaternion_rate,
     with_joint_coordinates,
 )
@@ -212,7 +213,7 @@ def simulate_notes_form(
         # absolute tolerances of 1 m, 1, 1 m/s and 1 1/s: those by default are too coarse
         if method == "dop853":
             form, x = fastest_acceleration(model), joint_coordinates(model, state)[2]
-            start = state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
+            start = maximal_coordinates(state)
             run = integrate_dop853(model, *start, times, rtol, form, x=x, atol=rtol)
         else:
             run = integrate_batch([(model, state)], times, rtol, project=True)

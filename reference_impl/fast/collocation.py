@@ -20,6 +20,7 @@ from functools import cache
 import numpy as np
 from numpy.polynomial.legendre import leggauss, legvander
 
+from reference_impl.arrays import Motion
 from reference_impl.fast.chain_elimination import component_first
 from reference_impl.fast.tree_elimination import EliminatedSystem, eliminated_system
 from reference_impl.integrate import IntegrationResult, state_scales
@@ -155,17 +156,7 @@ def integrate_collocation(
     """
     forest = chains if isinstance(chains, EliminatedSystem) else eliminated_system(chains)
     quiet = 0.1 * rtol if sweep_tolerance is None else sweep_tolerance
-    stepper = _Stepper(
-        forest,
-        component_first(r, p),
-        component_first(v, pdot),
-        rtol,
-        quiet,
-        gauss_tables(nodes),
-        dense,
-        baumgarte,
-    )
-    stepper.initialise_scales(r, p, v, pdot)
+    stepper = _Stepper(forest, (r, p, v, pdot), rtol, quiet, gauss_tables(nodes), dense, baumgarte)
     span = float(times[-1] - times[0])
     t, steps, rejected, hindered, done = float(times[0]), 0, 0, 0, 1
     samples = np.empty((2, len(times), 7, forest.body_count))
@@ -227,8 +218,7 @@ class _Stepper:
     def __init__(
         self,
         forest: EliminatedSystem,
-        q: Array,
-        v: Array,
+        motion: Motion,
         rtol: float,
         quiet: float,
         table: GaussTables,
@@ -239,7 +229,8 @@ class _Stepper:
         parts = -(-len(table.c) * forest.body_count // MAX_BODIES_AT_ONCE)
         nodes = np.array_split(np.arange(len(table.c)), min(parts, len(table.c)))
         self.tiles = [(slice(at[0], at[-1] + 1), forest.repeated(len(at))) for at in nodes]
-        self.q, self.v, self.rtol, self.sweep_tolerance = q, v, rtol, quiet
+        self.q, self.v = q, v = component_first(*motion[:2]), component_first(*motion[2:])
+        self.rtol, self.sweep_tolerance = rtol, quiet
         self.dense, self.baumgarte = dense, baumgarte
         # joint coordinates near which the angles of springs are taken, carried on by their rates
         self.x = np.zeros((forest.joint_count, 2))
@@ -251,14 +242,16 @@ class _Stepper:
         self.copies: dict[int, EliminatedSystem] = {}  # by number
         self.modes: Array = np.empty(0)  # (7, S, M) Legendre modes of the last step's accelerations
         self.sweeps = 0
+        self._initialise_scales(motion)
 
-    def initialise_scales(self, r: Array, p: Array, v: Array, pdot: Array) -> None:
+    def _initialise_scales(self, motion: Motion) -> None:
         """Natural sizes (7, M) of q and v, chain by chain, and the first step from their ratio."""
         q_size, v_size = np.empty_like(self.q), np.empty_like(self.v)
         pushed = np.abs(self.forest.acceleration(self.q, self.v))
         for chain, at in zip(self.forest.chains, self.forest.first_body, strict=False):
             body = slice(at, at + chain.n)
-            y = state_scales(chain, r[body], p[body], v[body], pdot[body])
+            r, p, v, pdot = (part[body] for part in motion)
+            y = state_scales(chain, r, p, v, pdot)
             first, second = y[0], y[3 * chain.n]
             q_size[:3, body], q_size[3:, body] = first, second
             v_size[:3, body], v_size[3:, body] = y[7 * chain.n], y[10 * chain.n]

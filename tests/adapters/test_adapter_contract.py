@@ -19,6 +19,7 @@ from plumbline.engines.adapter import UNSUPPORTED_KINDS
 from plumbline.engines.registry import ENGINES, load_adapter
 from plumbline.model import kinematics
 from plumbline.model.datatypes import BadInput, EngineFailure, State, Unsupported
+from plumbline.truth.certified_state import certify_state
 from plumbline.truth.rounding_bound import state_rounding_bound
 from tests.helpers import engine_process as worker
 from tests.helpers import pendulums

@@ -42,11 +42,11 @@ def assert_reported(found: StateQuantities, truth: StateQuantities, bound: Round
 def true_trajectory(model: Model, state: State, times: Array) -> Trajectory:
     """The motion by Taylor's method in extended precision; by the reference where heyoka is missing."""
     try:
-        run = simulate_taylor(model, state, times, "extended")
+        run, steps = simulate_taylor(model, state, times, "extended")
     except TruthUnavailable:
         return reference_trajectory(model, state, times)
     r, p, v, omega = (np.asarray(getattr(run, name), float) for name in ("r", "p", "v", "omega"))
-    return Trajectory(times, r, p, v, quaternion_rate(p, omega), run.steps)
+    return Trajectory(times, r, p, v, quaternion_rate(p, omega), steps)
 
 
 def converging_runs(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from plumbline.model.datatypes import State
-from plumbline.model.kinematics import complete_state, quaternion_rate
+from plumbline.model.kinematics import complete_state, maximal_coordinates, quaternion_rate
 from plumbline.truth.rounding_bound import state_rounding_bound
 from reference_impl.direct import EPS, DirectSystem, Solution
 from reference_impl.euler_parameters import L
@@ -235,6 +235,7 @@ def test_a_rod_short_beside_another_chain_s_is_no_collapsed_one():
 def test_a_collapsed_rod_on_a_body_that_is_not_turned_is_named_too():
     model, state = random_chain(np.random.default_rng(24), [True])
     at = complete_state(model, State(np.array([[1.0, 0, 0, 0]]), state.omega, state.u, state.udot))
+    r, *rest = maximal_coordinates(at)
     with pytest.raises(SingularSystem, match="rod above body 1 has length 0"):
         StructuredSystem([model]).solve(r - at.u * model.length, *rest)
 

@@ -21,9 +21,7 @@ TIMES = np.linspace(0.0, 1.0, 11)
 
 def make_stepper(forest, initial, table):
     """A stepper before its first step, with the scales of the initial values."""
-    stepper = collocation._Stepper(forest, *components(*initial), 1e-6, 1e-7, table, True, baumgarte=0.0)
-    stepper.initialise_scales(*initial)
-    return stepper
+    return collocation._Stepper(forest, initial, 1e-6, 1e-7, table, True, baumgarte=0.0)
 
 
 def run(model, state, rtol, times=TIMES, **options):

@@ -9,6 +9,7 @@ from plumbline.model.datatypes import State
 from plumbline.model.invariants import attitude_error, position_error
 from plumbline.model.kinematics import (
     complete_state,
+    maximal_coordinates,
     quaternion_rate,
     stretched_length,
     with_joint_coordinates,
