@@ -34,7 +34,7 @@ class IntegrationResult:
 
 def pack_state(
     *motion: *Motion,
-) -> Float[Array, "14*bodies"]:
+) -> Float[Array, "entries"]:
     """Concatenate y = (r, p, ṙ, ṗ) (N6)."""
     return np.concatenate([x.ravel() for x in motion])
 
@@ -89,7 +89,7 @@ def notes_acceleration(chain: Mechanism) -> Acceleration:
 def state_scales(
     chain: Mechanism,
     *motion: *Motion,
-) -> Float[Array, "14*bodies"]:
+) -> Float[Array, "entries"]:
     """Return the size that each part of y has in this motion, for absolute tolerances.
 
     A coordinate that passes through zero needs no more digits there than the motion as a whole: the

@@ -149,7 +149,7 @@ def block_diagonal(blocks: Shaped[AnyArray, "n i j"]) -> Shaped[AnyArray, "n*i n
 def assemble_system(
     chain: Mechanism,
     *motion: *Motion,
-) -> tuple[Shaped[AnyArray, "9*bodies 9*bodies"], Shaped[AnyArray, "9*bodies"]]:
+) -> tuple[Shaped[AnyArray, "unknowns unknowns"], Shaped[AnyArray, "unknowns"]]:
     """Assemble S and b of (N5) for one body (S1–S5) or two (D1–D6); every joint is read as a rod.
 
     Args:
@@ -200,7 +200,7 @@ def assemble_system(
 def solve_system(
     chain: Mechanism,
     *motion: *Motion,
-) -> Float[Array, "9*bodies"]:
+) -> Float[Array, "unknowns"]:
     """Solve (N5) for x = (r̈, p̈, λ, λ_E).
 
     Args:

@@ -16,7 +16,16 @@ import numpy as np
 from plumbline.engines.adapter import Adapter
 from plumbline.engines.metamorphic_hooks import MetamorphicHooks
 from plumbline.measurements.relation_result import OPTION_PREFIX, Refusal, RelationResult
-from plumbline.model.datatypes import Array, EngineFailure, Integrator, Model, State, Trajectory, Unsupported
+from plumbline.model.datatypes import (
+    Array,
+    EngineFailure,
+    Float,
+    Integrator,
+    Model,
+    State,
+    Trajectory,
+    Unsupported,
+)
 from plumbline.model.invariants import attitude_error, position_error
 from plumbline.model.kinematics import angular_velocity, stretched_length
 from plumbline.processes.exceptions import describe_exception
@@ -195,7 +204,12 @@ def _check_options(
 
 
 def run_or_refusal(
-    engine: Adapter, model: Model, state: State, times: Array, integrator: str, resolution: float
+    engine: Adapter,
+    model: Model,
+    state: State,
+    times: Float[Array, "samples"],
+    integrator: str,
+    resolution: float,
 ) -> Trajectory | Unsupported | EngineFailure:
     """Simulate a run, or return the exception with which the engine refused it or failed."""
     try:

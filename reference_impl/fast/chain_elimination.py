@@ -93,7 +93,7 @@ class StructuredSystem:
     """
 
     # as of `TreeSystem`: there are no springs on angles
-    x: Array | None = None
+    x: Float[Array, "joints coordinates"] | None = None
     winding: Elements | None = None
 
     def __init__(self, chains: Sequence[Mechanism]) -> None:
@@ -363,7 +363,7 @@ class StructuredSystem:
         q: Float[Array, "7 bodies"],
         v: Float[Array, "7 bodies"],
         baumgarte: float = 0.0,
-        x: Array | None = None,
+        x: Float[Array, "joints coordinates"] | None = None,
     ) -> Float[Array, "7 bodies"]:
         """Return the accelerations, on or off the constraints.
 
