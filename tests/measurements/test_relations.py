@@ -1,7 +1,7 @@
 """Relations that need no truth: they hold on every engine, and each breaks under a defect of its kind."""
 
 from dataclasses import replace
-from functools import cache, partialmethod
+from functools import cache
 from itertools import product
 from unittest.mock import patch
 
@@ -374,11 +374,9 @@ def test_a_scheme_that_is_not_symmetric_does_not_come_back():
 
 def test_accelerations_that_are_not_carried_break_the_way_back():
     class Forgetful(exudyn_adapter()):
-        _run_samples = partialmethod(
-            lambda self, *more, compute_initial_accelerations=True: exudyn_adapter()._run_samples(
-                self, *more, compute_initial_accelerations=True
-            )
-        )
+        def _run_samples(self, chain, times, settings, step):
+            settings.timeIntegration.generalizedAlpha.computeInitialAccelerations = True
+            return super()._run_samples(chain, times, settings, step)
 
     assert relation_result(Forgetful(), "reversed in time").ratio > 1
 
@@ -468,11 +466,11 @@ def test_a_step_too_coarse_to_be_solved_is_taken_finer():
     tried = []
 
     class Stiff(exudyn_adapter()):
-        def _run_samples(self, chain, times, integrator, step, compute_initial_accelerations=True):
+        def _run_samples(self, chain, times, settings, step):
             tried.append(step)
             if step > max(tried) / 4:
                 raise EngineFailure("no convergence")
-            return super()._run_samples(chain, times, integrator, step, compute_initial_accelerations)
+            return super()._run_samples(chain, times, settings, step)
 
     found = relation_result(Stiff(), "reversed in time")
     assert found.ratio < 0.3 and min(tried) == max(tried) / 4
