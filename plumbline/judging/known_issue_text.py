@@ -17,7 +17,7 @@ LINE = 118  # characters
 LARGE = 1e5  # a number that is easier to read with an exponent
 SELECTING = (
     "scenario", "engine", "level", "integrator", "quantity", "verdict", "max_ratio", "max_ratio_by_inertia",
-    "min_bodies", "min_loops", "joints", "shown_by", "intermittent", "extra_refinements_only",
+    "min_bodies", "min_loops", "joints", "failed_calls", "shown_by", "intermittent", "extra_refinements_only",
 )  # fmt: skip
 Entry = dict[str, Any]
 

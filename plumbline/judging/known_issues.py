@@ -42,7 +42,7 @@ from plumbline.diagnosis.cause import CauseKind
 from plumbline.engines.declared_names import declared_integrators, declared_texts
 from plumbline.engines.registry import ENGINES, IMPORTERS, USER_ENGINES
 from plumbline.importers.neutral_model import MODEL_UNITS
-from plumbline.judging.rows import Level, Row, Verdict
+from plumbline.judging.rows import FAILED_CALLS, Level, Row, Verdict
 from plumbline.judging.state_level import SINGULAR_POSE, STATE_UNITS, VARIANT_QUANTITIES
 from plumbline.measurements.relation_result import OTHER_FORMULATIONS, REPEATABILITY, UNEXPLAINED
 from plumbline.measurements.run_relations import REVERSED_IN_TIME
@@ -104,6 +104,7 @@ class KnownIssue:
     min_bodies: int = 0  # with fewer it does not occur
     min_loops: int = 0  # the same of loops
     joints: tuple[str, ...] = ()  # kinds, of which the mechanism has one; empty: any
+    failed_calls: tuple[str, ...] = ()  # names or patterns: no other call failed; empty: any
     mechanism: Mechanism | None = None
     shown_by: str = ""  # the engine whose rows show the mechanism; empty: the row's own
     intermittent: str = ""  # why the verdict may or may not occur; empty: it must
@@ -211,6 +212,10 @@ class KnownIssue:
         """
         if not self.has_cause(row):
             return f"the entry {self.name} records another cause"
+        failed = str(row.extra.get(FAILED_CALLS, "")).split("\n") if self.failed_calls else []
+        for call in failed:
+            if not any(fnmatchcase(call, pattern) for pattern in self.failed_calls):
+                return f"the entry {self.name} does not record that {call or 'no call by name'} fails"
         ratio = math.inf if row.ratio is None else row.ratio
         if not ratio <= covered and covered < math.inf:
             return f"the entry {self.name} covers {covered:g} times the tolerance at most"
@@ -318,6 +323,7 @@ class _Selector(BaseModel):
     min_bodies: PositiveInt | None = _field("The smallest number of bodies with which it occurs.", None)
     min_loops: PositiveInt | None = _field("The smallest number of loops with which it occurs.", None)
     joints: _Texts | None = _field("A kind of joint, or a list: the mechanism has one of them.", None)
+    failed_calls: _Texts | None = _field("The calls that fail, or patterns: no other has failed.", None)
     shown_by: str = _field("The engine whose rows show the mechanism.", "")
     intermittent: str = _field("Why the verdict may or may not occur.", "")
     extra_refinements_only: bool = _field("Whether the nightly's smaller steps alone show it.", False)
@@ -355,7 +361,7 @@ class _Selector(BaseModel):
         own = {one: getattr(self, one) for one in _Selector.model_fields}
         own["engine"] = self.engine or common["engine"]
         own |= {"min_bodies": self.min_bodies or 0, "min_loops": self.min_loops or 0}
-        own |= {"joints": tuple(self.joints or ())}
+        own |= {"joints": tuple(self.joints or ()), "failed_calls": tuple(self.failed_calls or ())}
         lists = {one: own[one] for one in ("scenario", "integrator", "quantity")}
         for names in product(*lists.values()):
             varied = [one for one, given in zip(names, lists.values(), strict=True) if len(given) > 1]

@@ -13,7 +13,16 @@ import numpy as np
 from plumbline.engines.engine_calls import Evaluation
 from plumbline.engines.variants import NoAnswer, VariantKind
 from plumbline.judging.identity import state_fingerprints
-from plumbline.judging.rows import WRONG_CALL, Columns, Deviation, JudgingResult, Row, RowContext, Verdict
+from plumbline.judging.rows import (
+    FAILED_CALLS,
+    WRONG_CALL,
+    Columns,
+    Deviation,
+    JudgingResult,
+    Row,
+    RowContext,
+    Verdict,
+)
 from plumbline.judging.surface_rows import judge_surface
 from plumbline.model.datatypes import Array
 from plumbline.model.loops import MIN_SINGULAR_VALUE
@@ -117,7 +126,7 @@ def judge_variants(context: RowContext, truth: StateTruth, evaluation: Evaluatio
             failed = sorted(names for answer, names in missing if not answer.is_refusal)
             verdict = Verdict.FAILED if failed else Verdict.INFORMATION
             reason = "; ".join(f"by {names}: {answer.message}" for answer, names in missing)
-            extra = {WRONG_CALL: failed[0]} if failed else {}
+            extra = {WRONG_CALL: failed[0], FAILED_CALLS: "\n".join(failed)} if failed else {}
             rows.append(context.make_row("surface", "-", f"all_by_{kind}", verdict, reason, extra=extra))
     return rows
 

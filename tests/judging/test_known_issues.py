@@ -16,7 +16,7 @@ from plumbline.engines.registry import ENGINES, load_adapter
 from plumbline.execution.random_batch import RandomBatch
 from plumbline.execution.runner import RunResult
 from plumbline.judging import known_issues
-from plumbline.judging.rows import RowContext
+from plumbline.judging.rows import FAILED_CALLS, RowContext
 from plumbline.processes.cpu_time import CpuTimes
 from plumbline.scenario.line_and_column_errors import ScenarioError
 from plumbline.storage.results_store import ResultTables
@@ -511,6 +511,22 @@ def test_an_entry_is_about_mechanisms_that_have_what_it_needs(tmp_path, needs, i
     excuses = known_issues.KnownIssues(entries, has_extra_refinements=False)
     (found,) = excuses.mark_known([ratio_row(10.0)], 3, joints=("ball", "rod", "rod", "rod"))
     assert (found.known_issue == "a") is is_known
+
+
+@pytest.mark.parametrize(
+    ("calls", "is_known"),
+    [("mj_island, MjData.iacc", True), ("mj_island, MjData.iacc\nSPARSE", True), ("SPARSE\nDENSE", False),
+     (None, False)],
+)  # fmt: skip
+def test_an_entry_covers_no_other_call_that_fails(tmp_path, calls, is_known):
+    failed_calls = {"failed_calls": ["mj_island,*", "SPARSE"]}
+    entries = loaded(tmp_path, {"scenario": "*", "verdict": "failed", **failed_calls})
+    excuses = known_issues.KnownIssues(entries, has_extra_refinements=False)
+    extra = {} if calls is None else {FAILED_CALLS: calls}
+    row = replace(ratio_row(None, "surface", "all_by_option", verdict="failed"), extra=extra)
+    (found,) = excuses.mark_known([row], 3)
+    assert (found.known_issue == "a") is is_known, found.reason
+    assert is_known or "does not record that" in found.reason
 
 
 def test_each_row_of_an_entry_must_occur(tmp_path):
