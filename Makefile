@@ -35,7 +35,7 @@ test: .venv/test.done reports/node_modules/.tried  ## style, types and the fast 
 	$(MAKE) --jobs 2 lint fast-tests
 
 fast-tests: .venv/test.done
-	$(PYTHON) -m pytest -n 3
+	$(PYTHON) -m pytest -n 4
 
 lint: .venv/test.done  ## style and types only
 	$(PYTHON) -m ruff check .
