@@ -10,6 +10,7 @@ from plumbline.equations.arithmetic import balls as ball_arithmetic
 from plumbline.equations.arithmetic import floats
 from plumbline.equations.tree import Tree
 from plumbline.model.datatypes import KINDS, State
+from plumbline.model.kinematics import minimal_rates
 from plumbline.model.loops import motion_without_inertia
 from plumbline.model.random_mechanisms import ELEMENTS, random_tree
 from plumbline.model.sampling import compared_states, random_states
@@ -122,6 +123,42 @@ def test_long_doubles_have_their_digits(name):
                 for x, y in zip(np.ravel(values), true, strict=True)
             ]
             assert max(errors) <= 3e-18 * balls["scale"].get(quantity, 1.0), quantity
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_forces_of_joints_do_the_work_of_the_wrenches_that_they_stand_for(seed):
+    """At rest without weight the bodies' accelerations x by wrenches w have wᵀx = τᵀ M⁺ τ."""
+    rng = np.random.default_rng(seed)
+    model = random_tree(rng, 6)
+    loads = {name: rng.normal(size=(6, 3)) for name in ("force", "moment")}
+    model = model.changed(gravity=np.zeros(3), **loads)
+    (moving,) = random_states(model, 1, seed)
+    still = {name: np.zeros_like(getattr(moving, name)) for name in ("omega", "udot", "v", "xdot")}
+    state = batch([replace(moving, **still)])
+    tree, moved = Tree(floats(float), model, state), evaluated(floats(float), model, state)
+    turns = np.array([np.broadcast_to(A, (1, 3, 3))[0] for A in tree.A])
+    wrenches = [
+        (F[:, None], (A @ n)[:, None]) for F, n, A in zip(model.force, model.moment, turns, strict=True)
+    ]
+    tau = np.concatenate([np.reshape(part, -1) for part in tree.joint_forces(wrenches)])
+    mass = np.reshape(tree.mass_matrix(is_relative=True), (len(tau), len(tau)))
+    work = np.sum(model.force * moved["acceleration"]) + np.sum(model.moment * moved["angular_acceleration"])
+    inverse = np.linalg.pinv(mass, hermitian=True)  # a rod has no rate along itself
+    assert work == pytest.approx(tau @ inverse @ tau, rel=1e-10)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_mass_matrix_gives_the_kinetic_energy_of_bodies_and_rotors(seed):
+    """Also where only some coordinates of a joint have elements."""
+    rng = np.random.default_rng(seed)
+    model = random_tree(rng, 8, elements=ELEMENTS)
+    some = rng.integers(2, size=model.armature.shape)
+    fields = ("armature", "damping", "stiffness", "rest", "effort")
+    model = model.changed(**{name: getattr(model, name) * some for name in fields})
+    for state in random_states(model, 2, seed):
+        found, rates = evaluated(floats(), model, state), minimal_rates(model, state)
+        energy = rates @ found["mass_matrix"] @ rates / 2
+        assert energy == pytest.approx(float(found["kinetic_energy"]), rel=1e-12)
 
 
 def test_a_batch_is_its_states():

@@ -134,7 +134,14 @@ TEST_FILES = {  # by target or top folder, the tests that must notice its mutant
     ],
     "checker": ["tests/truth/test_certificate_checker.py", "tests/truth/test_certificate_file.py"],
     "prover": ["tests/truth/test_certificate_proof.py"],
-    "equations": ["tests/equations/test_*.py", "tests/truth/test_definition.py"],
+    "equations": [
+        "tests/equations/test_*.py",
+        *(
+            f"tests/truth/test_{name}.py"
+            for name in ("definition", "rounding_bound", "certified_state", "certified_tree")
+        ),
+        *(f"tests/diagnosis/test_{name}.py" for name in ("diagnose", "force_location", "prediction")),
+    ],
 }
 TOKEN = re.compile(r"\"[^\"]*\"|'[^']*'|\w+\.?\w*|[^\w\s]+")
 LiveFunctions = dict[tuple[str, int], list[FunctionType]]  # functions of a file by name and first line
