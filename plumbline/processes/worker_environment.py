@@ -12,7 +12,8 @@ from fnmatch import fnmatchcase
 SINGLE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
 )
-# Which kernels numerical libraries use: some processors need it said, and other kernels round otherwise.
+# Variables that choose the kernels of numerical libraries. Some libraries need them on some processors, and
+# results of different kernels differ in their last digits.
 KERNELS = (
     "OPENBLAS_CORETYPE", "OPENBLAS_L2_SIZE", "NPY_DISABLE_CPU_FEATURES", "MKL_CBWR",
     "MKL_ENABLE_INSTRUCTIONS", "BLIS_ARCH_TYPE", "NVPL_BLAS_DEBUG_CPU_TYPE",
