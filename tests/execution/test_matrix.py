@@ -1,8 +1,8 @@
 """The product as tests: every scenario × engine × level is a test of its own.
 
 `pytest -k "double and mujoco"` runs those of one family and engine; the failure message is the
-verdict's own sentence.  By default the cells that `tests.helpers.fast_matrix` selects run, at fewer states
-than a run compares; `-m full` runs the rest, and the command `nightly` all cells at every state.
+verdict's own sentence.  By default the cells that `tests.helpers.fast_matrix` selects run; `-m full` runs
+the rest.
 """
 
 import os
@@ -10,14 +10,14 @@ import os
 import pytest
 
 from plumbline.engines.registry import ENGINES
-from plumbline.execution.plan import RANDOM_STATES, Plan
+from plumbline.execution.plan import Plan
 from plumbline.execution.runner import describe_engines
 from plumbline.execution.scenario_verdicts import ScenarioRun
 from plumbline.judging import known_issues
 from plumbline.model.invariants import inertia_ratio
 from plumbline.processes.worker_pool import Limits, WorkerPool
 from tests.helpers.catalogue import catalogue_scenarios
-from tests.helpers.fast_matrix import STATES_OF_FAST_CELLS, features, is_fast, levels
+from tests.helpers.fast_matrix import features, is_fast, levels
 
 
 def matrix_cells():
@@ -70,8 +70,7 @@ def test_cell(name, engine, level, workers, engines, truths):
     info = engines[engine]
     if info.missing:
         pytest.skip(info.missing)
-    count = STATES_OF_FAST_CELLS if is_fast(found, level) else RANDOM_STATES
-    plan = Plan([found], [engine], level, limits=Limits(600), random_state_count=count)
+    plan = Plan([found], [engine], level, limits=Limits(600))
     excuses = known_issues.KnownIssues(known_issues.project_known_issues(), has_extra_refinements=False)
     bench = ScenarioRun(plan, found, {engine: info}, known=excuses)
     known_truth = truths.get((name, level))

@@ -32,7 +32,6 @@ STATES = STEPS | {
     "tree-of-seven-sprung": "every joint, load and element in one tree",
     "four-bar": "a loop",
 }
-STATES_OF_FAST_CELLS = 15  # random ones, besides the initial one
 LOADS = ("force", "moment", "drag_force", "drag_moment")
 
 
