@@ -9,8 +9,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from plumbline.engines.registry import load_adapter
+from plumbline.measurements.drift_order import (
+    BLOCK_COUNT,
+    MAX_RELATIVE_DRIFT,
+    DriftWindow,
+    InvariantDrift,
+    LongRun,
+)
 from plumbline.measurements.order_and_limit import step_unit
-from plumbline.model.datatypes import Array, Float, Integrator, Model, State, Trajectory, Unsupported
+from plumbline.model.datatypes import Array, Integrator, Model, State, Trajectory, Unsupported
 from plumbline.model.invariants import (
     INVARIANT_UNITS,
     compute_invariants,
@@ -31,8 +38,6 @@ MAX_BODY_SECONDS = 100.0
 # of `time_unit`: largest drifts are kept up to each, and the end
 WINDOW_ENDS = (0.1, 1.0, 10.0, 100.0, 1000.0)
 MIN_WINDOW = 1.0  # of `time_unit`: shortest run that is tried, decade by decade, where longer ones fail
-MAX_RELATIVE_DRIFT = 0.1  # of an invariant's scale: beyond, the step is too coarse for this motion
-BLOCK_COUNT = 16  # blocks of time in each window
 ADAPTIVE_SAMPLE_SPACING = 0.125  # s between samples of a method with step control, which ends a step at each
 
 
@@ -51,29 +56,6 @@ class LongRunPlan:
         if self.seconds == self.requested_seconds:
             return ""
         return f"; the limit of steps × bodies allows {self.seconds:g} s of {self.requested_seconds:g} s"
-
-
-@dataclass(frozen=True, eq=False)
-class DriftWindow:
-    """The drift of one invariant up to one time, in the invariant's unit."""
-
-    max_drift: float
-    max_drift_first_half: float  # largest in the first half of the window
-    block_drifts: Float[Array, "blocks"]  # largest distance from the value at the block's beginning
-
-
-@dataclass(frozen=True, eq=False)
-class LongRun:
-    """One run, reduced; dictionaries have one entry per window that it reached, by its end [s]."""
-
-    resolution: float  # step [s], or relative tolerance
-    steps: int
-    reached_time: float  # s
-    failure: str | None  # of the longest run that was tried, where a shorter one replaces it
-    work_uncertainty: dict[float, float]  # J
-    invariant_scales: dict[float, dict[str, float]]  # by window and invariant
-    windows: dict[str, dict[float, DriftWindow]]  # by invariant and window
-    cpu_time: float  # s, failed runs included
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,6 +102,10 @@ def run_long_run_study(
 ) -> LongRunStudy:
     """Run at every resolution of a plan; a run that fails is repeated a decade shorter.
 
+    Where a drift falls too slowly one more run, with half the step, decides: the blocks of a run are not
+    independent.  A violent moment opens the joints of an index-2 method for all times after it, so that all
+    its later blocks drift too far (ten balls with Exudyn's trapezoidal method: orders 1.8, 1.0 and then 3.6).
+
     Args:
         sample_interval: the scenario's time between samples [s].
         plan: length and resolutions.
@@ -132,13 +118,15 @@ def run_long_run_study(
 
     """
     adapter = load_adapter(engine)
-    spacing = _sample_spacing(adapter.integrator(integrator), model, sample_interval, plan)
+    method = adapter.integrator(integrator)
+    spacing = _sample_spacing(method, model, sample_interval, plan)
 
     def runs_until(end: float, is_checked: bool) -> LongRunStudy | float:
         """All runs; where they are checked and a pose may be singular, when [s]."""
         lengths = [t for t in _window_ends(end, plan) if t >= min(MIN_WINDOW * plan.time_unit, end)]
         runs: list[LongRun] = []
-        for resolution in plan.resolutions:
+        resolutions = list(plan.resolutions)
+        for resolution in resolutions:
             begin, failure, trajectory = time.process_time(), None, None
             for seconds in reversed(lengths):
                 try:
@@ -156,6 +144,8 @@ def run_long_run_study(
             doubt = _first_doubt(model, state, trajectory, runs[-1], end) if is_checked else None
             if doubt is not None:
                 return doubt
+            if len(runs) == len(plan.resolutions) and _falls_too_slowly(runs, method, plan):
+                resolutions.append(resolution**2 / resolutions[-2])  # the loop goes on with it
         return LongRunStudy(runs, plan)
 
     study = runs_until(plan.seconds, is_checked=model.has_loops)
@@ -166,6 +156,21 @@ def run_long_run_study(
         assert isinstance(study, LongRunStudy)
         study = replace(study, singular=singular)
     return study
+
+
+def decisive_windows(run: LongRun, quantity: str, plan: LongRunPlan) -> list[float]:
+    """The ends [s] of the windows of a run that are long enough to decide, longest first."""
+    ends = sorted(run.windows[quantity], reverse=True)
+    return [end for end in ends if end >= MIN_WINDOW * plan.time_unit] or [run.reached_time]
+
+
+def _falls_too_slowly(runs: list[LongRun], integrator: Integrator, plan: LongRunPlan) -> bool:
+    """Whether some drift falls slower than the method's order."""
+    return any(
+        InvariantDrift(runs, integrator, quantity, end).falls_too_slowly
+        for quantity in runs[-1].windows
+        for end in decisive_windows(runs[-1], quantity, plan)
+    )
 
 
 def leaves_range(run: LongRun, seconds: float) -> bool:

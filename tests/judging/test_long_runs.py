@@ -6,14 +6,12 @@ import pytest
 from plumbline.engines.registry import load_adapter
 from plumbline.execution.plan import Plan
 from plumbline.execution.runner import run_plan
-from plumbline.judging.long_runs import DriftOrder, judge_long_runs
+from plumbline.judging.long_runs import judge_long_runs
 from plumbline.judging.rows import RowContext
 from plumbline.measurements import long_run_study
+from plumbline.measurements.drift_order import BLOCK_COUNT, DriftOrder, DriftWindow, InvariantDrift, LongRun
 from plumbline.measurements.long_run_study import (
-    BLOCK_COUNT,
     MAX_BODY_STEPS,
-    DriftWindow,
-    LongRun,
     LongRunPlan,
     leaves_range,
     plan_long_run,
@@ -65,6 +63,7 @@ def test_a_chaotic_motion_keeps_what_is_conserved_for_100_s():
     energy = rows["energy_drift_long"]
     assert energy.level == "invariants" and energy.compared_until == 100.0 and energy.declared_order == 4
     assert 3.5 < energy.order < 5.5
+    assert energy.reason.endswith("over steps 0.0078125 … 0.00195312")  # three runs
     by = [energy.extra[f"by {t:g} s"] for t in (0.1, 1, 10, 100)]
     assert by == sorted(by) and by[-1] == energy.value < 1e-5
 
@@ -115,6 +114,7 @@ def test_another_order_than_its_name_is_seen(use_defect):
     rows = run_long("tumbling-ball", use_defect(DEFECTS["order-2-named-RK4"]), "RK4", 12.5)
     row = rows["energy_drift_long"]
     assert row.verdict == "disagrees" and row.order < 3.5 and "required 3.9" in row.reason
+    assert "0.0078125 … 0.000976562" in row.reason  # a fourth run confirms it
 
 
 @pytest.mark.full
@@ -198,6 +198,25 @@ def test_a_drift_that_grows_as_a_power_of_time_leaves_its_range_earlier():
     assert leaves_range(run(5e-5, 5e-3), 10.0)  # quadratic: 0.5
     assert leaves_range(run(5e-2, 5e-2), 10.0)  # at least linear: 0.5
     assert not leaves_range(run(0.0, 5e-3), 10.0)
+
+
+def test_a_fourth_run_decides_where_two_runs_drift_too_far():
+    """As where joints open at a violent moment and stay open, which is no matter of the step."""
+    blocks = np.random.default_rng(3).uniform(1.0, 2.0, BLOCK_COUNT) * 1e-3
+    method = Integrator("trapezoidal", "step", 2)
+
+    def falls_too_slowly(*factors):
+        runs = []
+        for k, factor in enumerate(factors):
+            drift = DriftWindow(1.0, 1.0, blocks * factor)
+            windows, scales = {"momentum_drift": {25.0: drift}}, {25.0: {"momentum_drift": 100.0}}
+            runs.append(LongRun(2.0**-k, 25 * 2**k, 25.0, None, {}, scales, windows, 0.0))
+        return InvariantDrift(runs, method, "momentum_drift", 25.0).falls_too_slowly
+
+    assert not falls_too_slowly(1, 1 / 4, 1 / 16)
+    assert falls_too_slowly(1, 1.5 / 4, 2.5 / 16)
+    assert not falls_too_slowly(1, 1.5 / 4, 2.5 / 16, 1 / 64)
+    assert falls_too_slowly(1, 1.5 / 4, 2.5 / 16, 2.5 / 32)
 
 
 def test_the_jackknife_knows_a_common_motion_from_two():
