@@ -7,7 +7,9 @@ mechanism:
                      interpolation of these lead back to q.  d = q ⊖ q₋ has ḋ = ∂d/∂q v, and v is the velocity
                      that `dIntegrate` makes of it; q̇ = T v gives v by T's inverse.
     derivatives      terms of velocities are of second degree, so that
-                     v̇ = ½ ∂v̇/∂v v + ∂v̇/∂τ (τ − g), of closed loops too.
+                     v̇ = ½ ∂v̇/∂v v + ∂v̇/∂τ (τ − g), of closed loops too.  Of trees ∂v̇/∂τ is M⁻¹, and has lost
+                     digits (pinocchio-computeMinverse-loses-digits): it is compared by itself, and taken off
+                     ∂v̇/∂v, M v̇ = ½ (∂v̇/∂τ)⁻¹ ∂v̇/∂v v + τ − g.
     data             forces and momenta summed over all joints are those of the mechanism.
 """
 
@@ -237,11 +239,15 @@ def _add_mimic_momenta(s: Probed, along_axis: bool) -> None:
 def _add_forward_derivatives(s: Probed) -> None:
     m, (q, v, a), data = s.m, s.motion, s.m.createData()
     tau, g = pin.rnea(m, data, q, v, a).copy(), pin.computeGeneralizedGravity(m, data, q).copy()
+    M = s.square(pin.crba(m, m.createData(), q))
     _, by_v, by_tau = pin.computeABADerivatives(m, data, q, v, tau)
     inverse = np.triu(s.square(by_tau))
     inverse = inverse + np.triu(inverse, 1).T
-    by = "computeABADerivatives", "Data.ddq_dv", "Data.ddq_dtau"
-    s.add_accelerations(by, s.square(by_v) @ v / 2 + inverse @ (tau - g), "by_aba")
+    by = "computeABADerivatives", "Data.ddq_dtau"
+    s.add_forces("momentum_through_inverse_by_aba", {by: M @ (inverse @ (M @ v))})
+    velocity_terms = np.linalg.solve(inverse, s.square(by_v) @ v / 2)
+    by = "computeABADerivatives", "Data.ddq_dv"
+    s.add_accelerations(by, np.linalg.solve(M, velocity_terms + tau - g), "by_inverse")
 
 
 def _add_batch(s: Probed) -> None:

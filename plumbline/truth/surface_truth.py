@@ -410,6 +410,7 @@ _BY_ALGORITHM = {
     "by_map_rate": ("momentum_rate", "centroidal_angular_momentum_rate"),
     "by_coriolis_matrix": ("inverse_dynamics",),
     "by_constraint_solver": ("frame_acceleration", "frame_angular_acceleration"),
+    "by_inverse": ("frame_acceleration", "frame_angular_acceleration"),
     "by_aba": (
         "inverse_dynamics", "momentum_through_inverse", "frame_acceleration", "frame_angular_acceleration",
     ),

@@ -1,6 +1,7 @@
 """What is Pinocchio's own: the digits of its algorithms, massless rods, limits of a column."""
 
 import multiprocessing
+from dataclasses import replace
 from functools import wraps
 
 import numpy as np
@@ -8,6 +9,8 @@ import pytest
 
 from plumbline.model import kinematics
 from plumbline.model.datatypes import Unsupported
+from plumbline.model.random_mechanisms import random_tree
+from plumbline.model.sampling import random_states
 from plumbline.scenario.loader import find_scenario_file, load_scenario
 from plumbline.truth.certified_state import certify_state
 from tests.helpers import engine_process as worker
@@ -20,6 +23,7 @@ Chain, Pinocchio = pinocchio_engine.PinocchioChain, pinocchio_engine.Pinocchio
 PinocchioMaximal = maximal.PinocchioMaximal
 
 TIMES = np.linspace(0, 2, 5)
+EPS = np.finfo(float).eps
 
 
 def in_engine_process(test):
@@ -57,6 +61,25 @@ def test_aba_loses_the_symmetry_of_articulated_inertias():
     assert all(error["crba", n] < 1e-10 for n in (10, 30, 50)), error
     assert error["aba", 10] < 1e-12 and error["aba", 30] > 1e-10 and error["aba", 50] > 1e-5, error
     assert asymmetry[10] < 1e-14 and asymmetry[50] > 1e-6, asymmetry
+
+
+@in_engine_process
+def test_derivatives_of_forward_dynamics_lose_digits_by_their_inverse_alone():
+    """A rod of 0.1 kg and a ball of 100 kg: ∂v̇/∂v is -∂v̇/∂τ ∂τ/∂v to rounding, and ∂v̇/∂τ is not M⁻¹."""
+    model = random_tree(np.random.default_rng(70), 2, ("ball", "rod"))
+    scale = np.array([0.1, 100.0]) / model.mass
+    model = replace(model, mass=model.mass * scale, inertia=model.inertia * scale[:, None, None])
+    (state,) = random_states(model, 1, 70)
+    chain = Chain(model, "crba")
+    m, data, (q, v), zero = chain.pin_model, chain.data, chain.coordinates(state), chain.zero_torque
+    M = pin.crba(m, data, q)
+    _, by_v, inverse = (x.copy() for x in pin.computeABADerivatives(m, data, q, v, zero))
+    inverse = np.triu(inverse) + np.triu(inverse, 1).T
+    of_torque = pin.computeRNEADerivatives(m, data, q, v, zero)[1]
+    lost, own = (np.max(np.abs(x @ M - np.eye(m.nv))) for x in (inverse, np.linalg.inv(M)))
+    assert own < m.nv * EPS * np.linalg.cond(M) and lost > 1e4 * m.nv * EPS * np.linalg.cond(M)
+    products = np.abs(inverse) @ np.abs(of_torque) @ np.abs(v)  # two here, two there, of nv terms
+    assert np.all(np.abs(by_v @ v + inverse @ of_torque @ v) < 4 * m.nv * EPS * products)
 
 
 @in_engine_process
