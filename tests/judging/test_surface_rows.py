@@ -95,6 +95,15 @@ def test_angles_near_their_singularity_are_allowed_the_digits_that_they_lose():
     assert np.all((lost > 5e3) & (lost < 1e4))
 
 
+def test_a_fast_body_that_hardly_turns_has_its_forces_by_implicit_steps():
+    model, states = mechanism(("free",), bodies=1)
+    v, omega = (x / np.linalg.norm(x) for x in (states[0].v, states[0].omega))
+    fast = complete_state(model, replace(states[0], v=1e4 * v, omega=omega))
+    answers = answers_of("mujoco", model, [fast])
+    assert any("mj_implicit" in call for call in answers["inverse_dynamics"])
+    assert set(verdicts(state_truth(model, [fast]), answers).values()) == {Verdict.AGREES}
+
+
 @pytest.mark.parametrize("engine", ["pinocchio", "exudyn"])
 def test_bodies_of_a_loop_are_compared_and_a_relative_change_of_1e_6_is_seen(engine):
     (s,) = load_scenarios(["slider-crank"])
