@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from plumbline.judging.refinement_analysis import RefinementAnalysis
-from plumbline.judging.rows import Row, Verdict, first_decided
+from plumbline.judging.rows import Row, Verdict, first_decided, with_unit
 from plumbline.measurements.order_and_limit import observed_order
 from plumbline.measurements.refinement_study import ROUNDING_PER_STEP, rounding_floor
 from plumbline.model.datatypes import Array
@@ -44,7 +44,7 @@ def _invariant_row(study: RefinementAnalysis, quantity: str, unit: str, samples:
     floor, per_step = rounding_floor(steps, scale, accepted), ROUNDING_PER_STEP + accepted
     work_uncertainty = last.work_uncertainty if quantity == "energy_drift" else 0.0
     drift = np.maximum.accumulate(np.max(np.linalg.norm(samples[-1], axis=-1), axis=1))
-    rounding = f"{steps} steps, {per_step:.1g} × {scale:.3g} {unit} each: {floor:.2g}"
+    rounding = f"{steps} steps, {per_step:.1g} × {with_unit(scale, unit, 3)} each: {floor:.2g}"
 
     def row(
         verdict: Verdict,
@@ -69,7 +69,7 @@ def _invariant_row(study: RefinementAnalysis, quantity: str, unit: str, samples:
     except ValueError as error:
         failure = str(error)
     if drift[end] <= floor:
-        reason = f"{name} {drift[end]:.2g} {unit}: rounding"
+        reason = f"{name} {with_unit(drift[end], unit)}: rounding"
         ratio = float(drift[end] / floor)
         return row(Verdict.AGREES, reason, end, floor, ratio=ratio, limit_tolerance=float(tolerance[end]))
     if failure:
@@ -81,7 +81,9 @@ def _invariant_row(study: RefinementAnalysis, quantity: str, unit: str, samples:
         at = number - 1
         to_limit = float(np.max(np.linalg.norm((samples[-1] - limit.y)[:number], axis=-1)))
         allowed = to_limit + float(tolerance[at])
-        at_zero = f"{limit_drift[at]:.2g} ± {tolerance[at]:.2g} {unit} at step zero, t ≤ {times[at]:g} s"
+        at_zero = (
+            f"{limit_drift[at]:.2g} ± {with_unit(tolerance[at], unit)} at step zero, t ≤ {times[at]:g} s"
+        )
         derivation = (
             f"{to_limit:.2g} from the finest step to step zero, itself ± {limit.uncertainty[at]:.2g}; "
             f"{rounding}; the work by quadrature ± {work_uncertainty:.2g}"
@@ -89,12 +91,12 @@ def _invariant_row(study: RefinementAnalysis, quantity: str, unit: str, samples:
         ratio = float(limit_drift[at] / tolerance[at])
         extra = {"limit": float(limit_drift[at]), "limit_tolerance": float(tolerance[at])}
         if limit_drift[at] <= tolerance[at] <= DETECTABLE_PARAMETER_ERROR * scale:
-            reason = f"{name} {drift[at]:.2g} {unit} at the finest step, {at_zero}"
+            reason = f"{name} {with_unit(drift[at], unit)} at the finest step, {at_zero}"
             return row(Verdict.AGREES, reason, at, allowed, derivation, ratio, **extra)
         if limit_drift[at] > tolerance[at] and is_trusted:
             reason = f"{name} does not vanish with the step: {at_zero}"
             return row(Verdict.DISAGREES, reason, at, float(tolerance[at]), derivation, ratio, **extra)
-        reason = f"{name} {drift[at]:.2g} {unit}: {at_zero} does not decide"
+        reason = f"{name} {with_unit(drift[at], unit)}: {at_zero} does not decide"
         return row(Verdict.UNRESOLVED, reason, at, allowed, derivation, ratio, **extra)
 
     found = first_decided(judge_window(number) for number in study.window_lengths(float(times[-1])))

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from plumbline.judging.rows import JudgingResult, Row, RowContext, Verdict, first_decided
+from plumbline.judging.rows import JudgingResult, Row, RowContext, Verdict, first_decided, with_unit
 from plumbline.judging.trajectory_level import singular_motion_row
 from plumbline.measurements.drift_order import (
     BLOCK_COUNT,
@@ -124,17 +124,17 @@ class _DriftJudge:
     def judge_window(self, drift: InvariantDrift) -> Row:
         """The verdict in one window."""
         floor = drift.allowed_drift
-        summary = f"{self.name} {drift.max_drift:.2g} {self.unit} within {drift.end:g} s"
+        summary = f"{self.name} {with_unit(drift.max_drift, self.unit)} within {drift.end:g} s"
         if drift.max_drift > floor:
             return self.judge_order(drift, summary)
         cause = "rounding"
         if self.integrator.kind == "tolerance":
             cause = f"the error that the tolerance {self.finest.resolution:g} accepts in every step"
         steps = f"{self.finest.steps} steps in {self.finest.reached_time:g} s"
-        derivation = f"{steps}, a scale of {drift.scale:.3g} {self.unit}"
+        derivation = f"{steps}, a scale of {with_unit(drift.scale, self.unit, 3)}"
         if floor <= DETECTABLE_PARAMETER_ERROR * drift.scale:
             return self.verdict_row(Verdict.AGREES, f"{summary}: {cause}", drift, floor, derivation)
-        reason = f"{summary}: {floor:.2g} {self.unit} may be {cause}"
+        reason = f"{summary}: {with_unit(floor, self.unit)} may be {cause}"
         return self.verdict_row(Verdict.UNRESOLVED, reason, drift, floor, derivation)
 
     def judge_order(self, drift: InvariantDrift, summary: str) -> Row:
@@ -156,7 +156,7 @@ class _DriftJudge:
             f"{usable[0].resolution:g} … {self.finest.resolution:g}"
         )
         derivation = (
-            f"mean drift within {BLOCK_COUNT} blocks of time {whole.fine_mean:.2g} {self.unit}, "
+            f"mean drift within {BLOCK_COUNT} blocks of time {with_unit(whole.fine_mean, self.unit)}, "
             f"{whole.coarse_mean:.2g} at the coarsest: {observed} ({SIGMA_FACTOR:g} σ of the blocks), "
             f"required {required:.3g}, rounding {drift.rounding_floor(BLOCK_COUNT):.2g}"
         )
@@ -186,15 +186,16 @@ class _DriftJudge:
         elif unstable:
             (a, b), verdict = unstable[0], Verdict.UNRESOLVED
             reason = (
-                f"an unstable motion: {self.name} {self.windows[a].max_drift:.2g} {self.unit} by {a:g} s, "
-                f"{self.windows[b].max_drift:.2g} by {b:g} s, faster than a bounded drift or a leak grows"
+                f"an unstable motion: {self.name} {with_unit(self.windows[a].max_drift, self.unit)} by "
+                f"{a:g} s, {self.windows[b].max_drift:.2g} by {b:g} s, faster than a bounded "
+                "drift or a leak grows"
             )
         else:
             is_bounded = growth < MAX_SYMMETRIC_GROWTH
             verdict = Verdict.AGREES if is_bounded else Verdict.DISAGREES
             outcome = "bounded" if is_bounded else "it grows with time, although the method is symmetric"
             reason = (
-                f"{self.name} {first_half:.2g} {self.unit} by {end / 2:g} s, {window.max_drift:.2g} by "
+                f"{self.name} {with_unit(first_half, self.unit)} by {end / 2:g} s, {window.max_drift:.2g} by "
                 f"{end:g} s: {outcome}"
             )
             derivation = (
@@ -220,7 +221,9 @@ class _DriftJudge:
             reason += f"; in {self.study.plan.seconds:g} s {self.finest.failure}"
         elif end < self.finest.reached_time:
             last = self.windows[self.finest.reached_time].max_drift
-            reason += f"; {last:.2g} {self.unit} within {self.finest.reached_time:g} s, which does not decide"
+            reason += (
+                f"; {with_unit(last, self.unit)} within {self.finest.reached_time:g} s, which does not decide"
+            )
         if self.integrator.kind == "tolerance":
             order = None
         return self.make_row(

@@ -46,6 +46,11 @@ class Verdict(StrEnum):
         return VERDICT_STYLES[self]
 
 
+def with_unit(size: float, unit: str, digits: int = 2) -> str:
+    """Return a size in its unit, in words; a number without a dimension has none."""
+    return f"{size:.{digits}g}" if unit == "1" else f"{size:.{digits}g} {unit}"
+
+
 class VerdictStyle(NamedTuple):
     """How a verdict is shown and ranked."""
 

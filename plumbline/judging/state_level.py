@@ -22,6 +22,7 @@ from plumbline.judging.rows import (
     Row,
     RowContext,
     Verdict,
+    with_unit,
 )
 from plumbline.judging.surface_rows import judge_surface
 from plumbline.model.datatypes import Array
@@ -140,7 +141,7 @@ def _judge_quantity(
     unit = STATE_UNITS[quantity]
     row = _quantity_row(context, quantity, unit, worst, looseness, truth.method, evaluation.cpu_time)
     if limit_error := float(np.max(_limit_errors(quantity, evaluation))):
-        share = f"; of it up to {limit_error:.2g} {unit} is the uncertainty of the engine's limit"
+        share = f"; of it up to {with_unit(limit_error, unit)} is the uncertainty of the engine's limit"
         extra = row.extra | {"limit_error": limit_error}
         row = replace(row, derivation=row.derivation + share, extra=extra)
     return row, worst, deviation
@@ -231,8 +232,8 @@ def _quantity_row(
     if ratio > 1:
         verdict = Verdict.DISAGREES
         reason = (
-            f"the {name} of {context.title} is off by {error[at]:.3g} {unit} at {where}, {ratio:.3g} times "
-            f"the rounding bound; {int(np.sum(ratios > 1))} of {count} states disagree"
+            f"the {name} of {context.title} is off by {with_unit(error[at], unit, 3)} at {where}, "
+            f"{ratio:.3g} times the rounding bound; {int(np.sum(ratios > 1))} of {count} states disagree"
         )
     elif compared and 2 * compared >= count:
         verdict = Verdict.AGREES
@@ -250,7 +251,7 @@ def _quantity_row(
         value=float(error[at]),
         tolerance=float(bound[at]),
         ratio=ratio,
-        derivation=f"first-order rounding bound per body and state, {bound[at]:.2g} {unit} at {where}, "
+        derivation=f"first-order rounding bound per body and state, {with_unit(bound[at], unit)} at {where}, "
         f"and at most {loosest:.1g} of the scale at {count} states, {MAX_RELATIVE_BOUND:g} at {compared} of "
         f"them; truth: {method}",
         cpu_time=cpu_time,

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from plumbline.engines.engine_calls import StepEvaluation
-from plumbline.judging.rows import JudgingResult, Row, RowContext, Verdict
+from plumbline.judging.rows import JudgingResult, Row, RowContext, Verdict, with_unit
 from plumbline.model.datatypes import EngineFailure, Integrator, Model, State, StepRun
 from plumbline.model.loops import keeps_dependent_rows
 from plumbline.model.step_methods import ConstrainedMethod, JointSpaceMethod
@@ -147,7 +147,7 @@ def _row(
         verdict = Verdict.DISAGREES
         reason = (
             f"{context.title} does not take the declared step of {integrator.name}: {name} off by "
-            f"{error[at]:.3g} {unit} ({place}), {ratio:.3g} times the rounding bound"
+            f"{with_unit(error[at], unit, 3)} ({place}), {ratio:.3g} times the rounding bound"
         )
     elif not ratio <= 1 or np.mean(is_sharp) < 0.5:
         verdict = Verdict.UNRESOLVED
@@ -161,7 +161,7 @@ def _row(
     return context.make_row(
         "step", integrator.name, quantity, verdict, reason, unit,
         value=float(error[at]), tolerance=float(bound[at]), ratio=ratio, alias_of=alias, cpu_time=cpu_time,
-        derivation=f"{bound[at]:.2g} {unit} at {place}; in the median {np.median(looseness):.1g} "
+        derivation=f"{with_unit(bound[at], unit)} at {place}; in the median {np.median(looseness):.1g} "
         "of the accelerations' effect on a step; truth: the declared formula in extended precision "
         "(docs/integrators.md)",
         extra={"comparisons": float(error.size), "bound_relative": float(np.max(looseness)),
@@ -220,7 +220,9 @@ def _left_out_words(found: StepDeviations, unit: str) -> tuple[str, float]:
     words = f"; {np.count_nonzero(left_out)} steps have no bound: {', '.join(causes)}"
     if wrong:
         size = float(np.max(found.errors[left_out][is_off]))
-        words += f", of which {wrong} differ by more than one would allow, at most by {size:.3g} {unit}"
+        words += (
+            f", of which {wrong} differ by more than one would allow, at most by {with_unit(size, unit, 3)}"
+        )
     return words, float(wrong)
 
 
@@ -245,8 +247,8 @@ def _run_row(
         reason = (
             f"{context.title} does not take the declared step of {integrator.name}: {what} is off first at "
             f"step {first + 1} (t = {run.trajectory.t[first]:.6g} s), and at {len(wrong)} in all; at most by "
-            f"{found.errors[worst, column]:.3g} {unit} at step {worst + 1}, {ratio:.3g} times the rounding "
-            "bound"
+            f"{with_unit(found.errors[worst, column], unit, 3)} at step {worst + 1}, {ratio:.3g} times the "
+            "rounding bound"
         )
         if quantity != "run_mean":
             extra |= {"first_step": first + 1.0, "wrong_steps": float(len(wrong))}
@@ -274,7 +276,7 @@ def _run_row(
         "step", integrator.name, quantity, verdict, reason, unit,
         value=float(found.errors[worst, column]), tolerance=float(found.bounds[worst, column]), ratio=ratio,
         alias_of=alias, cpu_time=cpu_time, extra=extra,
-        derivation=f"{found.bounds[worst, column]:.2g} {unit} at step {worst + 1}"
+        derivation=f"{with_unit(found.bounds[worst, column], unit)} at step {worst + 1}"
         + f", body {body + 1}" * has_bodies + "; truth: the declared formula in extended precision, from the "
         "engine's own sample before (docs/integrators.md)",
     )  # fmt: skip

@@ -9,7 +9,7 @@ import numpy as np
 
 from plumbline.engines.engine_calls import Evaluation
 from plumbline.engines.missing_names import FAILED_PARTS, MISSING_NAMES
-from plumbline.judging.rows import WRONG_CALL, Row, RowContext, Verdict
+from plumbline.judging.rows import WRONG_CALL, Row, RowContext, Verdict, with_unit
 from plumbline.model.datatypes import Array
 from plumbline.truth.ground_truth import StateTruth
 from plumbline.truth.rounding_bound import MAX_RELATIVE_BOUND
@@ -58,7 +58,9 @@ def _row(context: RowContext, quantity: str, true: SurfaceTruth, evaluation: Eva
     sharp, count, loosest = int(np.sum(looseness <= MAX_RELATIVE_BOUND)), len(scale), float(np.max(looseness))
     if ratio > 1:
         verdict = Verdict.DISAGREES
-        reason = f"{context.title}: the {name} by {call} is off by {error:.3g} {unit} at state {state}, "
+        reason = (
+            f"{context.title}: the {name} by {call} is off by {with_unit(error, unit, 3)} at state {state}, "
+        )
         reason += f"{ratio:.3g} times the rounding bound"
         reason += f"; by {', '.join(others)} too" if others else ""
     elif 2 * sharp >= count:

@@ -26,6 +26,7 @@ from plumbline.judging.rows import (
     RowContext,
     Verdict,
     first_decided,
+    with_unit,
 )
 from plumbline.judging.state_level import SINGULAR_POSE
 from plumbline.measurements.order_and_limit import ORDER_CHANGE_FACTOR, ORDER_MARGIN
@@ -255,7 +256,7 @@ def _rows_against_truth(study: RefinementAnalysis, quantity: _ComparedQuantity) 
         ratio=float(off[at] / tolerance[at]),
         derivation=f"up to t = {end:g} s: limit ({how}) ± {limit_uncertainty[at]:.2g}, "
         f"truth ({study.truth.method}) ± {quantity.truth_uncertainty[at]:.2g}, "
-        f"rounding {study.rounding_description} × {quantity.scale:.3g} {unit} = {rounding[at]:.2g}; "
+        f"rounding {study.rounding_description} × {with_unit(quantity.scale, unit, 3)} = {rounding[at]:.2g}; "
         f"a mistake of {DETECTABLE_PARAMETER_ERROR:g} in a parameter changes it by "
         f"{quantity.detectable[at]:.2g}",
         extra={
@@ -269,7 +270,7 @@ def _rows_against_truth(study: RefinementAnalysis, quantity: _ComparedQuantity) 
         method,
         name,
         Verdict.INFORMATION,  # own ≤ estimate where the limit agrees, by the triangle inequality
-        f"{name} at {resolution} {finest:g} is {own:.2g} {unit} from the truth, "
+        f"{name} at {resolution} {finest:g} is {with_unit(own, unit)} from the truth, "
         f"the refinement study estimates {estimate:.2g}{found.remark}",
         unit,
         value=own,
@@ -291,21 +292,22 @@ def _judge_windows(
     def judge_window(at: int) -> _WindowVerdict:
         until = f"up to t = {study.times[at]:g} s"
         if off[at] <= tolerance[at] <= detectable[at]:
-            reason = f"{name} limit within {off[at]:.2g} {unit} of the truth {until}"
+            reason = f"{name} limit within {with_unit(off[at], unit)} of the truth {until}"
             return _WindowVerdict(Verdict.AGREES, reason, at)
         if off[at] <= tolerance[at]:
             reason = (
-                f"uncertainty {tolerance[at]:.2g} {unit} {until} is above the {detectable[at]:.2g} {unit} "
-                f"that a mistake of {DETECTABLE_PARAMETER_ERROR:g} would make"
+                f"uncertainty {with_unit(tolerance[at], unit)} {until} is above the "
+                f"{with_unit(detectable[at], unit)} that a mistake of {DETECTABLE_PARAMETER_ERROR:g} "
+                "would make"
             )
         elif is_trusted:
             reason = (
-                f"the {name} at step zero is {off[at]:.3g} {unit} from the truth {until}, "
+                f"the {name} at step zero is {with_unit(off[at], unit, 3)} from the truth {until}, "
                 f"{off[at] / tolerance[at]:.3g} times the uncertainties"
             )
             return _WindowVerdict(Verdict.DISAGREES, reason, at)
         else:
-            reason = f"{name} limit {off[at]:.2g} {unit} off {until}, but no order is observed"
+            reason = f"{name} limit {with_unit(off[at], unit)} off {until}, but no order is observed"
         return _WindowVerdict(Verdict.UNRESOLVED, reason, at)
 
     found = first_decided(judge_window(number - 1) for number in study.window_lengths(study.horizon))

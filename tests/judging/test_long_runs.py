@@ -66,6 +66,8 @@ def test_a_chaotic_motion_keeps_what_is_conserved_for_100_s():
     assert energy.reason.endswith("over steps 0.0078125 … 0.00195312")  # three runs
     by = [energy.extra[f"by {t:g} s"] for t in (0.1, 1, 10, 100)]
     assert by == sorted(by) and by[-1] == energy.value < 1e-5
+    norm = rows["norm_drift_long"]
+    assert norm.reason.startswith(f"norm drift {norm.value:.2g} within 100 s")  # no unit
 
 
 def test_a_step_too_coarse_for_100_s_is_judged_where_it_is_not():
