@@ -293,10 +293,14 @@ def start_warm_process(modules: Sequence[str] = ()) -> BaseContext:
     _keep_sockets_in_scratch_folder()
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([_WARM_MODULE, *modules])
+    resource_tracker.ensure_running()  # its start unblocks SIGINT
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # for the warm process: Ctrl-C is ours
     try:
         forkserver.ensure_running()  # in this thread: the warm process ends with the thread that started it
     except OSError:  # the path of its socket has at most 107 bytes, and TMPDIR may be longer
         return multiprocessing.get_context("spawn")
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
     return context
 
 
@@ -332,6 +336,7 @@ def initialize_worker(scratch: str, gigabytes: float, parent: int, environment: 
         if number := getattr(signal, name, None):
             signal.signal(number, usual)
     if hasattr(os, "setsid"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # blocked by `start_warm_process`
         os.setsid()  # Ctrl-C and what an engine sends to its process group stay apart
     die_with_parent(parent)
     with contextlib.suppress(ImportError, ValueError, OSError):  # no such limit on Windows

@@ -141,6 +141,26 @@ def test_faults_are_reported_at_once_and_change_no_other_task(tmp_path):
     assert [outcomes[str(i)][1] for i in range(len(FAULTS))] == [2 * i for i in range(len(FAULTS))]
 
 
+def test_ctrl_c_while_the_libraries_load_reaches_the_command_alone(tmp_path):
+    (tmp_path / "slow_library.py").write_text("open('loading', 'w').close()\nimport time\ntime.sleep(1)\n")
+    script = parent_script(tmp_path, """
+        from plumbline.processes.worker_pool import start_warm_process
+        sys.path.insert(0, sys.argv[1])
+        signal.signal(signal.SIGINT, lambda *_: print('interrupted'))
+        start_warm_process(['slow_library'])
+        while not Path('loading').exists():
+            time.sleep(0.01)
+        os.killpg(0, signal.SIGINT)
+        with WorkerPool(1) as workers:
+            print(*(o.value for o in workers.run([Task(0, double, (3,))])))
+    """)  # fmt: skip
+    command = [sys.executable, script, tmp_path]
+    ran = subprocess.run(
+        command, cwd=tmp_path, start_new_session=True, capture_output=True, text=True, timeout=100
+    )
+    assert (ran.stdout, ran.stderr) == ("interrupted\n6\n", "")
+
+
 def test_an_engine_that_forks_answers_once():
     with WorkerPool(1) as workers:
         tasks = [Task(0, come_back_twice, engine="e"), Task(1, double, (3,), engine="e")]
