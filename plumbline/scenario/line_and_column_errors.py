@@ -75,6 +75,11 @@ def did_you_mean(word: str, known: Sequence[str]) -> str:
     return f"did you mean {close!r}?" if close else ""
 
 
+def in_brackets(hint: str) -> str:
+    """Write a hint that may be empty after what is wrong."""
+    return f" ({hint})" if hint else ""
+
+
 def nearest_or_all(word: str, known: Iterable[str]) -> str:
     """Suggest the known word that is nearest to a misspelt one, or list all of them."""
     names = list(known)

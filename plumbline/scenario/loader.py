@@ -33,6 +33,7 @@ from plumbline.scenario.line_and_column_errors import (
     ScenarioError,
     closest_match,
     did_you_mean,
+    in_brackets,
     shorten,
 )
 from plumbline.scenario.schema import (
@@ -218,8 +219,8 @@ def find_scenario_file(name: str | Path) -> Path:
         return path
     valid = "a path of a YAML, URDF or MJCF file, or a name that `plumbline list scenarios` shows"
     near = closest_match(str(name), [*known, *FAMILIES], cutoff=0.6)
-    hint = f". did you mean {f'`--family {near}`' if near in FAMILIES else repr(near)}?" if near else ""
-    message = f"unknown scenario{hint}"
+    hint = f"did you mean {f'`--family {near}`' if near in FAMILIES else repr(near)}?" if near else ""
+    message = f"unknown scenario{in_brackets(hint)}"
     raise ScenarioError([Problem(shorten(str(name)), 0, 0, "", message, valid)])
 
 
@@ -285,7 +286,7 @@ def build_scenario(source: YamlSource, path: Path) -> Scenario:
     for name, array in {**model.fields, **vars(state)}.items():
         if name != "kind" and not np.all(np.abs(array) <= MAX_MAGNITUDE):
             what = f"has numbers that make {name} larger than {MAX_MAGNITUDE:g}"
-            raise source.fatal_error(what, "SI numbers of a pendulum", (1, 1))
+            raise source.fatal_error(what, "numbers in SI units", (1, 1))
     sizes = np.linalg.norm(model.inertia, axis=(1, 2))
     for body in np.flatnonzero((sizes > 0) & (sizes < MIN_INERTIA)):
         raise source.fatal_error(
@@ -400,9 +401,10 @@ def _parent_of(bodies: list[Body], k: int, far: list[int]) -> tuple[int, str, st
         given, earlier = repr(body.parent), [i for i, name in enumerate(names[:k]) if name == body.parent]
         if not earlier:
             hint = did_you_mean(str(body.parent), [name for name in names[:k] if name])
-            why = "which is not above this body" if body.parent in names else f"no body's name. {hint}"
+            unknown = f"no body's name{in_brackets(hint)}"
+            why = "which is not above this body" if body.parent in names else unknown
             valid = "the name of a body above this one, or world"
-            return -1, "parent", f"is {given}, {why}".strip(" ."), valid
+            return -1, "parent", f"is {given}, {why}", valid
         if len(earlier) > 1:
             return -1, "parent", f"is {given}, the name of {len(earlier)} bodies", "a name that one body has"
         parent = earlier[0]
@@ -464,7 +466,7 @@ def _body_named(name: str, bodies: list[Body], *, may_be_world: bool) -> tuple[i
     if name == "world" and may_be_world:
         return -1, ""
     hint = did_you_mean(name, [other for other in names if other])
-    return -1, f"is {name!r}, no body's name. {hint}".strip(" .")
+    return -1, f"is {name!r}, no body's name{in_brackets(hint)}"
 
 
 def _add_closing_joints(tree: Model, document: Document, closed: NDArray[np.intp]) -> Model:

@@ -691,7 +691,7 @@ class Document(SchemaModel):
     )
     gravity: Vector = _field("Acceleration of gravity, world frame.", "m/s²", [0.0, 0.0, -9.81])
     bodies: list[ChainItem] = _field(
-        "The chain, from the pivot outwards: single and repeated bodies.", min_length=1, max_length=MAX_BODIES
+        "Bodies, single or repeated, each after its parent.", min_length=1, max_length=MAX_BODIES
     )
 
     springs: list[Spring] = _field("Springs and dampers between points.", default=[])

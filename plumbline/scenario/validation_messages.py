@@ -14,7 +14,13 @@ from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 from plumbline.model.datatypes import KINDS as JOINT_KINDS
-from plumbline.scenario.line_and_column_errors import Problem, closest_match, did_you_mean, shorten
+from plumbline.scenario.line_and_column_errors import (
+    Problem,
+    closest_match,
+    did_you_mean,
+    in_brackets,
+    shorten,
+)
 from plumbline.scenario.schema import SCHEMA_VERSION, Body, BodySequence, Document
 from plumbline.scenario.yaml_source import PathKey, YamlSource, dotted_path
 
@@ -134,8 +140,8 @@ def _unknown_field(name: str, at: _Location, root: type[BaseModel]) -> str:
     """Say where a field belongs that stands elsewhere, or which one may be meant."""
     own, elsewhere = list(_fields(at.model)), _places(root)
     if name in elsewhere:
-        own_hint = did_you_mean(name, own) if closest_match(name, own, cutoff=0.75) else ""
-        return f"`{name}` is a field of {_belongs(name, at, root)}. {own_hint}"
+        own_hint = "; " + did_you_mean(name, own) if closest_match(name, own, cutoff=0.75) else ""
+        return f"`{name}` is a field of {_belongs(name, at, root)}{own_hint}"
     near = closest_match(name, [*own, *elsewhere])
     if near in own or not near:
         return did_you_mean(name, own)
@@ -181,14 +187,14 @@ def _message_and_valid(error: ErrorDetails, at: _Location, root: type[BaseModel]
             return "is missing", _field_description(info)
         case "extra_forbidden":
             words = _unknown_field(str(error["loc"][-1]), at, root)
-            return f"unknown field. {words}".strip(" ."), "one of " + ", ".join(_fields(at.model))
+            return "unknown field" + in_brackets(words), "one of " + ", ".join(_fields(at.model))
         case "literal_error" if error["loc"][-1:] == ("schema_version",):
             words = f"is {_quote(given)}; this version of Plumbline reads {SCHEMA_VERSION}"
             return words, str(SCHEMA_VERSION)
         case "literal_error":
             options = [str(o) for o in _literals(info.annotation if info else None)]
             hint = did_you_mean(str(given), options)
-            return f"is {_quote(given)}. {hint}".strip(" ."), "one of " + ", ".join(options)
+            return f"is {_quote(given)}" + in_brackets(hint), "one of " + ", ".join(options)
         case "union_tag_not_found":
             close = [k for k in given if did_you_mean(k, ["kind"])] if isinstance(given, dict) else []
             hint = f" ({_quote(close[0])} is not a field of it)" if close else ""
@@ -208,6 +214,8 @@ def _message_and_valid(error: ErrorDetails, at: _Location, root: type[BaseModel]
             return f"is {_quote(given)}", f"a number {BOUNDS[kind]} {bound:g}"
         case "model_type" | "model_attributes_type" | "dict_type" if not error["loc"]:
             return f"is {_describe_value(given)}", "a mapping that starts with schema_version: 1"
+        case "model_type" | "model_attributes_type" if info is None:  # an item of a file that is a list
+            return f"is {_describe_value(given)}", "a mapping with " + ", ".join(_fields(at.model))
         case "too_short" | "too_long":
             bound = context.get("min_length", context.get("max_length"))
             # pairs, vectors, quaternions, six, matrix

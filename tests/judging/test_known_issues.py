@@ -307,6 +307,14 @@ def test_an_id_of_another_file_is_refused_with_both_places(tmp_path, text):
     assert f" is used twice, first at {first}:1; valid would be an id of its own" in str(problem)
 
 
+def test_an_entry_that_is_no_mapping_is_refused_with_the_fields_of_one(tmp_path):
+    (tmp_path / "known.yaml").write_text("- 1\n")
+    with pytest.raises(
+        ScenarioError, match=r":1:3: \[0\]: is the number 1; valid would be a mapping with scenario,"
+    ):
+        known_issues.load_known_issues(tmp_path / "known.yaml")
+
+
 def test_two_entries_of_one_line_are_two(tmp_path):
     entry = "{id: a, scenario: rest, engine: mujoco, verdict: failed, evidence: e, reason: r}"
     (tmp_path / "known.yaml").write_text(f"[{entry}, {entry}]")

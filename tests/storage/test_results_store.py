@@ -190,7 +190,7 @@ def test_temporary_files_of_a_killed_run_are_removed(tmp_path):
         (lambda d: d["rows"][0].update(value="x"), "rows[0].value: is the text 'x', not a number"),
         (
             lambda d: d["rows"][0].update(verdict="agree"),
-            "rows[0].verdict: is 'agree'. did you mean 'agrees'?",
+            "rows[0].verdict: is 'agree' (did you mean 'agrees'?)",
         ),
         (lambda d: d["rows"][0].update(scenario="t"), "rows[0].scenario is 't'; valid would be one of the"),
         (lambda d: d["rows"][0].pop("reason"), "rows[0].reason: is missing"),
