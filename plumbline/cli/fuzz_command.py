@@ -105,7 +105,8 @@ def fuzz(
             is_interrupted = True
         written = list(write_findings(result, folder, command_line()))
     new = result.new
-    summary = f"{count_noun(result.scenario_count, 'scenario')}, {count_noun(len(new), 'new finding')}"
+    summary = f"{count_noun(result.scenario_count, 'mechanism')}, {count_noun(len(new), 'new finding')}"
+    summary += "" if result.scenario_count else ": nothing was compared in time"
     log(f"{summary}, {time.monotonic() - began:.0f} s")
     if as_json:
         print_json([f.record() for f in result.findings])
@@ -117,4 +118,4 @@ def fuzz(
             click.echo(f"smallest mechanism: {path}")
     if is_interrupted:
         sys.exit(ExitCode.INTERRUPTED)
-    sys.exit(ExitCode.DISAGREEMENT if new else ExitCode.SUCCESS)
+    sys.exit(result.exit_code)

@@ -69,6 +69,11 @@ class FuzzResult:
         """Those that nothing expects."""
         return [finding for finding in self.findings if finding.needs_attention]
 
+    @property
+    def exit_code(self) -> ExitCode:
+        """That of `run`: also where nothing was compared, it is not 0."""
+        return ExitCode.DISAGREEMENT if self.new or not self.scenario_count else ExitCode.SUCCESS
+
     def as_run(self) -> RunResult:
         """The rows that need a look as those of one run."""
         tables = ResultTables()
@@ -88,7 +93,7 @@ class FuzzResult:
             "started": self.started.isoformat(timespec="seconds"),
             "duration": (datetime.now(UTC) - self.started).total_seconds(),
             "sentence": f"{self.scenario_count} mechanisms of seed {self.seed}, {len(self.new)} new findings",
-            "exit_code": int(ExitCode.DISAGREEMENT if self.new else ExitCode.SUCCESS),
+            "exit_code": int(self.exit_code),
             "random_batch": None,
         }
         return found
