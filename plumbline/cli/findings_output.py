@@ -15,7 +15,7 @@ from plumbline.judging.known_issues import KnownIssue
 from plumbline.judging.rows import SHOWN_STYLES, Row, Verdict, shown_verdict
 from plumbline.scenario.line_and_column_errors import shorten
 
-WIDTH = 80  # columns, where the terminal is no wider
+WIDTH = 80  # columns, in a pipe and of lines that cut what does not fit
 MAX_REASON = 2000  # characters of what an engine raised
 MAX_FINDINGS = 20  # written out; the report has all
 
@@ -28,10 +28,11 @@ def describe_run(
     Args:
         rows: of the run.
         findings: of `find_findings`.
-        width: of the lines, in columns.
+        width: of the lines, in columns; at least `WIDTH`, so that names stay whole.
         verdict_count: rows of random scenarios that are only counted.
 
     """
+    width = max(width, WIDTH)
     new = [f for f in findings if f.needs_attention and f.verdict != Verdict.HARNESS_FAILED]
     for finding in new[:MAX_FINDINGS]:
         yield from finding_lines(finding, width)
@@ -63,7 +64,7 @@ def finding_lines(finding: Finding, width: int) -> list[str]:
 def recorded_line(finding: Finding, width: int) -> str:
     """Describe a recorded finding in one line: in fewer words where the whole is too long."""
     shown, ratio = shown_verdict(finding.verdict, finding.known_issue), finding.largest_ratio
-    size, short = ("", "") if ratio is None else (f", up to {ratio:.2g} tolerances", f", × {ratio:.2g}")
+    size, short = ("", "") if ratio is None else (f", up to {ratio:.2g} × tolerance", f", {ratio:.2g} × tol.")
     rows = _count_rows(finding)
     texts = [f"{finding.name}: {x}" for x in (coverage(finding) + size, rows + size, rows + short)]
     text = next((text for text in texts if len(text) <= width - 2), texts[-1])
@@ -123,7 +124,7 @@ def explain(
     if issue is not None:
         yield ""
         yield f"recorded as {finding.known_issue}:"
-        yield from wrap(issue.reason, width, "  ")
+        yield from wrap(issue.explanation, width, "  ")
         yield from wrap(f"Evidence: {issue.evidence}", width, "  ")
         if issue.since:
             yield f"  Since version {issue.since}."
@@ -135,14 +136,15 @@ def explain(
     yield ""
     yield f"{coverage(finding)}; smallest scenario first:"
     for row in finding.rows:
-        ratio = "" if row.ratio is None else f"  {row.ratio:.3g} tolerances"
+        ratio = "" if row.ratio is None else f"  {row.ratio:.3g} × tolerance"
         yield f"  {row.style.glyph} {row.key}{ratio}"
     smallest = finding.rows[0]
     if smallest.reason != finding.sentence:
         yield ""
         yield from wrap(f"In {smallest.scenario}: {smallest.reason}", width, "")
-    if smallest.diagnosis and smallest.diagnosis != finding.sentence:
-        yield from wrap(smallest.diagnosis, width, "")
+    diagnosis = smallest.diagnosis or ""
+    if diagnosis not in ("", finding.sentence, issue and issue.diagnosis):
+        yield from wrap(diagnosis, width, "")
     yield ""
     level = "state" if smallest.level == "surface" else smallest.level
     option = f" --level {level}" if level in ("state", "step", "trajectory") else ""

@@ -23,6 +23,7 @@ from plumbline.cli.terminal_output import (
     log,
     make_console,
     print_json,
+    print_legend,
 )
 from plumbline.cli.verdict_matrix import coloured_glyph, engine_heading
 from plumbline.engines.environments import is_optional_importer
@@ -152,7 +153,9 @@ def model(
     else:
         for file in result.files:
             _print_file(file, result)
-        _print_missing(result)
+        if result.files:
+            print_legend(row for file in result.files for row in file.rows)
+            _print_missing(result)
     for problem in result.problems[:MAX_LISTED_PROBLEMS]:
         log(str(problem))
     if folder is not None:
@@ -272,9 +275,9 @@ def _print_missing(result: ModelRunResult) -> None:
     absent = [name for name in result.plan.importers if result.engines[name].missing]
     optional = [n for n in absent if is_optional_importer(n) and not result.engines[n].version]
     if optional:
-        it = "it" if len(optional) == 1 else "them"
+        it, importers = ("it", "importer") if len(optional) == 1 else ("them", "importers")
         way = "pip" if IS_INSTALLED else "`make importers`"
-        click.echo(f"{glyph} {', '.join(optional)}: not installed here; {way} installs {it}")
+        click.echo(f"{glyph} {importers} of {', '.join(optional)}: not installed here; {way} installs {it}")
     for name in absent:
         if name not in optional:
             click.echo(f"{glyph} {name}: {result.engines[name].missing}")

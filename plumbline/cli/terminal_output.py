@@ -40,7 +40,7 @@ def make_console(file: Any) -> Console:
 
 def line_width(out: Console) -> int:
     """Return the width of sentences: that of a terminal or of COLUMNS; in a pipe 80 columns."""
-    return WIDTH if out.width == PIPED_WIDTH else max(WIDTH, min(out.width, MAX_WIDTH))
+    return WIDTH if out.width == PIPED_WIDTH else min(out.width, MAX_WIDTH)
 
 
 def wrap_items(items: Iterable[str], width: int) -> str:
@@ -170,6 +170,12 @@ def print_findings(
     out = make_console(sys.stdout)
     for line in describe_run(rows, findings, line_width(out), verdict_count or {}):
         out.print(line)
+    print_legend(rows)
+
+
+def print_legend(rows: Iterable[Row]) -> None:
+    """Print the glyphs of rows with their words on stdout."""
+    out = make_console(sys.stdout)
     out.print(f"[dim]{escape(wrap_items(legend(rows), line_width(out)))}[/]")
 
 

@@ -125,8 +125,12 @@ class KnownIssue:
         if not (self.mechanism or self.cause or self.needs is not None):
             return None
         since = f" Since version {self.since}." if self.since else ""
-        mechanism = f"{MECHANISMS[self.mechanism]}. " if self.mechanism else ""
-        return f"recorded: {mechanism}{self.reason}{since}"
+        return f"recorded: {self.explanation}{since}"
+
+    @property
+    def explanation(self) -> str:
+        """The recorded mechanism, if any, and the reason."""
+        return f"{MECHANISMS[self.mechanism]}. {self.reason}" if self.mechanism else self.reason
 
     def has_cause(self, row: Row) -> bool:
         """Return whether the diagnosis of a row's cell names what is recorded."""

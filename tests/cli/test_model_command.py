@@ -38,6 +38,7 @@ def test_importers_that_agree_exit_with_0_and_a_table(tmp_path):
     assert "✗" not in result.stdout
     assert "not compared: 1 × limit" in result.stdout
     assert "left open: 1 × link without <inertial>" in result.stdout
+    assert "✓ agrees  i information" in result.stdout
 
 
 @pytest.fixture(scope="module")

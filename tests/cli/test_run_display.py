@@ -6,13 +6,16 @@ from unittest.mock import patch
 
 import pytest
 
+from plumbline.cli.findings_output import explain
 from plumbline.cli.run_display import RunDisplay
-from plumbline.cli.terminal_output import make_console, print_matrix
+from plumbline.cli.terminal_output import line_width, make_console, print_matrix
 from plumbline.cli.verdict_matrix import VerdictMatrix
 from plumbline.engines.adapter import EngineInfo
 from plumbline.execution.exit_codes import ExitCode
 from plumbline.execution.plan import Plan, RunObserver
 from plumbline.execution.runner import run_plan
+from plumbline.judging.findings import find_findings
+from plumbline.judging.known_issues import MECHANISMS, KnownIssue, KnownIssues
 from plumbline.judging.rows import SHOWN_STYLES, Row, Verdict
 from plumbline.scenario import loader
 from tests.helpers.commands import invoke
@@ -120,6 +123,23 @@ def test_a_pipe_has_the_width_columns_or_room_for_everything(monkeypatch, column
 def test_a_terminal_keeps_its_width(monkeypatch):
     monkeypatch.setenv("COLUMNS", "77")
     assert make_console(Terminal()).width == 77
+
+
+@pytest.mark.parametrize(("columns", "width"), [("60", 60), ("", 80), ("500", 160)])
+def test_sentences_have_the_width_of_the_terminal(monkeypatch, columns, width):
+    monkeypatch.setenv("COLUMNS", columns)
+    assert line_width(make_console(StringIO())) == width
+
+
+def test_a_record_is_printed_once():
+    issue = KnownIssue(
+        "a", "rest", "mujoco", "disagrees", "measured", "the axis is read twice", mechanism="rounding"
+    )
+    known = KnownIssues([issue], has_extra_refinements=False)
+    (finding,) = find_findings(known.mark_known([row("rest", "disagrees", 2.0)], 1), {"rest": 1})
+    shown = " ".join(explain(finding, issue, {}, 1000, ""))
+    assert shown.count("read twice") == shown.count(MECHANISMS["rounding"]) == 1
+    assert shown.count("2 × tolerance") == 1
 
 
 @pytest.mark.parametrize("width", [30, 40, 80, 200])
