@@ -23,8 +23,8 @@ from reports.junit import add_suite
 def serve(engine: str) -> None:
     """Answer protocol 1 on standard input and output for a Python adapter.
 
-    ENGINE is FILE.py:Class or package.module:Class, in its own environment; elsewhere it is the engine
-    'cmd:plumbline serve ENGINE'.
+    ENGINE is FILE.py:Class or package.module:Class. Start it in the environment that has the engine; a run in
+    another environment names it --adapter 'cmd:plumbline serve ENGINE'.
     """
     from plumbline.engines.registry import load_adapter
     from plumbline.engines.serve import serve_standard_streams

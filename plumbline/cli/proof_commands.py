@@ -88,7 +88,7 @@ def prove(names: tuple[str, ...], duration: float | None, precision: Any, out: P
 @options.limits_options(3600.0)
 @options.json_option
 def verify(files: tuple[Path, ...], expected: str | None, jobs: int, limits: Limits, as_json: bool) -> None:
-    """Prove certificates again, with nothing but python-flint and NumPy; print of what they are a proof.
+    """Prove certificates again, with nothing but python-flint and NumPy; print what each one proves.
 
     The proof is of the numbers in the certificate: it says which scenario of the catalogue has exactly
     these numbers, whatever the certificate's own field `scenario` claims. The checker is one file, which

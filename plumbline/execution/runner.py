@@ -189,7 +189,9 @@ def run_plan(
         "commit": git_commit(),
         "python": platform.python_version(),
         "versions": {name: info.version for name, info in result.engines.items()},
-        "truth": "; ".join(f"{method} ({n} scenarios)" for method, n in run.truth_methods.most_common()),
+        "truth": "; ".join(
+            f"{method} ({n} scenario{'s' * (n != 1)})" for method, n in run.truth_methods.most_common()
+        ),
         "level": plan.level,
         "states": plan.random_state_count + 1,
         "sentence": summarize_verdicts(result),

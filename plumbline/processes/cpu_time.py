@@ -105,7 +105,7 @@ class CpuTimes:
             return f"CPU {total:.1f} s: {parts}"
         calls = sum(self.seconds[kind] for kind in ("engines", "reference", "truth", "diagnosis"))
         return (
-            f"CPU {total:.1f} s: {parts}; over the engines' own time: harness "
+            f"CPU {total:.1f} s: {parts}; as a share of the engines' time: harness "
             f"{100 * (total - calls) / engines:.0f} %, truth and reference "
             f"{100 * (calls - engines) / engines:.0f} %"
         )

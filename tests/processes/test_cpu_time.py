@@ -38,7 +38,7 @@ def test_calls_are_counted_by_the_engine_called():
     for key, cost in costs.items():
         split.add_outcome(Outcome(key, cpu_time=cost), key.cpu_time_kind)
     assert [split.seconds[k] for k in ("truth", "reference", "engines", "diagnosis")] == [1.0, 2.0, 4.0, 8.0]
-    assert "over the engines' own time" not in split.summary(), "too little to compare with"
+    assert "as a share of the engines' time" not in split.summary(), "too little to compare with"
     split.add_outcome(Outcome(key, cpu_time=4.0), "engines")
     assert "harness 0 %, truth and reference 138 %" in split.summary()
 
