@@ -12,7 +12,7 @@ from typing import Any, cast
 
 import exudyn
 import numpy as np
-from exudyn import kinematicTree, rigidBodyUtilities, robotics
+from exudyn import graphics, kinematicTree, rigidBodyUtilities, robotics
 
 from adapters.exudyn_common import (
     EXPLICIT,
@@ -31,6 +31,9 @@ from plumbline.model.datatypes import Array, EngineFailure, Float, Model
 utilities: Any = rigidBodyUtilities  # as below, functions are untyped
 trees: Any = kinematicTree
 robots: Any = robotics
+# To make the shapes of links, which nothing here draws, takes longer than the tree. One shape replaces all.
+_SHAPE = graphics.Lines([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+_UNDRAWN = robots.VRobotLink(showMBSjoint=False, showCOM=False, graphicsData=[_SHAPE])
 LONG_STEP = 1.0  # s: of one step of Euler's method, in which v₁ = v₀ + h a to rounding
 
 
@@ -54,7 +57,7 @@ def robot_of(links: Sequence[Any], gravity: Float[Array, "3"]) -> Any:
         robot.AddLink(
             robots.RobotLink(
                 link.mass, link.centre, link.inertia, preHT=pose_of(link), jointType=short_type(link),
-                parent=link.parent,
+                parent=link.parent, visualization=_UNDRAWN,
             )
         )  # fmt: skip
     return robot
@@ -66,11 +69,14 @@ def _add_by_tree_links(mbs: Any, links: Sequence[Any], gravity: Array, rates: Ar
         inertia = utilities.RigidBodyInertia()
         inertia.SetWithCOMinertia(link.mass, link.inertia, link.centre)
         made.append(
-            utilities.TreeLink(inertia, jointType=link.joint, jointHT=pose_of(link), parent=link.parent)
+            utilities.TreeLink(
+                inertia, jointType=link.joint, jointHT=pose_of(link), parent=link.parent, graphicsDataList=[]
+            )
         )
     tree = mbs.CreateKinematicTree(
-        listOfTreeLinks=made, initialCoordinates_t=rates.tolist(), gravity=gravity.tolist()
-    )
+        listOfTreeLinks=made, initialCoordinates_t=rates.tolist(), gravity=gravity.tolist(),
+        baseGraphicsDataList=[],
+    )  # fmt: skip
     return mbs.GetObject(tree)["nodeNumber"], tree
 
 
