@@ -65,6 +65,7 @@ from plumbline.model.datatypes import (
 )
 from plumbline.model.kinematics import (
     JointFrame,
+    cross,
     elastic_energy,
     minimal_rates,
     own_rates,
@@ -182,11 +183,11 @@ class _Linkage:
         u = self.state.u[k]
         start = 3 * int(np.sum(self.model.rods[:k]))
         target = np.zeros_like(self._spin)  # the rod's u × u̇
-        target[:, start : start + 3] = np.cross(u, np.eye(3)).T
+        target[:, start : start + 3] = cross(u, np.eye(3)).T
         relative = target - self._spin
         turning = relative @ self.nu
         z = _unit_vector(turning - u * (u @ turning), _fallback_axis(u, self.model.gravity))
-        axes = np.stack([u, np.cross(z, u), z], axis=1)
+        axes = np.stack([u, cross(z, u), z], axis=1)
         self._add_revolutes(2, axes, relative, k)
         self._hang = np.array([self.model.length[k], 0.0, 0.0])
 
@@ -202,7 +203,7 @@ class _Linkage:
         relative = self._body_spins[k] - self._spin
         z = _unit_vector(relative @ self.nu, _fallback_axis(A @ near, model.gravity))
         x = _perpendicular_unit(z)
-        axes = np.stack([x, np.cross(z, x), z], axis=1)
+        axes = np.stack([x, cross(z, x), z], axis=1)
         self._add_revolutes(3, axes, relative, k)
         self._carry_body(k, near)
 
@@ -216,7 +217,7 @@ class _Linkage:
         kind = self.model.kinds[k]
         if kind.exchanges_axes:  # the link between has x of the far and y of the near body
             x, y = joint.axes(self.state.x[k])[0].axis, axes[:, 1]
-            axes = np.stack([x, y, np.cross(x, y)], axis=1)
+            axes = np.stack([x, y, cross(x, y)], axis=1)
         self._hang = self._hang + self._axes.T @ shift
         for i, (what, axis) in enumerate(joint.motions):
             name = ("Revolute" if what == "turn" else "Prismatic") + "XYZ"[axis]
@@ -366,12 +367,12 @@ def _unit_vector(wanted: Array, fallback: Array) -> Array:
 
 def _fallback_axis(arm: Array, gravity: Array) -> Array:
     """Return the axis (3,) about which gravity turns an arm at rest; if it does not, a perpendicular one."""
-    return _unit_vector(np.cross(gravity, arm), _perpendicular_unit(_unit_vector(arm, np.eye(3)[0])))
+    return _unit_vector(cross(gravity, arm), _perpendicular_unit(_unit_vector(arm, np.eye(3)[0])))
 
 
 def _perpendicular_unit(unit: Array) -> Array:
     """Return a unit vector (3,) perpendicular to a unit vector."""
-    across = np.cross(unit, np.eye(3)[np.argmin(np.abs(unit))])
+    across = cross(unit, np.eye(3)[np.argmin(np.abs(unit))])
     return np.asarray(across / np.linalg.norm(across))
 
 
@@ -503,6 +504,6 @@ def _evaluate_state(tree: _KinematicTree) -> StateQuantities:
         kinetic_energy=float(0.5 * tree.initial_angle_rates @ M @ tree.initial_angle_rates),
         potential_energy=elastic_energy(tree.model, tree.state)  # springs have no output of it
         - float(mass @ (r @ gravity)),
-        angular_momentum=np.sum(np.cross(r, mass[:, None] * v) + spin, axis=0),
+        angular_momentum=np.sum(cross(r, mass[:, None] * v) + spin, axis=0),
         mass_matrix=W.T @ M @ W,
     )

@@ -15,7 +15,7 @@ import numpy as np
 from adapters.mujoco_common import structure_of
 from adapters.mujoco_probes import Probed
 from plumbline.model.datatypes import Array, Float
-from plumbline.model.kinematics import quaternion_exponential, quaternion_product, rotation_matrix
+from plumbline.model.kinematics import cross, quaternion_exponential, quaternion_product, rotation_matrix
 from plumbline.model.probe_frames import PROBE_TURN
 
 SCALAR = {mujoco.mjtJoint.mjJNT_HINGE: "HINGE", mujoco.mjtJoint.mjJNT_SLIDE: "SLIDE"}
@@ -30,7 +30,7 @@ def _add_motions(s: Probed) -> None:
         velocity[b] = velocity[m.body_parentid[b]] + d.qvel[own] @ d.cdof[own]
         rates[b] = rates[m.body_parentid[b]] + d.qacc[own] @ d.cdof[own] + d.qvel[own] @ d.cdof_dot[own]
     _, speed = _at_point(s, d.cvel)
-    turned = np.cross(d.cvel[s.links, :3], speed)
+    turned = cross(d.cvel[s.links, :3], speed)
     for name, vectors, moving, added in (
         ("cvel", d.cvel, "velocity", 0.0),
         ("cdof", velocity, "velocity", 0.0),
@@ -68,7 +68,7 @@ def _at_point(s: Probed, vectors: Array) -> tuple[Array, Array]:
     """Angular part, and linear part at the probe points, of a spatial vector per body."""
     lever = s.d.site_xpos[s.sites] - s.d.subtree_com[s.m.body_rootid[s.links]]
     own = vectors[s.links]
-    return own[:, :3], own[:, 3:] + np.cross(own[:, :3], lever)
+    return own[:, :3], own[:, 3:] + cross(own[:, :3], lever)
 
 
 def _add_attitudes(s: Probed) -> None:
@@ -212,12 +212,12 @@ def _add_wrenches(s: Probed) -> None:
     for b in reversed(range(1, m.nbody)):
         J = spatial_inertia(d.cinert[b])
         momentum, w, v = J @ d.cvel[b], d.cvel[b, :3], d.cvel[b, 3:]
-        turned = np.append(np.cross(w, momentum[:3]) + np.cross(v, momentum[3:]), np.cross(w, momentum[3:]))
+        turned = np.append(cross(w, momentum[:3]) + cross(v, momentum[3:]), cross(w, momentum[3:]))
         wrench[b] += J @ d.cacc[b] + turned - d.cfrc_ext[b]
         wrench[m.body_parentid[b]] += wrench[b]
     lever = d.subtree_com[m.body_rootid[s.links]] - d.site_xpos[s.sites]
     local, force = d.site_xmat[s.sites].reshape(-1, 3, 3).mT, wrench[s.links, 3:]
-    moment = wrench[s.links, :3] + np.cross(lever, force)
+    moment = wrench[s.links, :3] + cross(lever, force)
     s.add("joint_force_local", ("MjData.cfrc_ext",), np.matvec(local, force))
     s.add("joint_moment_local", ("MjData.cfrc_ext",), np.matvec(local, moment))
 

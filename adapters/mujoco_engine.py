@@ -533,7 +533,7 @@ class _MujocoChain:
         for j, (b, u) in enumerate(zip(np.array(self.link_ids)[rods] - 1, state.u[rods], strict=True)):
             q[b] = kinematics.turn_of_z(-u)  # the rod's turn about its own axis has no effect
             q[b] /= np.linalg.norm(q[b])
-            E[b, :, 3 * j : 3 * j + 3] = kinematics.rotation_matrix(q[b]).T @ np.cross(u, np.eye(3)).T
+            E[b, :, 3 * j : 3 * j + 3] = kinematics.rotation_matrix(q[b]).T @ kinematics.cross(u, np.eye(3)).T
         return q, E
 
     def set_state(self, state: State) -> Array:
@@ -608,7 +608,7 @@ class _MujocoChain:
             joint_moment=self._joint_moments(),
             kinetic_energy=float(d.energy[1]),
             potential_energy=float(d.energy[0]),
-            angular_momentum=d.subtree_angmom[0] + np.cross(com, momentum),
+            angular_momentum=d.subtree_angmom[0] + kinematics.cross(com, momentum),
             mass_matrix=T.T @ M @ T,
         )
 
@@ -623,7 +623,7 @@ class _MujocoChain:
         m, d, link = self.m, self.d, self.link_ids
         near = d.xpos[link] + np.matvec(d.xmat[link].reshape(-1, 3, 3), self.model.proximal)
         arm = d.subtree_com[m.body_rootid[link]] - near
-        return np.asarray(d.cfrc_int[link, :3] + np.cross(arm, d.cfrc_int[link, 3:]))
+        return np.asarray(d.cfrc_int[link, :3] + kinematics.cross(arm, d.cfrc_int[link, 3:]))
 
     def sample(self) -> tuple[Array, Array, Array, Array]:
         """Return r, p, v, ω′ of the links, read with a second data so that the run is not disturbed."""

@@ -9,7 +9,7 @@ import pinocchio as pin
 
 from plumbline.engines.metamorphic_hooks import MetamorphicHooks
 from plumbline.model.datatypes import Array, Float, Unsupported
-from plumbline.model.kinematics import quaternion_rate
+from plumbline.model.kinematics import cross, quaternion_rate
 from plumbline.model.welding import RigidPart
 
 WORLD_ALIGNED = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
@@ -115,7 +115,7 @@ def energies_and_momentum(
     return {
         "kinetic_energy": float(kinetic),
         "potential_energy": float(potential) + elastic,
-        "angular_momentum": momentum.angular + np.cross(data.com[0], momentum.linear),
+        "angular_momentum": momentum.angular + cross(data.com[0], momentum.linear),
     }
 
 

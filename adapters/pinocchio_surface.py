@@ -24,6 +24,7 @@ from adapters.pinocchio_probes import Probed
 from adapters.pinocchio_relations import mimics, relations
 from plumbline.engines.missing_names import add_parts
 from plumbline.model.datatypes import Array, Call
+from plumbline.model.kinematics import cross
 
 SPATIAL = "spatial_acceleration"
 
@@ -154,7 +155,7 @@ def _at_frame(s: Probed, name: str, f: int, data: pin.Data, reading: Reading) ->
     joint, place = frame.parentJoint, frame.placement
     if what == "acceleration":  # a classical one is moved as the spatial one
         velocity = pin.getVelocity(s.m, data, joint, getattr(pin.ReferenceFrame, name))
-        what, vector[:3] = SPATIAL, vector[:3] - np.cross(velocity.angular, velocity.linear)
+        what, vector[:3] = SPATIAL, vector[:3] - cross(velocity.angular, velocity.linear)
     aligned = pin.SE3(np.eye(3), data.oMi[joint].rotation @ place.translation)
     move = {"LOCAL": place, "WORLD": pin.SE3.Identity()}.get(name, aligned)
     return function, what, by, move.actInv(pin.Motion(vector))

@@ -30,7 +30,8 @@ def rotation_matrix(p: Float[Array, "... 4"]) -> Float[Array, "... 3 3"]:
 
     """
     p = np.asarray(p, dtype=np.result_type(p, float))
-    w, x, y, z = p[..., 0], p[..., 1], p[..., 2], p[..., 3]
+    # of one quaternion numbers, which are faster than arrays
+    w, x, y, z = p.tolist() if p.shape == (4,) else (p[..., i] for i in range(4))
     ww, xx, yy, zz = w * w, x * x, y * y, z * z
     wx, wy, wz, xy, xz, yz = w * x, w * y, w * z, x * y, x * z, y * z
     s = ww + xx + yy + zz
@@ -38,7 +39,7 @@ def rotation_matrix(p: Float[Array, "... 4"]) -> Float[Array, "... 3 3"]:
     A[..., 0, 0], A[..., 0, 1], A[..., 0, 2] = s - 2 * (yy + zz), 2 * (xy - wz), 2 * (xz + wy)
     A[..., 1, 0], A[..., 1, 1], A[..., 1, 2] = 2 * (xy + wz), s - 2 * (xx + zz), 2 * (yz - wx)
     A[..., 2, 0], A[..., 2, 1], A[..., 2, 2] = 2 * (xz - wy), 2 * (yz + wx), s - 2 * (xx + yy)
-    return A / s[..., None, None]
+    return np.asarray(A / np.asarray(s)[..., None, None])
 
 
 def normalised(x: Float[Array, "... n"]) -> Float[Array, "... n"]:
