@@ -146,7 +146,7 @@ class PinocchioChain:
             self.body_joints.append(joint)
         self.pin_model = change.remake(self.pin_model)
         self.com_frames = [self.pin_model.getFrameId(f"com {k}") for k in range(model.n)]
-        self.data = self.pin_model.createData()
+        self.renew_data()
         self.joint_count = self.pin_model.njoints - 1
         self.body_rows = [joint - 1 for joint in self.body_joints]  # of the bodies among the joints
         moved = [k for k, kind in enumerate(model.kinds) if not kind.is_rigid]
@@ -154,6 +154,9 @@ class PinocchioChain:
         self.rod_rows = [j for j in range(self.joint_count) if j not in self.body_rows]
         self.parent_rows = [int(parent) - 1 for parent in self.pin_model.parents][1:]
         self.joints = list(self.pin_model.joints)[1:]
+        # whether dexp is solved as one matrix, and not by its 3 × 3 blocks
+        is_small = self.joint_count <= MAX_DENSE_JOINTS
+        self.has_dense_dexp = is_small or any(joint.nv != 3 for joint in self.joints)
         self.zero_torque = np.zeros(self.pin_model.nv)
         self.moving = [
             (k, self.joints[row]) for k, row in enumerate(self.body_rows) if model.kinds[k].element_count
@@ -171,6 +174,13 @@ class PinocchioChain:
         if self.has_constraints:
             init_constraint_dynamics(self.pin_model, self.data, self.welds, self.weld_data)
         self._init_loads()
+
+    def renew_data(self) -> None:
+        """Make a workspace, and keep what its functions write: poses, turns and velocities of the joints."""
+        self.data, joints = self.pin_model.createData(), range(self.pin_model.njoints)
+        self.poses = [self.data.oMi[j] for j in joints]
+        self.turns = [pose.rotation for pose in self.poses]
+        self.velocities = [self.data.v[j].vector for j in joints]
 
     def _end(self, body: int, point: Array) -> tuple[int, pin.SE3]:
         """Return the joint and the place in its frame of a point of a body, or of the world, joint 0."""
@@ -233,12 +243,14 @@ class PinocchioChain:
         self.fext = pin.StdVec_Force()
         for _ in range(self.pin_model.njoints):
             self.fext.append(pin.Force.Zero())
-        self.loads = [
-            place.act(pin.Force(np.zeros(3), n))
+        # the numbers of `fext` by body, and whether it is the first on its joint: welded ones share it
+        self.joint_loads = [self.fext[j].vector for j in self.body_joints]
+        self.is_first = [j not in self.body_joints[:k] for k, j in enumerate(self.body_joints)]
+        self.constant_loads = [
+            place.act(pin.Force(np.zeros(3), n)).vector.copy()
             for place, n in zip(self.placements, model.moment, strict=True)
         ]
-        self.constant_loads = list(self.loads)
-        self.constant_wrenches = [load.vector.copy() for load in self.loads]
+        self.loads = list(self.constant_loads)
         self.has_force = np.any(model.force != 0, axis=1).tolist()
         self.has_body_drag = ((model.drag_force != 0) | (model.drag_moment != 0)).tolist()
         # in the joints' frames: wrenches by forces at the centres of mass in these axes, and by velocities
@@ -259,10 +271,8 @@ class PinocchioChain:
 
     def _add_up_loads(self) -> None:
         """Set `fext` of every joint to the loads of its bodies: one, and those welded to it."""
-        taken = set()
-        for j, load in zip(self.body_joints, self.loads, strict=True):
-            self.fext[j] = self.fext[j] + load if j in taken else load
-            taken.add(j)
+        for total, is_first, load in zip(self.joint_loads, self.is_first, self.loads, strict=True):
+            total[:] = load if is_first else total + load
 
     def coordinates(self, state: State) -> tuple[Float[Array, "nq"], Float[Array, "nv"]]:
         """Map a state to Pinocchio's coordinates q and v."""
@@ -344,40 +354,36 @@ class PinocchioChain:
         """Set `fext` to the loads at a state."""
         if not self.bodies_with_varying_loads:
             return
-        data, model = self.data, self.source_model
-        pin.forwardKinematics(self.pin_model, data, q, v)
-        poses, motions, found = data.oMi, data.v, dict[int, Array]()
+        model = self.source_model
+        pin.forwardKinematics(self.pin_model, self.data, q, v)
         for k in self.bodies_with_varying_loads:
-            j, wrench = self.body_joints[k], self.constant_wrenches[k]
+            j, wrench = self.body_joints[k], self.constant_loads[k]
             if self.has_force[k]:
-                wrench = wrench + self.pulls[k].dot(model.force[k].dot(poses[j].rotation))  # Rᵀ F
+                wrench = wrench + self.pulls[k].dot(model.force[k].dot(self.turns[j]))  # Rᵀ F
             if self.has_body_drag[k]:
-                wrench = wrench - self.drags[k].dot(motions[j].vector)
-            found[k] = wrench
+                wrench = wrench - self.drags[k].dot(self.velocities[j])
+            self.loads[k] = wrench
         for i in range(len(model.spring_body)):
-            self._add_spring(i, found)
-        for k, wrench in found.items():
-            self.loads[k] = pin.Force(wrench)
+            self._add_spring(i)
         self._add_up_loads()
 
-    def _add_spring(self, i: int, wrenches: dict[int, Array]) -> None:
-        """Add to the wrenches on bodies what a spring between points does to them."""
-        poses, motions, model = self.data.oMi, self.data.v, self.source_model
+    def _add_spring(self, i: int) -> None:
+        """Add to the loads of bodies what a spring between points does to them."""
+        model, poses, (near_pull, far_pull) = self.source_model, self.poses, self.spring_pulls[i]
         (near, at), (far, there) = self.spring_ends[i]
-        turns = poses[near].rotation, poses[far].rotation
         d = poses[far].act(there.translation) - poses[near].act(at.translation)
-        rates = [
-            turn.dot(pull.T.dot(motions[joint].vector))  # velocities of points are dual to forces on them
-            for turn, pull, (joint, _) in zip(turns, self.spring_pulls[i], self.spring_ends[i], strict=True)
-        ]
-        rate, length = rates[1] - rates[0], math.sqrt(d.dot(d))
+        # velocities of points are dual to forces on them
+        near_rate = self.turns[near].dot(self.velocities[near].dot(near_pull))
+        far_rate = self.turns[far].dot(self.velocities[far].dot(far_pull))
+        length = math.sqrt(d.dot(d))
         tension = model.spring_stiffness[i] * (length - model.spring_length[i])
-        tension += model.spring_damping[i] * d.dot(rate) / length
+        tension += model.spring_damping[i] * d.dot(far_rate - near_rate) / length
         force = d * (tension / length)
-        ends = zip(model.spring_body[i].tolist(), (1, -1), turns, self.spring_pulls[i], strict=True)
-        for b, sign, turn, pull in ends:
-            if b >= 0:
-                wrenches[b] = wrenches[b] + pull.dot(sign * force.dot(turn))
+        b, c = model.spring_body[i].tolist()
+        if b >= 0:
+            self.loads[b] = self.loads[b] + near_pull.dot(force.dot(self.turns[near]))
+        if c >= 0:
+            self.loads[c] = self.loads[c] - far_pull.dot(force.dot(self.turns[far]))
 
     def joint_torque(self, q: Float[Array, "nq"], v: Float[Array, "nv"]) -> Float[Array, "nv"]:
         """Evaluate springs, dampers and efforts of the joints."""
@@ -435,8 +441,8 @@ class PinocchioChain:
         a = pin.constraintDynamics(engine, data, q, v, push, self.welds, self.weld_data, settings).copy()
         for (b, c), solved in zip(self.ends, self.weld_data, strict=True):
             force = solved.contact_force  # on b, in the frame of b and c
-            self.loads[b] = self.loads[b] + self.placements[b].act(force)
-            self.loads[c] = self.loads[c] - self.placements[c].act(force)
+            self.loads[b] = self.loads[b] + self.placements[b].act(force).vector
+            self.loads[c] = self.loads[c] - self.placements[c].act(force).vector
         self._add_up_loads()
         return np.asarray(a)
 
@@ -456,7 +462,7 @@ class PinocchioChain:
 
         """
         dexp = pin.dIntegrate(self.pin_model, q, theta, pin.ArgumentPosition.ARG1)
-        if self.joint_count <= MAX_DENSE_JOINTS or any(joint.nv != 3 for joint in self.joints):
+        if self.has_dense_dexp:
             return np.asarray(lapack.dgesv(dexp, v)[2])
         each = np.arange(self.joint_count)
         blocks = dexp.reshape(self.joint_count, 3, self.joint_count, 3)[each, :, each, :]  # the rest is zero
@@ -561,7 +567,7 @@ class PinocchioChain:
                 continue
             j = self.body_joints[k]
             inertia = self.placements[k].act(pin.Inertia(model.mass[k], np.zeros(3), model.inertia[k]))
-            need = inertia * data.a_gf[j] + inertia.vxiv(data.v[j]) - self.loads[k]
+            need = inertia * data.a_gf[j] + inertia.vxiv(data.v[j]) - pin.Force(self.loads[k])
             for child in np.flatnonzero(model.body[:, 0] == k):
                 need = need + self._in_frame_of(j, self.body_joints[child], wrench[child])
             wrench[k] = need
@@ -790,7 +796,7 @@ class Pinocchio(PinocchioAdapter):
         chain, own = PinocchioChain(cut.model, self.usual_algorithm, ends=cut.ends), cut.place[: model.n]
         joints, placements = [chain.body_joints[k] for k in own], [chain.placements[k] for k in own]
         frames = add_probe_frames(chain.pin_model, joints, placements, model)
-        chain.data = chain.pin_model.createData()
+        chain.renew_data()
         if chain.has_constraints:
             init_constraint_dynamics(chain.pin_model, chain.data, chain.welds, chain.weld_data)
         inertias = [
