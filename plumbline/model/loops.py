@@ -503,8 +503,13 @@ def smallest_singular_value(model: Model, state: State, rank: int | None = None)
 
     """
     cut = cut_open(model)
-    values = singular_values(cut, cut.state(state))[0]
-    return float(values[(rank or regular_rank(model, state)) - 1])
+    return float(smallest_singular_values(cut, cut.state(state), rank or regular_rank(model, state)))
+
+
+def smallest_singular_values(cut: CutMechanism, state: State, rank: int) -> Float[Array, "..."]:
+    """Measure as `smallest_singular_value`, at states of the tree: arrays may have leading axes."""
+    rows = cut.jacobian(state) * cut.row_scale[:, None]
+    return np.asarray(np.linalg.svd(rows, compute_uv=False)[..., rank - 1])
 
 
 def regular_rank(model: Model, state: State) -> int:

@@ -54,7 +54,7 @@ from plumbline.model.kinematics import (
     spring_vectors,
     stack_states,
 )
-from plumbline.model.loops import cut_open, regular_rank, wrench_length
+from plumbline.model.loops import cut_open, regular_rank, smallest_singular_values, wrench_length
 from plumbline.model.step_methods import JointSpaceMethod
 from plumbline.model.welding import BodyParts, part_offsets, undivided_bodies
 from plumbline.processes.worker_pool import Pickled
@@ -212,8 +212,7 @@ def _of_loops(model: Model, states: Sequence[State], method: JointSpaceMethod | 
     totals, scales, sums, _, joints, motion = terms.bounds(is_eliminated=method is None)
     (of_welds, of_gaps), spreads = terms.weld_errors(), np.ones(len(states))
     if method is None:
-        scaled, rank = cut.jacobian(there) * cut.row_scale[:, None], regular_rank(model, states[0])
-        spreads += 1 / np.linalg.svd(scaled, compute_uv=False)[:, rank - 1]  # as `smallest_singular_value`
+        spreads += 1 / smallest_singular_values(cut, there, regular_rank(model, states[0]))
     else:
         totals += terms.factor_errors() + of_gaps
     for s, spread in enumerate(spreads.tolist()):

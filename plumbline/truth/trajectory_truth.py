@@ -27,10 +27,17 @@ from plumbline.model.kinematics import (
     angular_velocity,
     joint_coordinates,
     maximal_coordinates,
+    normalised,
     quaternion_rate,
     with_joint_coordinates,
 )
-from plumbline.model.loops import MIN_MOTION_SINGULAR_VALUE, regular_rank, smallest_singular_value
+from plumbline.model.loops import (
+    MIN_MOTION_SINGULAR_VALUE,
+    cut_open,
+    regular_rank,
+    smallest_singular_value,
+    smallest_singular_values,
+)
 from plumbline.truth import TruthUnavailable
 from plumbline.truth.certificate_proof import ProvedMotion, prove_motion, round_enclosure
 from plumbline.truth.notes_motion import integrate_batch, side_by_side, trajectories
@@ -414,7 +421,8 @@ class RegularMotion(NamedTuple):
 def regular_motion(model: Model, state: State, times: Array) -> RegularMotion:
     """Follow a motion until it comes near a singular pose.
 
-    Strides are so short that a singular value that goes on to fall as it falls cannot reach 0 within one.
+    Where the whole motion at once does not show that it is regular, it is followed in strides so short that a
+    singular value that goes on to fall as it falls cannot reach 0 within one.
 
     Args:
         model: with loops.
@@ -430,25 +438,28 @@ def regular_motion(model: Model, state: State, times: Array) -> RegularMotion:
     """
     rank = regular_rank(model, state)
     t, last, value = 0.0, float(times[-1]), smallest_singular_value(model, state, rank)
-    longest = stride = float(np.min(np.diff(times)))
+    interval = float(np.min(np.diff(times)))
+    longest = stride = last
     system, here = side_by_side([(model, state)])
     while t < last * (1 - 1e-12) and value >= MIN_MOTION_SINGULAR_VALUE:
         stride = min(stride, last - t)
-        grid = t + stride * np.linspace(0, 1, STRIDE_PARTS + 1)
+        parts = STRIDE_PARTS * max(1, int(np.ceil(stride / interval)))
+        grid = t + stride * np.linspace(0, 1, parts + 1)
+        most = parts if stride > interval else np.inf  # steps: near a singular pose they become short
         try:
-            run = integrate_collocation(system, *here, grid, REGULARITY_RTOL, project=True)
-            poses = zip(run.r[1:], run.p[1:], run.v[1:], run.pdot[1:], strict=True)
-            found = (smallest_singular_value(model, _sample_state(model, state, *y), rank) for y in poses)
-            values = np.array([value, *found])
+            run = integrate_collocation(system, *here, grid, REGULARITY_RTOL, project=True, max_steps=most)
+            values = np.append(value, _singular_values(model, run, rank)[1:])
             is_safe = bool(np.all(2 * values[1:] - values[:-1] > 0))  # the next value as the last two go on
         except ArithmeticError:
-            if stride < SHORTEST_STRIDE * longest and value > 10 * MIN_MOTION_SINGULAR_VALUE:
+            if stride < SHORTEST_STRIDE * interval and value > 10 * MIN_MOTION_SINGULAR_VALUE:
                 raise
             is_safe = False
-        if is_safe:
+        if stride > interval and not (is_safe and np.all(values >= MIN_MOTION_SINGULAR_VALUE)):
+            longest = stride = interval
+        elif is_safe:
             t, value, system = float(grid[-1]), float(values[-1]), eliminated_system([model], run.x[-1])
             here, stride = (run.r[-1], run.p[-1], run.v[-1], run.pdot[-1]), min(2 * stride, longest)
-        elif stride < SHORTEST_STRIDE * longest:
+        elif stride < SHORTEST_STRIDE * interval:
             return RegularMotion(t, True, value)
         else:
             stride /= 2
@@ -470,16 +481,16 @@ def first_doubt(model: Model, state: State, run: Trajectory) -> float | None:
 
     """
     rank, before = regular_rank(model, state), 0.0
-    for t, *sample in zip(run.t, run.r, run.p, run.v, run.pdot, strict=True):
-        value = smallest_singular_value(model, _sample_state(model, state, *sample), rank)
+    for i, t in enumerate(run.t):
+        value = float(_singular_values(model, run.at(slice(i, i + 1)), rank)[0])
         if value < MIN_MOTION_SINGULAR_VALUE or 2 * value <= before:
             return float(t)
         before = value
     return None
 
 
-def _sample_state(model: Model, start: State, r: Array, p: Array, v: Array, pdot: Array) -> State:
-    """The state of a motion's bodies."""
-    p = p / np.linalg.norm(p, axis=1, keepdims=True)
-    moved = State(p, angular_velocity(p, pdot), start.u, start.udot, r, v, start.x, start.xdot)
-    return with_joint_coordinates(model, moved)
+def _singular_values(model: Model, run: Trajectory | IntegrationResult, rank: int) -> Array:
+    """The smallest singular values (T,) at the samples of a motion."""
+    p, cut = normalised(run.p), cut_open(model)
+    moved = State(p, angular_velocity(p, run.pdot), r=run.r, v=run.v)
+    return smallest_singular_values(cut, cut.state(with_joint_coordinates(model, moved)), rank)
