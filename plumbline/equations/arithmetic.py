@@ -99,7 +99,7 @@ class _Floats(Arithmetic):
         return np.sum(a * b, -2, keepdims=True)
 
     def cross(self, a: Any, b: Any) -> Any:
-        return a.take(_NEXT, -2) * b.take(_LAST, -2) - a.take(_LAST, -2) * b.take(_NEXT, -2)
+        return (a * b.take(_NEXT, -2) - a.take(_NEXT, -2) * b).take(_NEXT, -2)
 
     def cross_matrix(self, a: Any) -> Any:
         return cross_matrix(a[..., 0])

@@ -16,7 +16,7 @@ import numpy as np
 
 from plumbline.model.datatypes import Array, Bool, Flags, Float, Indices, Int, JointKind, Model, State
 
-_NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])  # of each axis the next and the one after
+_NEXT = np.array([1, 2, 0])  # of each axis the next one
 
 
 def rotation_matrix(p: Float[Array, "... 4"]) -> Float[Array, "... 3 3"]:
@@ -59,7 +59,7 @@ def cross(a: Float[Array, "... 3"], b: Float[Array, "... 3"]) -> Float[Array, ".
         b: right factors; the leading dimensions are broadcast.
 
     """
-    return np.asarray(a.take(_NEXT, -1) * b.take(_LAST, -1) - a.take(_LAST, -1) * b.take(_NEXT, -1))
+    return np.asarray((a * b.take(_NEXT, -1) - a.take(_NEXT, -1) * b).take(_NEXT, -1))
 
 
 def cross_matrix(s: Float[Array, "... 3"]) -> Float[Array, "... 3 3"]:

@@ -208,7 +208,7 @@ def state_of_cylinders(model: Model, cylinders: Model, state: State) -> State:
     Args:
         model: a tree.
         cylinders: `joints_as_cylinders` of it.
-        state: of the tree.
+        state: of the tree; or many, of arrays with leading axes.
 
     Returns:
         The same state; shifts that joints have in addition are their pitches times the turns, or zero.
@@ -217,7 +217,7 @@ def state_of_cylinders(model: Model, cylinders: Model, state: State) -> State:
     pitched = np.array([kind.has_pitch for kind in model.kinds])
     x, xdot = (_of_cylinders(model, cylinders.kind, values) for values in (state.x, state.xdot))
     for values in (x, xdot):
-        values[pitched, 0] = model.length[pitched] * values[pitched, 1]
+        values[..., pitched, 0] = model.length[pitched] * values[..., pitched, 1]
     return complete_state(cylinders, replace(state, x=x, xdot=xdot))
 
 
@@ -226,8 +226,9 @@ def _of_cylinders(model: Model, kinds: Sequence[Kind], values: NDArray[np.float6
     found = values.copy()
     for k, kind in enumerate(model.kinds):
         if model.kind[k] != kinds[k]:
-            found[k] = 0.0
-            found[k, [_CYLINDER.index(motion) for motion in kind.motions]] = values[k, : len(kind.motions)]
+            places = [_CYLINDER.index(motion) for motion in kind.motions]
+            found[..., k, :] = 0.0
+            found[..., k, places] = values[..., k, : len(places)]
     return found
 
 

@@ -41,6 +41,7 @@ from plumbline.model.kinematics import (
     rotate_vectors,
     rotation_matrix,
     rotation_vector,
+    stack_states,
     turn_of_z,
 )
 from plumbline.model.loops import cut_open
@@ -109,20 +110,18 @@ class StepCharts:
         """
         cut = cut_open(model)
         self.place, self.ends = cut.place[: model.n], cut.ends  # of the mechanism's bodies, of loops' ends
-        model, states = cut.model, [cut.state(state) for state in states]
+        model, s = cut.model, cut.state(stack_states(states))
         # by joint which of the coordinates here are the mechanism's, and the pitches at which slides are held
         self.given = [slice(None, len(kind.motions)) for kind in model.kinds]
         self.held: dict[int, float] = {}
         if method.holds_pitches:
             self.held = {k: float(model.length[k]) for k, kind in enumerate(model.kinds) if kind.has_pitch}
             tree, model = model, joints_as_cylinders(model, PITCHED_KINDS)
-            states = [state_of_cylinders(tree, model, state) for state in states]
+            s = state_of_cylinders(tree, model, s)
             self.given = [slice(1, 2) if k in self.held else own for k, own in enumerate(self.given)]
         self.model, self.method = model, method
         self.is_held = bool(self.ends or self.held)
-        self.state = s = State(
-            **{name: np.array([getattr(x, name) for x in states], LongDouble) for name in vars(states[0])}
-        )
+        self.state = s = State(**{name: x.astype(LongDouble) for name, x in vars(s).items()})
         u = normalised(np.where(model.rods[:, None], s.u, UNIT[:3]))
         attitudes, rods = normalised(s.p), normalised(turn_of_z(u))
         spins, rod_spins = rotate_vectors(rotation_matrix(attitudes), s.omega), cross(s.u, s.udot)
@@ -529,6 +528,10 @@ class _MovingTree(Tree):
         self.charts, self.q = charts, q
         self.rates = [v[..., own] for own in charts.own]
         self.p, self.rod_p = charts.quaternions(q)
+        # the attitudes that turns of the charts lead to, as matrices
+        kinds = charts.model.kinds
+        self.turned = {k: rotation_matrix(p) for k, p in enumerate(self.p) if kinds[k].has_attitude}
+        self.rod_turned = {k: rotation_matrix(p) for k, p in self.rod_p.items()}
         self.rod_w: dict[int, Array] = {}
         self.rods: dict[int, tuple[Array, Array]] = {}  # u and u̇
         self.axes: dict[int, tuple[list[Array], Array]] = {}  # by chart: of its angles; α at q̈ = 0 of them
@@ -548,17 +551,17 @@ class _MovingTree(Tree):
         w = self.w[self.far[k]] if self.far[k] >= 0 else self.zero
         before = self.p[self.far[k]] if self.far[k] >= 0 else UNIT
         if k in self.charts.of_rod:
-            w = self.rod_w[k] = self._spin_after(self.charts.of_rod[k], before, self.rod_p[k], w)
-            before = self.rod_p[k]
-            u = rotation_matrix(before)[..., 2:]
+            w = self.rod_w[k] = self._spin_after(self.charts.of_rod[k], before, self.rod_turned[k], w)
+            before, u = self.rod_p[k], self.rod_turned[k][..., 2:]
             self.rods[k] = u, self.num.cross(w, u)
-        return rotation_matrix(self.p[k]), self._spin_after(self.charts.of_body[k], before, self.p[k], w)
+        here = self.turned[k]
+        return here, self._spin_after(self.charts.of_body[k], before, here, w)
 
     def _spin_after(self, at: int, before: Array, here: Array, w: Array) -> Array:
         """The angular velocity after a turn, w before it."""
         chart, rates = self.charts.charts[at], self.rates[at]
         if not chart.axes:
-            return w + rotation_matrix(here) @ rates[..., -3:, None]
+            return np.asarray(w + here @ rates[..., -3:, None])
         turned, bias, count = list[Array](), self.zero, len(chart.axes)
         for i, axis in enumerate(chart.axes):
             angle, rate = self.q[at][..., i - count, None], rates[..., i - count, None, None]
@@ -574,7 +577,7 @@ class _MovingTree(Tree):
         chart, r, v = self.charts.charts[at], self.q[at][..., :3], self.rates[at][..., :3, None]
         if not chart.axes:
             r = self.q[at][..., 4:]
-        return r[..., None], rotation_matrix(self.p[k]) @ v if self.charts.is_rigid(chart) else v
+        return r[..., None], self.turned[k] @ v if self.charts.is_rigid(chart) else v
 
     def rod_direction(self, k: int) -> tuple[Any, Any]:
         return self.rods[k]
@@ -605,7 +608,7 @@ class _MovingTree(Tree):
                 bend = found.rates[k][0] / LongDouble(self.model.length[k])  # ü
                 wanted = self.num.cross(u, bend) + udot * self.rod_spin(k)
                 rates, alpha_rod = self._rates_of_turn(
-                    self.charts.of_rod[k], self.rod_p[k], (w, self.rod_w[k]), (alpha, wanted), u
+                    self.charts.of_rod[k], self.rod_turned[k], (w, self.rod_w[k]), (alpha, wanted), u
                 )
                 out.append(rates)
                 w, alpha = self.rod_w[k], alpha_rod
@@ -614,7 +617,8 @@ class _MovingTree(Tree):
                 if self.charts.is_rigid(self.charts.charts[own]):
                     shift = self.A[k].mT @ (shift - self.num.cross(self.w[k], self.v[k]))
                 out.append(shift[..., 0])
-            out.append(self._rates_of_turn(own, self.p[k], (w, self.w[k]), (alpha, found.turning[k]))[0])
+            turns = (w, self.w[k]), (alpha, found.turning[k])
+            out.append(self._rates_of_turn(own, self.turned[k], *turns)[0])
         return _joined(out)
 
     def _rates_of_turn(
@@ -626,7 +630,7 @@ class _MovingTree(Tree):
         """
         if at not in self.axes:
             gained = alpha[1] - alpha[0] - self.num.cross(w[1], w[1] - w[0])
-            return (rotation_matrix(here).mT @ gained)[..., 0], alpha[1]
+            return (here.mT @ gained)[..., 0], alpha[1]
         turned, bias = self.axes[at]
         three = [x[..., 0] for x in (*turned, *(() if rod is None else (rod,)))]
         rates = _solve3(three, (alpha[1] - alpha[0] - bias)[..., 0])[..., : len(turned)]
