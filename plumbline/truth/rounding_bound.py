@@ -9,7 +9,9 @@ are added:
     tB  every term of each equation of a body and of a joint, rounded once, and the result itself
     tS  elimination onto the joints: the terms of C M⁻¹ f
     tJ  joint-space engines: the terms of M q̈ + h, as torque pairs at turns and force pairs at slides
-    d   accumulation of accelerations and forces along the branches
+    d   accumulation of accelerations and forces along the branches; along a joint's own motions also what
+        factors of the joint-space matrix leave of M q̈ = -h, √M_ii Σ √M_jj |q̈_j| (Higham, Accuracy and
+        Stability of Numerical Algorithms, 2002, theorem 10.3): other branches fill zeros of M
 
 Arms that an engine finds as differences of positions are off by a rounding of these: terms of tB count a
 share of the position too, which is the larger one where it is above 32 arms (rods of 100 m and more).
@@ -491,7 +493,11 @@ class _Terms:
         }
         rods, of_joints = np.zeros(t.a.shape), np.zeros((len(total), 2))
         for at, (what, k) in enumerate(joints.pairs):
-            load = joints.load[:, at]
+            load, left = joints.load[:, at], joints.left[:, at]
+            if what in ("upper", "lower"):
+                total[:, k, 2] += left / model.length[k]
+            else:
+                total[:, k, 2 if what == "slide" else 3] += left
             rods[:, k] += load * (what in ("upper", "lower"))
             of_joints[:, 0] += load * (np.linalg.norm(tip[:, k], axis=-1) if what == "slide" else 1.0)
             of_joints[:, 1] += load * joints.rate[:, at]
@@ -564,6 +570,8 @@ class _JointSpace:
             self.mass_matrix[:, row, row] += element.armature
             h[:, row] += element.size
         self.load = (self.mass_matrix @ self.acceleration[..., None])[..., 0] + h  # N m or N
+        root = np.sqrt(np.diagonal(self.mass_matrix, axis1=1, axis2=2))
+        self.left = root * np.sum(root * self.acceleration, -1, keepdims=True)  # N m or N, by factors of M
 
     def _relative_accelerations(self) -> Array:
         """(S, N, 3) accelerations of near points against the points that far bodies carry."""

@@ -380,7 +380,7 @@ _FORMULAS: Mapping[str, tuple[str, Callable[[Motion], Rounded]]] = {
     "subtree_mass": ("kg", _subtree_mass),
     "kinetic_energy": ("J", _kinetic_energy),
     "gravity_energy": ("J", lambda m: _gravity_energy(m, m.r)),
-    "gravity_energy_second_rate": ("W/s", lambda m: _gravity_energy(m, m.a)),
+    "gravity_energy_second_rate": ("W/s", lambda m: _gravity_energy(m, m.through_origin().a)),
     "mechanical_energy": ("J", lambda m: _kinetic_energy(m).plus(_gravity_energy(m, m.r))),
     "body_force_local": ("N", lambda m: m.local(_force_of_probe(m))),
     "body_moment_local": ("N m", lambda m: m.local(_body_moment(m))),
