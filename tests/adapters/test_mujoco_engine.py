@@ -14,6 +14,7 @@ from plumbline.model.datatypes import EngineFailure, State
 from plumbline.model.kinematics import complete_state, rotation_matrix
 from plumbline.model.random_mechanisms import ELEMENTS, random_loop_mechanism, random_tree
 from plumbline.model.sampling import random_states
+from plumbline.studies.random_steps import mechanism_of
 from plumbline.truth.certified_state import certify_state
 from plumbline.truth.rounding_bound import state_rounding_bound
 from tests.helpers import engine_process as worker
@@ -24,7 +25,7 @@ pytest.importorskip("mujoco")
 
 import mujoco
 
-from adapters.mujoco_engine import Mujoco, _Tie
+from adapters.mujoco_engine import STEP_REGULARISATIONS, Mujoco, _Tie
 
 
 def simulate(subject, at, integrator, step, times):
@@ -125,3 +126,13 @@ def test_the_installed_version_has_the_names_of_all_variants_and_of_the_column()
     calls = [variant.names for variant in Mujoco.variants] + [call for call, _ in Mujoco.column_names]
     for name in {name for call in calls for name in call}:
         assert attrgetter(name)(mujoco) is not None
+
+
+def test_every_step_of_a_loop_has_the_second_iteration_that_removes_rounding():
+    model, state = mechanism_of(70013)
+    soft = Mujoco()._softened(model, STEP_REGULARISATIONS[0])[0]
+    integrator = next(one for one in Mujoco.integrators if one.name == "implicitfast")
+    soft.tree.prepare(soft.state(state), integrator, 1 / 300)
+    for _ in range(20):
+        mujoco.mj_step(soft.tree.m, soft.tree.d)
+        assert soft.tree.d.solver_niter[0] >= 2
