@@ -5,10 +5,10 @@ Readings have no amount.  Each is listed for one body, joint or spring, and for 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
-from itertools import permutations
+from itertools import chain, permutations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -37,11 +37,11 @@ Change = Callable[[Case], Case]
 
 
 class Reading(NamedTuple):
-    """A term, how it is changed, what that does to a case, and where at its place the term is."""
+    """A term, how it is read, what that replaces, and where at its place the term is."""
 
     term: str
     words: str
-    change: Change
+    pieces: list[Piece]
     where: str = ""
 
 
@@ -110,20 +110,21 @@ def _attitude_key(q: Array, model: Model | None) -> Array:
 
 def _every_reading(case: Case) -> Iterator[tuple[str, str, str, Change]]:
     model = case.model
-    groups: dict[tuple[str, ...], list[Change]] = {}
+    groups: dict[tuple[str, ...], list[list[Piece]]] = {}
     for thing, count, readings in (
         ("body", model.n, _body_readings),
         ("joint", len(model.kind), _joint_readings),
         ("spring", len(model.spring_body), _spring_readings),
     ):
         for k in range(count):
-            for term, words, change, where in readings(case, k):
-                groups.setdefault((thing, term, words, where), []).append(change)
+            for term, words, pieces, where in readings(case, k):
+                groups.setdefault((thing, term, words, where), []).append(pieces)
                 if count <= MAX_PLACES:
-                    yield term, f"{thing} {k + 1}{where}", words, change
-    for (thing, term, words, where), changes in groups.items():
-        if len(changes) > 1:
-            yield term, f"all {PLURALS[thing]}{where}", words, _one_after_another(changes)
+                    yield term, f"{thing} {k + 1}{where}", words, _replaced(pieces)
+    for (thing, term, words, where), each in groups.items():
+        if len(each) > 1:
+            everywhere = _replaced(list(chain.from_iterable(each)))
+            yield term, f"all {PLURALS[thing]}{where}", words, everywhere
     yield from _fields_of_others(model)
     for term, names in MISSING.items():
         present = [name for name in names if np.any(getattr(model, name))]
@@ -138,28 +139,21 @@ def _every_reading(case: Case) -> Iterator[tuple[str, str, str, Change]]:
     yield "inputs", "", "rounded to single precision", _rounded_to_single_precision
 
 
-def _one_after_another(changes: Sequence[Change]) -> Change:
-    """The same reading of all places; each sees the right state of the others."""
+def _replaced(pieces: list[Piece]) -> Change:
+    """Replace parts of fields, each by what the right case makes of it."""
 
     def change(case: Case) -> Case:
-        changed = [one(case) for one in changes]
-        found = changed[0]
-        for other in changed[1:]:
-            found = _merged(case, found, other)
-        return found
+        fields: dict[str, Array] = {}
+        for name, k, at, of in pieces:
+            value, own = np.asarray(of(_Place(case, k))), VALUE_AXES[name]
+            values = fields[name] if name in fields else field(case, name).copy()
+            if value.ndim > own - len(at) and values.ndim == own + 1:  # another one at each state
+                values = np.repeat(values[None], len(value), 0)
+            values[_at(name, k, *at)] = value
+            fields[name] = values
+        return with_fields(case, **fields)
 
     return change
-
-
-def _merged(right: Case, one: Case, other: Case) -> Case:
-    """Both changes; where both change a field, what the second changes of it."""
-    fields = {}
-    for base, a, b in zip(*((case.model, case.state) for case in (right, one, other)), strict=True):
-        for name, value in vars(base).items():
-            x, y = getattr(a, name), getattr(b, name)
-            if y is not value:
-                fields[name] = y if x is value else np.where(y != value, y, x)
-    return with_fields(one, **fields)
 
 
 def _fields(**values: Any) -> Change:
@@ -208,28 +202,16 @@ class _Place:
 
 
 Read = Callable[[_Place], Any]
+Piece = tuple[str, int, tuple[int, ...], Read]  # field, place, where in its value, what is read there
 
 
-def _at(name: str, k: int) -> tuple[Any, ...]:
-    return (..., k, *(slice(None),) * VALUE_AXES[name])
+def _at(name: str, k: int, *at: int) -> tuple[Any, ...]:
+    return (..., k, *at, *(slice(None),) * (VALUE_AXES[name] - len(at)))
 
 
-def _row(name: str, k: int, of: Read) -> Change:
-    """Replace what a field holds of one place, by one value or one per state."""
-
-    def change(case: Case) -> Case:
-        value, values, own = np.asarray(of(_Place(case, k))), field(case, name), VALUE_AXES[name]
-        is_lifted = value.ndim > own and values.ndim == own + 1
-        values = np.repeat(values[None], len(value), 0) if is_lifted else values.copy()
-        values[_at(name, k)] = value
-        return with_fields(case, **{name: values})
-
-    return change
-
-
-def _constant(name: str, k: int, value: Any) -> Change:
-    """Replace what a field holds of one place by other numbers."""
-    return _row(name, k, lambda _: np.array(value))
+def _constant(name: str, k: int, value: Any, *at: int) -> Piece:
+    """Other numbers in place of what a field holds of one place."""
+    return name, k, at, lambda _: np.array(value)
 
 
 # -- bodies --------------------------------------------------------------------------------------------
@@ -291,18 +273,18 @@ def _body_readings(case: Case, k: int) -> Iterator[Reading]:
     is_read = {"p": kind.has_attitude, "omega": kind.has_attitude, "v": kind.holds_nothing}
     for term, name, readings in OF_BODIES:
         for words, of in readings.items() if is_read.get(name, True) else ():
-            yield Reading(term, words, _row(name, k, of))
-    on_body = model.body == k
-    if np.sum(on_body) > 1:
-        changed = np.where(on_body[..., None], -model.point, model.point)
-        yield Reading("attachment points", "reversed", _fields(point=changed))
-    if np.sum(on_body) == 2:
-        changed = model.point.copy()
-        changed[on_body] = changed[on_body][::-1]
-        yield Reading("attachment points", "exchanged", _fields(point=changed))
+            yield Reading(term, words, [(name, k, (), of)])
+    attached = [(j, side, model.point[j, side]) for j, side in np.argwhere(model.body == k).tolist()]
+    if len(attached) > 1:
+        reversed_ = [_constant("point", j, -point, side) for j, side, point in attached]
+        yield Reading("attachment points", "reversed", reversed_)
+    if len(attached) == 2:
+        others = zip(attached, attached[::-1], strict=True)
+        exchanged = [_constant("point", j, point, side) for (j, side, _), (*_, point) in others]
+        yield Reading("attachment points", "exchanged", exchanged)
     yield from _inertia_readings(model, k)
     points = {} if kind.holds_nothing else {"its joint's": model.proximal[k]}
-    points |= {f"joint {j + 1}'s": model.point[j, 0] for j, far in enumerate(model.body[:, 0]) if far == k}
+    points |= {f"joint {j + 1}'s": point for j, side, point in attached if side == 0}
     forces: dict[str, Read] = {
         "applied force": lambda b: b.force,
         "weight": lambda b: b.mass * b.case.model.gravity,
@@ -311,11 +293,11 @@ def _body_readings(case: Case, k: int) -> Iterator[Reading]:
     for which, point in points.items():
         for term, force in forces.items():
             moved = partial(lambda x, of, b: b.moment + np.cross(x, b.to_body(of(b))), point, force)
-            yield Reading(term, f"applied at {which} point", _row("moment", k, moved))
+            yield Reading(term, f"applied at {which} point", [("moment", k, (), moved)])
     for names, words in ((("force", "moment"), "applied force and moment"),
                          (("drag_force", "drag_moment"), "drag force and drag moment")):  # fmt: skip
-        changes = [_constant(name, k, getattr(model, other)[k]) for name, other in (names, names[::-1])]
-        yield Reading(words, "exchanged", partial(lambda one, other, case: other(one(case)), *changes))
+        pieces = [_constant(name, k, getattr(model, other)[k]) for name, other in (names, names[::-1])]
+        yield Reading(words, "exchanged", pieces)
 
 
 def _inertia_readings(model: Model, k: int) -> Iterator[Reading]:
@@ -323,10 +305,10 @@ def _inertia_readings(model: Model, k: int) -> Iterator[Reading]:
     J, arm = model.inertia[k], cross_matrix(model.proximal[k])
     if not model.kinds[k].holds_nothing:
         about_point = _constant("inertia", k, J - model.mass[k] * (arm @ arm))
-        yield Reading("inertia", "that about its joint's point", about_point)
+        yield Reading("inertia", "that about its joint's point", [about_point])
     for times, words in TURNS.items() if not model.kinds[k].has_attitude else ():
         of = partial(lambda n, axes, b: b.turned_inertia(n, axes), times, rotation_matrix(model.turn[k, 1]))
-        yield Reading("inertia", words, _row("inertia", k, of))
+        yield Reading("inertia", words, [("inertia", k, (), of)])
     for order in list(permutations(range(3)))[1:]:  # in the right order a factor
         for sign in (-1.0, 1.0):
             other = J.copy()
@@ -334,7 +316,7 @@ def _inertia_readings(model: Model, k: int) -> Iterator[Reading]:
                 a, b, c, d = (i + 1) % 3, (i + 2) % 3, (j + 1) % 3, (j + 2) % 3
                 other[a, b] = other[b, a] = sign * J[c, d]
             taken = ", ".join("-" * (sign < 0) + PRODUCTS[j] for j in order)
-            yield Reading("products of inertia yz, xz, xy", taken, _constant("inertia", k, other))
+            yield Reading("products of inertia yz, xz, xy", taken, [_constant("inertia", k, other)])
 
 
 # -- joints --------------------------------------------------------------------------------------------
@@ -351,10 +333,10 @@ def _joint_readings(case: Case, k: int) -> Iterator[Reading]:
         terms |= {"x": "coordinates", "xdot": "rates"} if k < model.n else {}
         for name, term in terms.items():
             exchanged = partial(lambda name, j: getattr(j, name)[..., order], name)
-            yield Reading(term, "exchanged", _row(name, k, exchanged))
+            yield Reading(term, "exchanged", [(name, k, (), exchanged)])
     if kind.has_pitch:
         for words, factor in (("reversed", -1.0), ("taken per turn, not per radian", 0.5 / np.pi)):
-            yield Reading("pitch", words, _constant("length", k, factor * model.length[k]))
+            yield Reading("pitch", words, [_constant("length", k, factor * model.length[k])])
     if not kind.holds_nothing:
         yield from _point_readings(model, k)
     if not kind.has_attitude:
@@ -365,25 +347,20 @@ def _coordinate_readings(model: Model, k: int) -> Iterator[Reading]:
     motions = model.kinds[k].motions
     of_each: dict[str, Callable[[Array], Array]] = {"reversed": np.negative, "its absolute value": np.abs}
 
-    def coordinate(name: str, i: int, change: Callable[[Array], Array]) -> Change:
-        def of(j: _Place) -> Array:
-            values = getattr(j, name)
-            return np.where(np.arange(values.shape[-1]) == i, change(values), values)
-
-        return _row(name, k, of)
+    def coordinate(name: str, i: int, change: Callable[[Array], Array]) -> Piece:
+        return name, k, (i,), lambda j: change(getattr(j, name)[..., i])
 
     for i, (what, _) in enumerate(motions):
         if what == "turn":
             principal = coordinate("x", i, lambda x: np.arctan2(np.sin(x), np.cos(x)))
-            yield Reading(f"angle {i + 1}", "its principal value", principal)
+            yield Reading(f"angle {i + 1}", "its principal value", [principal])
         for name, term in (("x", "coordinate"), ("xdot", "rate")):
             for words, change in of_each.items():
                 if name == "x" or len(motions) > 1 or words != "reversed":  # else a factor
-                    yield Reading(f"{term} {i + 1}", words, coordinate(name, i, change))
+                    yield Reading(f"{term} {i + 1}", words, [coordinate(name, i, change)])
         if model.stiffness[k, i]:
-            own = np.arange(model.stiffness.shape[1]) == i
-            pull = _row("effort", k, partial(lambda own, j: j.effort + own * j.stiffness * j.x, own))
-            yield Reading(f"spring {i + 1}", "without its coordinate", pull)
+            pull = partial(lambda i, j: j.effort[i] + j.stiffness[i] * j.x[..., i], i)
+            yield Reading(f"spring {i + 1}", "without its coordinate", [("effort", k, (i,), pull)])
 
 
 def _point_readings(model: Model, k: int) -> Iterator[Reading]:
@@ -398,10 +375,9 @@ def _point_readings(model: Model, k: int) -> Iterator[Reading]:
             ("given in the axes of the joint", turn @ points[side]),
             ("turned into the axes of the joint", turn.T @ points[side]),
         ):
-            pair = (point, near) if side == 0 else (far, point)
-            yield Reading(f"{where} point", words, _constant("point", k, pair))
-    yield Reading("points", "exchanged", _constant("point", k, (near, far)), " in the two bodies")
-    yield Reading("points", "reversed", _constant("point", k, (-far, -near)), " in both bodies")
+            yield Reading(f"{where} point", words, [_constant("point", k, point, side)])
+    yield Reading("points", "exchanged", [_constant("point", k, (near, far))], " in the two bodies")
+    yield Reading("points", "reversed", [_constant("point", k, (-far, -near))], " in both bodies")
 
 
 def _axes_readings(model: Model, k: int) -> Iterator[Reading]:
@@ -409,24 +385,24 @@ def _axes_readings(model: Model, k: int) -> Iterator[Reading]:
     kind = model.kinds[k]
     far, near = frames = model.turn[k]
 
-    def turned_by(half: Array) -> Change:
+    def turned_by(half: Array) -> Piece:
         return _constant("turn", k, quaternion_product(frames, half))
 
     for axis in dict.fromkeys(axis for _, axis in kind.motions):
         about = np.roll(np.eye(4)[1], int(axis == 0))  # about y for x, about x for the others
-        yield Reading(f"axis {'xyz'[axis]}", "reversed", turned_by(about))
+        yield Reading(f"axis {'xyz'[axis]}", "reversed", [turned_by(about)])
     far_body, near_body, both = " in the far body", " in the near body", " in both bodies"
     for sides, where in (((0,), far_body), ((1,), near_body), ((0, 1), both)):
         for words, misread in QUATERNIONS.items():
-            read = [misread(q) if side in sides else q for side, q in enumerate(frames)]
-            yield Reading("axes", words, _constant("turn", k, read), where)
-    yield Reading("axes", "exchanged", _constant("turn", k, (near, far)), " in the two bodies")
-    yield Reading("axes", "those of the near body", _constant("turn", k, (near, near)), far_body)
-    yield Reading("axes", "those of the far body", _constant("turn", k, (far, far)), near_body)
+            pieces = [_constant("turn", k, misread(frames[side]), side) for side in sides]
+            yield Reading("axes", words, pieces, where)
+    yield Reading("axes", "exchanged", [_constant("turn", k, (near, far))], " in the two bodies")
+    yield Reading("axes", "those of the near body", [_constant("turn", k, (near, near))], far_body)
+    yield Reading("axes", "those of the far body", [_constant("turn", k, (far, far))], near_body)
     pairs = ((0, 2), (1, 2)) if kind.is_about_z else ((0, 1), (0, 2), (1, 2))
     for i, j in pairs if kind.motions else ():
         about = np.array([0.0, *(np.sqrt(0.5) * (np.eye(3)[i] + np.eye(3)[j]))])
-        yield Reading(f"axes {'xyz'[i]} and {'xyz'[j]}", "exchanged", turned_by(about))
+        yield Reading(f"axes {'xyz'[i]} and {'xyz'[j]}", "exchanged", [turned_by(about)])
 
 
 # -- springs, fields of others, and all ----------------------------------------------------------------
@@ -436,12 +412,11 @@ def _spring_readings(case: Case, i: int) -> Iterator[Reading]:
     """Points of springs negated, left out or exchanged; rates not divided by the length."""
     model = case.model
     points = model.spring_point[i]
-    yield Reading("points", "exchanged", _constant("spring_point", i, points[::-1]))
+    yield Reading("points", "exchanged", [_constant("spring_point", i, points[::-1])])
     for side, where in enumerate(("first", "second")):
         where = f"{where} point" if model.spring_body[i, side] >= 0 else "world's point"
         for words, point in (("reversed", -points[side]), ("left out", 0 * points[side])):
-            pair = (point, points[1]) if side == 0 else (points[0], point)
-            yield Reading(where, words, _constant("spring_point", i, pair))
+            yield Reading(where, words, [_constant("spring_point", i, point, side)])
     if model.spring_damping[i]:
 
         def undivided(place: _Place) -> Array:
@@ -449,7 +424,7 @@ def _spring_readings(case: Case, i: int) -> Iterator[Reading]:
             spans = np.array([np.linalg.norm(spring_vectors(model, s.r, s.p)[i]) for s in each])
             return np.asarray(spans * model.spring_damping[i])
 
-        yield Reading("rate", "dᵀḋ, not over the length", _row("spring_damping", i, undivided))
+        yield Reading("rate", "dᵀḋ, not over the length", [("spring_damping", i, (), undivided)])
 
 
 def _fields_of_others(model: Model) -> Iterator[tuple[str, str, str, Change]]:
