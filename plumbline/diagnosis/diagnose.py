@@ -43,14 +43,13 @@ from plumbline.diagnosis.prediction import (
     View,
     error_ratio,
     error_ratios,
-    tolerances,
     values_of,
 )
 from plumbline.diagnosis.readings import other_branches
 from plumbline.diagnosis.terms import Terms, force_places, is_spanned
 from plumbline.engines.registry import load_adapter
 from plumbline.model.datatypes import Array, Model, StateQuantities
-from plumbline.model.kinematics import complete_state, stack_states
+from plumbline.model.kinematics import complete_state
 from plumbline.truth.ground_truth import StateTruth
 
 MAX_LOCATED = 4  # states at which the difference is looked for with one thing taken away
@@ -266,35 +265,24 @@ class _Diagnosing:
 
     # -- causes in outputs ---------------------------------------------------------------------------
 
-    def _at(self, quantity: str, quantities: Sequence[StateQuantities], shift: int = 0) -> Array:
-        return values_of([quantities[i - shift] for i in self.places], quantity)
-
-    def _bounds(self, quantity: str) -> Array:
-        return tolerances([self.truth.bounds[i] for i in self.places], quantity)
-
-    def outputs(self, case: Case | None = None, right: Answers | None = None) -> Outputs:
-        """The table of outputs at the states, of the truth or of an altered mechanism."""
-        truth = self.truth
-        names = [q for q in QUANTITIES if getattr(truth.quantities[0], q) is not None]
-        true = {q: self._at(q, truth.quantities) for q in names}
-        return Outputs(
-            case or Case(self.model, stack_states([truth.states[i] for i in self.places])),
-            true if right is None else true | {q: x for q, x in right.items() if q in true},
-            {q: self._at(q, truth.quantities, 1) for q in names},
-            {q: self._bounds(q) for q in names},
-        )
+    def outputs(self, case: Case, right: Answers) -> Outputs:
+        """The table of outputs at the states, of the mechanism or of an altered one."""
+        here, before = self.difference(View()), [self.truth.quantities[i - 1] for i in self.places]
+        previous = {q: values_of(before, q) for q in here.names}
+        return Outputs(case, here.true | {q: right[q] for q in here.names}, previous, here.bounds)
 
     def _name_outputs(self, quantities: Sequence[str], outputs: Outputs) -> dict[str, Cause]:
         named = {}
         for quantity in quantities:
-            found = outputs.name(quantity, self._at(quantity, self.reported))
+            found = outputs.name(quantity, self.difference(View()).given[quantity])
             if found is not None:
                 named[quantity] = replace(found, states=len(self.places), quantities=(quantity,))
         return named
 
     def _outputs_alone(self, wrong: Sequence[str]) -> tuple[Cause, ...]:
         """One cause in each wrong quantity; none where a quantity has no name."""
-        self.named = self._name_outputs(wrong, self.outputs())
+        here = self.difference(View())
+        self.named = self._name_outputs(wrong, self.outputs(here.predictor.case, here.true))
         return tuple(dict.fromkeys(self.named.values())) if len(self.named) == len(wrong) else ()
 
     def _with_outputs(
@@ -322,8 +310,8 @@ class _Diagnosing:
         return ()
 
     def _explains(self, quantity: str, right: Array) -> bool:
-        off = self._at(quantity, self.reported) - right
-        return error_ratio(off, self._bounds(quantity)) <= ACCEPTED_RATIO
+        here = self.difference(View())
+        return error_ratio(here.given[quantity] - right, here.bounds[quantity]) <= ACCEPTED_RATIO
 
     def _altered(self, search: Search, found: Explanation) -> tuple[Case, Answers]:
         """The mechanism with a cause, and the quantities that follow."""

@@ -77,10 +77,11 @@ class Difference:
         self.quantity = np.repeat(self.names, [x.size for x in self.true.values()])
         states = [np.repeat(range(len(places)), x.size // len(places)) for x in self.true.values()]
         self.state = np.concatenate(states)
-        bounds = {q: tolerances([truth.bounds[i] for i in places], q, given) for q in self.names}
-        each = {q: np.broadcast_to(per_entry(bounds[q], x), x.shape) for q, x in self.true.items()}
+        self.given = {q: values_of(given, q) for q in self.names}
+        self.bounds = {q: tolerances([truth.bounds[i] for i in places], q, given) for q in self.names}
+        each = {q: np.broadcast_to(per_entry(self.bounds[q], x), x.shape) for q, x in self.true.items()}
         self.weight = self._flat(each)
-        self.values = self.off({q: values_of(given, q) for q in self.names})
+        self.values = self.off(self.given)
         self.view, self.model = view, model
         self.predictor = Predictor(model, [truth.states[i] for i in places], view)
 

@@ -30,14 +30,14 @@ from plumbline.equations.arithmetic import floats
 from plumbline.equations.tree import Tree
 from plumbline.model.datatypes import Array
 from plumbline.model.kinematics import JointFrame, cross, rotate_vectors, rotation_matrix
-from plumbline.model.loops import cut_open
+from plumbline.model.loops import CutMechanism, cut_open
 
 Choose = Callable[[Array], Array]  # of the rows of some bodies or joints
 MakeCause = Callable[..., Cause]  # of words and amounts
 SINGLE_ROUNDING = 1e-5  # of the largest value: what computing in single precision may cost
 MAX_RATIO = 2.0  # in bounds: of what is returned and of the right quantity
 FACTOR_ROUNDING = 1e-6  # of a fitted share of a part: a word for 0, 1, 2 or −1 times
-LOADING = ("force", "moment", "drag_force", "drag_moment", "spring_damping", "spring_stiffness")
+LOADS = ("force", "moment", "drag_force", "drag_moment")
 SPRINGS, CLOSING_JOINTS = "the springs between points", "those of the closing joints"
 MAX_PARTS = 1000  # of which every two are tried
 SHARES = {-1.0: "without {}", 1.0: "with twice {}", -2.0: "with {} of the opposite sign"}
@@ -282,14 +282,22 @@ class Outputs:
 
     def _energy(self, which: int, *names: str, at: tuple[int, ...] = ()) -> Array:
         """How much kinetic (0) or potential energy (1) a number, or whole fields, add."""
-        model, state = self.case.model.tree, self.case.state
-        changes = {name: getattr(model, name).copy() for name in names}
+        found = self._added(lambda tree: tree.totals()[which], names, at)
+        return np.broadcast_to(found, (len(self.case.state.p), 1, 1))[:, 0, 0]
+
+    def _added(self, of: Callable[[Tree], Array], names: Sequence[str], at: tuple[int, ...] = ()) -> Array:
+        """What numbers of some fields add to what is found of the mechanism, loops cut open."""
+        state = self._cut.state(self.case.state)
+        changes = {name: getattr(self.case.model, name).copy() for name in names}
         for values in changes.values():
             values[(..., *at)] = 0.0
-        full, less = (
-            Tree(floats(), one, state).totals()[which] for one in (model, replace(model, **changes))
-        )
-        return np.asarray(np.broadcast_to(full - less, (len(state.p), 1, 1))[:, 0, 0])
+        less = self._cut.with_numbers(replace(self.case.model, **changes)).model
+        full, without = (of(Tree(floats(), one, state)) for one in (self._cut.model, less))
+        return np.asarray(full - without)
+
+    @cached_property
+    def _cut(self) -> CutMechanism:
+        return cut_open(self.case.model)
 
     # -- wrenches of joints ------------------------------------------------------------------------
 
@@ -328,30 +336,24 @@ class Outputs:
         weight = np.zeros((2, *state.v.shape))
         weight[0] = model.mass[..., None] * model.gravity[..., None, :]
         loads = {"weight": weight}
-        for name in ("force", "moment", "drag_force", "drag_moment"):
-            loads[WORDS[name]] = self._loads(**{name: getattr(model, name)})
+        for name in LOADS:
+            loads[WORDS[name]] = self._added(self._loads, [name])
         parts, bodies = list[Part](), np.arange(model.n)
         for what, load in loads.items():
             each = [load * (bodies == k)[:, None] for k in bodies]
             parts += self._carried_parts(f"the {what} of body {{}}", f"the {what}s", each)
-        springs = {name: getattr(model, name) for name in ("spring_damping", "spring_stiffness")}
-        damping = {name: x for name, x in springs.items() if name == "spring_damping"}
-        for words, fields in ("{}", springs), ("the damping of {}", damping):
-            if fields is springs or all(map(np.any, springs.values())):
-                numbers = np.arange(len(model.spring_body))
-                masks = [numbers == i for i in numbers]
-                each = [self._loads(**{name: x * mask for name, x in fields.items()}) for mask in masks]
-                parts += self._carried_parts(words.format("spring {}"), words.format(SPRINGS), each)
+        springs = ["spring_stiffness", "spring_damping"]
+        are_damped = all(np.any(getattr(model, name)) for name in springs)
+        for words, names in ("{}", springs), *((("the damping of {}", springs[1:]),) * are_damped):
+            each = [self._added(self._loads, names, (i,)) for i in range(len(model.spring_body))]
+            parts += self._carried_parts(words.format("spring {}"), words.format(SPRINGS), each)
         return parts + self._element_parts() + self._joint_parts()
 
-    def _loads(self, **fields: Array) -> Array:
-        """Forces and moments (2, S, N, 3) of bodies by some fields alone."""
-        model, state = self.case.model.tree, self.case.state
-        none = {name: 0 * getattr(model, name) for name in LOADING}
-        loads = Tree(floats(), replace(model, **none | fields), state).loads()
-        shape = len(state.p), 3, 1
-        return np.array([np.stack([np.broadcast_to(x, shape)[..., 0] for x in some], 1)
-                         for some in zip(*loads, strict=True)])  # fmt: skip
+    def _loads(self, tree: Tree) -> Array:
+        """Forces and moments (2, S, N, 3) of the bodies by loads, drag and springs between points."""
+        shape, places = (len(tree.state.p), 3, 1), self._cut.place[: self.case.model.n]
+        return np.array([np.stack([np.broadcast_to(some[k], shape)[..., 0] for k in places], 1)
+                         for some in zip(*tree.loads(), strict=True)])  # fmt: skip
 
     def _carried_parts(self, words: str, every: str, loads: Sequence[Array], first: int = 0) -> list[Part]:
         """What joints carry of each of some loads (2, S, N, 3), which are of places from the first on."""
@@ -429,7 +431,7 @@ class Outputs:
         model, state = self.case.model, self.case.state
         if not model.has_loops or not self.right.keys() >= {"acceleration", *WRENCHES}:
             return []
-        cut, number = cut_open(model), np.arange(len(model.kind))[:, None]
+        cut, number = self._cut, np.arange(len(model.kind))[:, None]
         inertial = np.matvec(model.inertia, self.right["angular_acceleration"]) + gyroscopic_moment(self.case)
         inertial, each, total = np.matvec(self._turns, inertial), list[tuple[str, Array]](), 0.0 * self._near
 
