@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from plumbline.diagnosis.cause import Cause
 from plumbline.diagnosis.edits import Edit, at_place, coordinate_place
 from plumbline.diagnosis.prediction import VECTORS, Answers, Predictor
-from plumbline.equations.responses import Responses
+from plumbline.equations.responses import EndRows, Responses
 from plumbline.model.datatypes import Array, Model
 from plumbline.model.kinematics import cross, rotation_matrix
 from plumbline.model.loops import cut_open
@@ -23,7 +23,6 @@ from plumbline.model.loops import cut_open
 NOT_HELD = 1e-9  # of a direction: what the joint holds of it
 MAX_CONDITION = 1e14  # of the inertia that released directions have
 RANK_TOLERANCE = 1e-9  # of effects: a force that changes nothing
-Effect = Callable[[Answers], Array]
 
 
 class Terms:
@@ -32,22 +31,20 @@ class Terms:
     def __init__(self, predictor: Predictor) -> None:
         """Solve the right mechanism and its responses."""
         self.predictor, self.model = predictor, predictor.case.model
-        self.joints = np.arange(len(self.model.kind))  # where joint k is in the tree
-        self.tree, self.state = predictor.case.model, predictor.case.state
-        self.ends: tuple[tuple[int, int], ...] = ()
-        self.scale: Array | None = None
-        if self.model.has_loops:
-            cut = cut_open(self.model)
-            self.joints, self.ends, self.scale = cut.place, cut.ends, cut.row_scale
-            self.tree, self.state = predictor.cut(self.tree, self.state)
+        cut = cut_open(self.model)
+        self.joints, self.ends, self.scale = (
+            cut.place,
+            cut.ends,
+            cut.row_scale,
+        )  # where joint k is in the tree
+        self.tree, self.state = cut.model, cut.state(predictor.case.state)
         self.found = self._solved(self.ends, "accelerations")
         self._responses = self.found.to_joints()  # (S, N, 4, 3, c)
         first = np.cumsum([0, *(held.shape[-1] for held in self.found.held)])
         self._columns = [slice(first[k], first[k + 1]) for k in range(len(first) - 1)]
 
-    def _solved(self, ends: Sequence[tuple[int, int]], end_rows: str) -> Responses:
-        scale = None if self.scale is None else self.scale[: 6 * len(ends)]
-        return Responses(self.tree, self.state, ends, scale, end_rows)  # type: ignore[arg-type]
+    def _solved(self, ends: Sequence[tuple[int, int]], end_rows: EndRows) -> Responses:
+        return Responses(self.tree, self.state, ends, self.scale[: 6 * len(ends)], end_rows)
 
     def answers(self, change: Array) -> Answers:
         """Turn changes (S, N, 4, 3) of the solution into those of the mechanism's vectors."""

@@ -111,12 +111,13 @@ def test_elementary_mistakes_in_outputs_are_named(name, mistake):
         assert cause.amount == {"2 T": (2.0,), "T/2": (0.5,)}.get(mistake, ())
 
 
-def test_different_mistakes_in_one_quantity_stay_apart():
+@pytest.mark.parametrize("name", [CHAIN, *(pytest.param(name, marks=SLOW) for name in (TREE, LOOP))])
+def test_different_mistakes_in_one_quantity_stay_apart(name):
     of_accelerations = [m for m, (quantity, *_) in TEN.items() if quantity == "acceleration"]
     pairs = list(combinations(of_accelerations, 2))
     assert len(pairs) == 10
     for one, other in pairs:
-        assert cause_of_output(CHAIN, one).identity != cause_of_output(CHAIN, other).identity
+        assert cause_of_output(name, one).identity != cause_of_output(name, other).identity
 
 
 def carried(model, forces):
