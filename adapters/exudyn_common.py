@@ -47,7 +47,8 @@ class ExudynAdapter(MetamorphicHooks):
     """Declarations common to all columns of Exudyn."""
 
     package = "exudyn"
-    supported_versions = ">=1.9,<2"
+    supported_versions = ">=1.7,<2"
+    extra_requirements = (("<1.9", "numpy<2"),)  # beside NumPy 2 every array reads as zeros
 
     def version(self) -> str:
         """Return the version of the Exudyn that is loaded."""
@@ -327,6 +328,12 @@ def known_arguments(function: Callable[..., Any], given: Mapping[str, Any]) -> M
     """Leave out what older versions of a function have not."""
     own = getattr(function, "__func__", function)  # of a method of a system, which would be kept alive
     return {name: value for name, value in given.items() if name in _parameters(own)}
+
+
+def items_argument(function: Callable[..., Any], ends: Sequence[Any]) -> Mapping[str, Any]:
+    """Give the items that a function connects by their name in this version."""
+    names = dict.fromkeys(("itemNumbers", "bodyNumbers", "bodyOrNodeList"), ends)
+    return dict([*known_arguments(function, names).items()][:1])
 
 
 @cache

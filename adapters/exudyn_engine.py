@@ -68,6 +68,7 @@ from plumbline.model.kinematics import (
     elastic_energy,
     joint_coordinates,
     remembered_velocity_jacobian,
+    rotate_vectors,
     rotation_matrix,
 )
 from plumbline.model.loops import independent_rows
@@ -506,7 +507,7 @@ def _evaluate_state(chain: ExudynChain) -> StateQuantities:
     elements = _element_wrenches(chain)
     momentum = (M @ chain.qdot.ravel()).reshape(n, w)  # of θ̇ = B ω′: Bᵀ (…) = J ω′
     p = chain.state.p[chain.body_of_piece]
-    spin = np.matvec(chain.rates.mT, momentum[:, 3:])
+    spin = rotate_vectors(chain.rates.swapaxes(-1, -2), momentum[:, 3:])
     r = np.array([mbs.GetObjectOutputBody(body, Output.Position) for body in chain.piece_bodies])
     still = np.zeros(w - 3)
     weight = (M @ np.tile([*chain.model.gravity, *still], n)).reshape(n, w)[:, :3]
@@ -545,10 +546,10 @@ def _joint_moments(chain: ExudynChain, force: Array, of_p: Array) -> Array:
     near = chain.model.body[:, 1]
     A = rotation_matrix(chain.state.p)[near]
     rates = chain.rates[[chain.first_piece[i] for i in near]]
-    about_centre = np.matvec(rates.mT, of_p)
+    about_centre = rotate_vectors(rates.swapaxes(-1, -2), of_p)
     centre = np.array([chain.piece_centre[chain.first_piece[i]] for i in near])
-    lever = np.matvec(A, chain.model.proximal - centre)
-    return np.asarray(np.matvec(A, about_centre) - cross(lever, force))
+    lever = rotate_vectors(A, chain.model.proximal - centre)
+    return np.asarray(rotate_vectors(A, about_centre) - cross(lever, force))
 
 
 def _system_matrices(chain: ExudynChain) -> tuple[Array, Array, Array]:

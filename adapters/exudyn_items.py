@@ -20,7 +20,7 @@ from adapters.exudyn_common import (
     changed_item,
     initialized_solver,
     items,
-    known_arguments,
+    items_argument,
     make_rigid_body,
     make_settings,
     make_system,
@@ -236,7 +236,7 @@ def _add_rotors(body_kind: str) -> Callable[[_Items], None]:
         s.mbs.Assemble()
         call = _call("Node1D", body_kind)
         turns = np.reshape([s.of_body(rotor, "RotationMatrix") for rotor in rotors], (-1, 3, 3, 3))
-        s.add_axes(call, [x @ y @ z @ PROBE_TURN for x, y, z in turns @ np.array(frames).mT])
+        s.add_axes(call, [x @ y @ z @ PROBE_TURN for x, y, z in turns @ np.array(frames).swapaxes(-1, -2)])
         spins = np.reshape([s.of_body(rotor, "AngularVelocity") for rotor in rotors], (-1, 3, 3))
         s.add("frame_angular_velocity", call, np.sum(spins, axis=1))
         s.add("frame_angular_velocity", (*call, MASS), _gathered(s.momenta(rotors), LINES) / inertia)
@@ -317,9 +317,8 @@ def _add_coordinate_constraints(s: _Items) -> None:
                 (_call(f"{by_user}_t"), short, by_velocity),
             ):
                 made.setdefault(call, []).append(s.object(kind, fixed, marker, **given))
-            ends = {key: [None, point] for key in ("itemNumbers", "bodyOrNodeList", "bodyNumbers")}
-            own = dict([*known_arguments(create, ends).items()][:1])  # under the name of the version
-            joint = create(s.mbs, coordinates=[None, i], offset=place, **own)
+            ends = items_argument(create, [None, point])
+            joint = create(s.mbs, coordinates=[None, i], offset=place, **ends)
             made.setdefault(("MainSystem.CreateCoordinateConstraint",), []).append(joint)
     s.mbs.Assemble()
     for (call, joints), factor in zip(made.items(), (0.5, 1.0, 2.0, 2.0, 2.0), strict=True):
@@ -385,7 +384,7 @@ def _add_relative_markers(s: _Items) -> None:
             s.add("frame_position_from_anchor", (*call, "OutputVariableType.Displacement"), place)
         elif not kind.startswith(between):
             turns = np.array([turned(angles) @ PROBE_TURN for angles in place])
-            s.add("frame_axes_by_angles", call, np.reshape(turns.mT, (-1, 3)))
+            s.add("frame_axes_by_angles", call, np.reshape(turns.swapaxes(-1, -2), (-1, 3)))
 
 
 def _add_connectors(s: _Items) -> None:

@@ -126,7 +126,7 @@ class _Points:
     """What is pushed, and what a step made of it; ``places``: directions, of ``lengths`` [m]."""
 
     def __init__(self, record: SurfaceRecord, places: Float[Array, "bodies 3"]) -> None:
-        self.record = record
+        self.record, self.containers = record, list[Any]()
         self.lengths = np.linalg.norm(places, axis=1, keepdims=True)
         self.places = np.where(self.lengths > 0, places, AXES[0]) / np.where(
             self.lengths > 0, self.lengths, 1
@@ -136,7 +136,7 @@ class _Points:
 
     def system(
         self, is_lawful: Callable[[], bool] = lambda: True, pull: float = 0.0, spring: Any = None
-    ) -> tuple[Any, Any]:
+    ) -> Any:
         """Assemble the points; where the law of the forces fails they are no numbers after the start.
 
         Args:
@@ -165,7 +165,8 @@ class _Points:
                 by = {"loadVectorUserFunction": partial(law, k)}
                 mbs.AddLoad(items.LoadForceVector(markerNumber=marker, loadVector=push, **by))
         mbs.Assemble()
-        return mbs, container
+        self.containers.append(container)  # read from after steps; 1.8 frees it with the last name for it
+        return mbs
 
     def read(self, mbs: Any) -> tuple[Array, Array]:
         """Return places and velocities."""
@@ -249,7 +250,7 @@ def add_point_answers(record: SurfaceRecord, state: State) -> None:
 
 
 def _add_step(points: _Points, names: Any, options: Any, factors: Factors) -> None:
-    mbs, _container = points.system(pull=PULL * ("computeLoadsJacobian" in options))
+    mbs = points.system(pull=PULL * ("computeLoadsJacobian" in options))
     _solve(mbs, options)
     points.add_results(names, points.read(mbs), factors)
 
@@ -268,7 +269,7 @@ def _add_root(points: _Points, names: Any, options: Mapping[str, Any]) -> None:
             items.ObjectConnectorCartesianSpringDamper(markerNumbers=markers, springForceUserFunction=law)
         )
 
-    mbs, _container = points.system(spring=spring)
+    mbs = points.system(spring=spring)
     settings = _settings({})
     newton = settings.staticSolver.newton
     newton.relativeTolerance, newton.absoluteTolerance, newton.maxIterations = TIGHT, 1e-300, 100
@@ -295,7 +296,7 @@ def _add_adaptive_steps(points: _Points) -> None:
             trials.append(t)
             return True
 
-        mbs, _container = points.system(is_lawful=lambda: len(trials) > failures)  # noqa: B023
+        mbs = points.system(is_lawful=lambda: len(trials) > failures)  # noqa: B023
         mbs.SetPreStepUserFunction(count)
         found = _after_step(points, mbs, adaptive | options, step)
         points.add_results(_names("TimeIntegrationSettings", names), found, _exact(time))
@@ -339,7 +340,7 @@ def _add_automatic_steps(points: _Points) -> None:
         ("stepSizeSafety relativeTolerance", by_error,
          {"stepSizeMaxIncrease": 1e3, "absoluteTolerance": 1e-300, "relativeTolerance": tolerance}),
     ):  # fmt: skip
-        mbs, _container = own.system()
+        mbs = own.system()
         x, v = _after_step(own, mbs, {"solverType": "ODE23"} | options | more, 2)
         signs, call = np.sign(points.places), _names("TimeIntegrationSettings", names)
         points.add_results(call, (signs * x, signs * v), _exact(h + second))
@@ -350,11 +351,7 @@ def _initialized(
     points: _Points, options: Mapping[str, Any], kind: str = IMPLICIT, pull: float = 0.0
 ) -> Iterator[tuple[Any, Any, Any]]:
     """Initialise a solver for one step of 1 s."""
-    (mbs, _container), settings, solver = (
-        points.system(pull=pull),
-        _settings(options),
-        getattr(exudyn, kind)(),
-    )
+    mbs, settings, solver = points.system(pull=pull), _settings(options), getattr(exudyn, kind)()
     with initialized_solver(solver, mbs, settings):
         solver.it.currentStepSize, solver.it.currentStepIndex = 1.0, 1
         yield solver, mbs, settings
@@ -516,7 +513,7 @@ def _add_initialisation(points: _Points) -> None:
 
 def _add_stored(points: _Points) -> None:
     """Read the velocities after a step from what sensors stored."""
-    mbs, _container = points.system()
+    mbs = points.system()
     velocity = {"outputVariableType": Output.Velocity, "writeToFile": False, "storeInternal": True}
     nodes = range(points.count)
     sensors = [mbs.AddSensor(items.SensorNode(nodeNumber=node, **velocity)) for node in nodes]

@@ -36,7 +36,7 @@ def _in_probe_axes(values: Array) -> Array:
 
 
 def _axes(values: Array) -> Array:
-    return (values.reshape(-1, 3, 3) @ PROBE_TURN).mT.reshape(-1, 3)
+    return (values.reshape(-1, 3, 3) @ PROBE_TURN).swapaxes(-1, -2).reshape(-1, 3)
 
 
 def _axes_of_angles(values: Array) -> Array:

@@ -157,7 +157,7 @@ class _Linkage:
             else:
                 self._add_jointed_body(k, own)
         self.start = self._coordinates_at_start()
-        self.body_axes = self.attitude.mT @ np.array(self.link_axes)
+        self.body_axes = self.attitude.swapaxes(-1, -2) @ np.array(self.link_axes)
 
     def _coordinates_at_start(self) -> Array:
         """Where the links' coordinates of 0 are, as `Trajectory` counts them."""

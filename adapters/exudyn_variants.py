@@ -22,6 +22,7 @@ from adapters.exudyn_common import (
     call_parts,
     changed_item,
     items,
+    items_argument,
     known_arguments,
     make_rigid_body,
     sizes_of_body,
@@ -293,7 +294,7 @@ def _created_between(function: str, **more: Any) -> Callable[..., Any]:
         ends, create = [mbs.GetMarker(marker) for marker in markerNumbers], getattr(mbs, function)
         given |= {f"localPosition{i}": end["localPosition"] for i, end in enumerate(ends)}
         bodies = [end["bodyNumber"] for end in ends]
-        return create(bodyNumbers=bodies, **given, **known_arguments(create, more))
+        return create(**items_argument(create, bodies), **given, **known_arguments(create, more))
 
     return add
 
@@ -315,9 +316,8 @@ def _created_along(mbs: Any, **given: Any) -> Any:
     law: dict[str, Any] = {name: given[name] for name in numbers if name in given}
     law["offset"] -= start
     law |= {"position": ends[0]["localPosition"], "axis": axis, "useGlobalFrame": False}
-    bodies = {"bodyNumbers" if is_turn else "itemNumbers": [end["bodyNumber"] for end in ends]}
     create = mbs.CreateTorsionalSpringDamper if is_turn else mbs.CreateLinearSpringDamper
-    return create(**bodies, **law)
+    return create(**items_argument(create, [end["bodyNumber"] for end in ends]), **law)
 
 
 def _place_of(mbs: Any, marker: Any) -> tuple[Array, Array]:

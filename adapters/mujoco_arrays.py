@@ -15,7 +15,13 @@ import numpy as np
 from adapters.mujoco_common import structure_of
 from adapters.mujoco_probes import Probed
 from plumbline.model.datatypes import Array, Float
-from plumbline.model.kinematics import cross, quaternion_exponential, quaternion_product, rotation_matrix
+from plumbline.model.kinematics import (
+    cross,
+    quaternion_exponential,
+    quaternion_product,
+    rotate_vectors,
+    rotation_matrix,
+)
 from plumbline.model.probe_frames import PROBE_TURN
 
 SCALAR = {mujoco.mjtJoint.mjJNT_HINGE: "HINGE", mujoco.mjtJoint.mjJNT_SLIDE: "SLIDE"}
@@ -72,7 +78,7 @@ def _at_point(s: Probed, vectors: Array) -> tuple[Array, Array]:
 
 
 def _add_attitudes(s: Probed) -> None:
-    d, inertial = s.d, rotation_matrix(s.m.body_iquat[s.links]).mT @ PROBE_TURN
+    d, inertial = s.d, rotation_matrix(s.m.body_iquat[s.links]).swapaxes(-1, -2) @ PROBE_TURN
     places, turns = np.zeros((len(s.links), 3)), np.zeros((len(s.links), 9))
     same, call = mujoco.mjtSameFrame.mjSAMEFRAME_NONE, ("mj_local2Global", "mjtSameFrame")
     for site, body, place, turn in zip(s.sites, s.links, places, turns, strict=True):
@@ -154,7 +160,7 @@ def _add_joint_frames(s: Probed) -> None:
         _add_joint_views(s)
         anchored = d.xpos[links].copy()
         last = (m.body_jntadr[links] + m.body_jntnum[links] - 1)[has_joint]
-        arms = np.matvec(d.xmat[links].reshape(-1, 3, 3)[has_joint], m.jnt_pos[last])
+        arms = rotate_vectors(d.xmat[links].reshape(-1, 3, 3)[has_joint], m.jnt_pos[last])
         # a slide moves the body after the anchor was found
         is_moved = m.jnt_type[last] == mujoco.mjtJoint.mjJNT_SLIDE
         anchored[has_joint] = np.where(is_moved[:, None], anchored[has_joint], d.xanchor[last] - arms)
@@ -216,10 +222,10 @@ def _add_wrenches(s: Probed) -> None:
         wrench[b] += J @ d.cacc[b] + turned - d.cfrc_ext[b]
         wrench[m.body_parentid[b]] += wrench[b]
     lever = d.subtree_com[m.body_rootid[s.links]] - d.site_xpos[s.sites]
-    local, force = d.site_xmat[s.sites].reshape(-1, 3, 3).mT, wrench[s.links, 3:]
+    local, force = d.site_xmat[s.sites].reshape(-1, 3, 3).swapaxes(-1, -2), wrench[s.links, 3:]
     moment = wrench[s.links, :3] + cross(lever, force)
-    s.add("joint_force_local", ("MjData.cfrc_ext",), np.matvec(local, force))
-    s.add("joint_moment_local", ("MjData.cfrc_ext",), np.matvec(local, moment))
+    s.add("joint_force_local", ("MjData.cfrc_ext",), rotate_vectors(local, force))
+    s.add("joint_moment_local", ("MjData.cfrc_ext",), rotate_vectors(local, moment))
 
 
 # Add all after `mj_forward` and `mj_rnePostConstraint`.

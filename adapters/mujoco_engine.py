@@ -573,9 +573,9 @@ class _MujocoChain:
         first = m.body_jntadr[own]
         turn = kinematics.quaternion_product(relative, kinematics.quaternion_conjugate(HINGE_TURN))
         before, near = kinematics.rotation_matrix(m.body_quat[own]), m.jnt_pos[first]
-        hang = m.body_pos[own] + np.matvec(before, near)
+        hang = m.body_pos[own] + kinematics.rotate_vectors(before, near)
         m.body_quat[own] = turn
-        m.body_pos[own] = hang - np.matvec(kinematics.rotation_matrix(turn), near)
+        m.body_pos[own] = hang - kinematics.rotate_vectors(kinematics.rotation_matrix(turn), near)
         self.d.qpos[m.jnt_qposadr[first][:, None] + np.arange(3)] = HINGE_ANGLES
         rows = m.jnt_dofadr[first][:, None] + np.arange(3)
         T[rows] = np.linalg.solve(HINGE_RATES, T[rows])
@@ -591,7 +591,7 @@ class _MujocoChain:
             d.qacc = np.linalg.solve(full_mass_matrix(m, d), d.qfrc_smooth + d.qfrc_constraint)
         velocity = self._spatial_motion(mujoco.mj_objectVelocity, d)
         d.xfrc_applied[link, :3] -= self.model.drag_force[:, None] * velocity[:, 3:]
-        moment = np.matvec(d.xmat[link].reshape(-1, 3, 3), self.model.moment)
+        moment = kinematics.rotate_vectors(d.xmat[link].reshape(-1, 3, 3), self.model.moment)
         d.xfrc_applied[link, 3:] = moment - self.model.drag_moment[:, None] * velocity[:, :3]
         mujoco.mj_rnePostConstraint(m, d)
         return T
@@ -623,7 +623,7 @@ class _MujocoChain:
     def _joint_moments(self) -> Array:
         """Return the moments (N, 3) about the joints' near points, world frame."""
         m, d, link = self.m, self.d, self.link_ids
-        near = d.xpos[link] + np.matvec(d.xmat[link].reshape(-1, 3, 3), self.model.proximal)
+        near = d.xpos[link] + kinematics.rotate_vectors(d.xmat[link].reshape(-1, 3, 3), self.model.proximal)
         arm = d.subtree_com[m.body_rootid[link]] - near
         return np.asarray(d.cfrc_int[link, :3] + kinematics.cross(arm, d.cfrc_int[link, 3:]))
 

@@ -243,7 +243,7 @@ def _add_relative(s: Probed) -> None:
     for name, quantity in RELATIVE_SENSORS.items():
         value = s.sensors(f"{name} in first")
         if name == "FRAMEQUAT":
-            value = rotation_matrix(value).mT.reshape(-1, 3)
+            value = rotation_matrix(value).swapaxes(-1, -2).reshape(-1, 3)
         s.add(quantity, (f"mjtSensor.mjSENS_{name}",), value)
     for name, (_, quantity, size) in DISTANCE_SENSORS.items():
         s.add(quantity, (f"mjtSensor.mjSENS_{name}",), s.sensors(name) / size)

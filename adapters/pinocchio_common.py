@@ -19,7 +19,7 @@ class PinocchioAdapter(MetamorphicHooks):
     """Declarations common to all columns of Pinocchio."""
 
     package = "pin"
-    supported_versions = ">=3.3.1,<5"
+    supported_versions = ">=2.6.10,<5"
     # What the wheels of version 3 were linked with.
     extra_requirements = (("<4", "cmeel-urdfdom<5"), ("<4", "cmeel-tinyxml2<11"))
     welding_unsupported_reason = ""
@@ -27,6 +27,16 @@ class PinocchioAdapter(MetamorphicHooks):
     def version(self) -> str:
         """Return the version of the pin wheel."""
         return str(pin.__version__)
+
+
+def joint_of(frame: pin.Frame) -> int:
+    """Return the joint that carries a frame; version 2 has another name for it."""
+    return int(frame.parentJoint if hasattr(frame, "parentJoint") else frame.parent)
+
+
+def armature(pin_model: pin.Model) -> Float[Array, "nv"]:
+    """Return the inertias [kg m², kg] of the joints' rotors; before version 3 models have none."""
+    return np.array(getattr(pin_model, "armature", np.zeros(pin_model.nv)))
 
 
 def translation(point: Float[Array, "3"]) -> pin.SE3:
@@ -75,7 +85,7 @@ def add_frame(pin_model: pin.Model, name: str, joint: int, point: Float[Array, "
         point: its origin [m] in the joint's frame.
 
     """
-    frame = pin.Frame(name, joint, translation(point), pin.FrameType.OP_FRAME)
+    frame = pin.Frame(name, joint, 0, translation(point), pin.FrameType.OP_FRAME)
     return int(pin_model.addFrame(frame))
 
 

@@ -51,6 +51,7 @@ from adapters.pinocchio_common import (
     PinocchioAdapter,
     add_frame,
     append_parts,
+    armature,
     composite,
     configuration_rate,
     energies_and_momentum,
@@ -165,7 +166,9 @@ class PinocchioChain:
         self.ends = ends
         # without ends a solver without constraints
         self.has_constraints = bool(ends) or self.algorithm == "constraintDynamics"
-        self.welds, self.weld_data = pin.StdVec_RigidConstraintModel(), pin.StdVec_RigidConstraintData()
+        self.welds, self.weld_data = list[Any](), list[Any]()
+        if self.has_constraints:
+            self.welds, self.weld_data = pin.StdVec_RigidConstraintModel(), pin.StdVec_RigidConstraintData()
         for ends_of_loop in ends:
             places = [(self.body_joints[k], self.placements[k]) for k in ends_of_loop]
             kind, frame = pin.ContactType.CONTACT_6D, pin.ReferenceFrame.LOCAL
@@ -222,7 +225,8 @@ class PinocchioChain:
         for k, joint in self.moving:
             is_ball = model.kinds[k].is_spherical
             at, own = slice(joint.idx_v, joint.idx_v + joint.nv), slice(1 if is_ball else joint.nv)
-            self.pin_model.armature[at] += model.armature[k, own]
+            if np.any(model.armature[k, own]):
+                self.pin_model.armature[at] += model.armature[k, own]
             self.damping[at], self.effort[at] = model.damping[k, own], model.effort[k, own]
             self.stiffness[at] = model.stiffness[k, own]
             if not is_ball:
@@ -304,7 +308,7 @@ class PinocchioChain:
         relative = frames.copy()
         relative[own] = quaternion_product(quaternion_conjugate(frames[up]), frames[own])
         spin = S.copy()
-        spin[own] -= rotation_matrix(relative[own]).mT @ S[up]
+        spin[own] -= rotation_matrix(relative[own]).swapaxes(-1, -2) @ S[up]
         q, T = pin.neutral(self.pin_model), np.zeros((self.pin_model.nv, S.shape[-1]))
         rates = own_rates(model)
         for j, joint in enumerate(self.joints):
@@ -413,8 +417,10 @@ class PinocchioChain:
                 return np.linalg.solve(mass, -bias)
             pin.cholesky.decompose(engine, data)  # along the tree's branches: sparse
             return np.ravel(pin.cholesky.solve(engine, data, -bias))
-        convention = pin.Convention.WORLD if self.algorithm == "aba-world" else pin.Convention.LOCAL
-        return np.asarray(pin.aba(self.pin_model, self.data, q, v, torque, self.fext, convention))
+        name = "WORLD" if self.algorithm == "aba-world" else "LOCAL"
+        has_both = hasattr(pin, "Convention") or self.algorithm != "aba"  # version 2 has the local one only
+        conventions = [getattr(pin.Convention, name)] if has_both else []
+        return np.asarray(pin.aba(self.pin_model, self.data, q, v, torque, self.fext, *conventions))
 
     def _load(self, q: Array, v: Array) -> Array:
         """Set the loads without forces of loops, and return the torques of the joints."""
@@ -535,7 +541,7 @@ class PinocchioChain:
             masses.append((self.body_joints[k] - 1, at_joint, 0.0, _axial_inertia(model, k)))
         welds = [[bodies[k] for k in pair] for pair in self.ends]
         loads = ("force", "moment", "drag_force", "drag_moment")
-        fields = {"gravity": model.gravity, "q": q, "v": v, "armature": engine.armature.copy()}
+        fields = {"gravity": model.gravity, "q": q, "v": v, "armature": armature(engine)}
         fields |= {f"link_{name}": getattr(model, name) for name in loads}
         fields |= {name: getattr(self, name) for name in ("effort", "damping", "stiffness", "rest")}
         fields |= {"of_q": self.scalars[0], "of_v": self.scalars[1], "joint_rates": self.rate_map(state)}

@@ -23,8 +23,11 @@ from plumbline.model.datatypes import Array, Call, Float
 # μ over the largest entry of J M⁻¹ Jᵀ, and how often the step is taken.  Measured on squeezer: with 1e-5 the
 # twelve steps do not converge (771 rad/s² off), with 1e-7 they end 5e-7 off, with 1e-8 within the bound.
 DAMPING, STEPS = 1e-8, 12
-FINE = pin.ProximalSettings(1e-15, 1e-14, 50)
 CORNERS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # m, points that hold a frame
+
+
+def _fine() -> Any:
+    return pin.ProximalSettings(1e-15, 1e-14, 50)
 
 
 class Loops(NamedTuple):
@@ -44,7 +47,7 @@ class _Rows:
         self.loops, self.m, self.q, self.v = loops, m, q, v
         self.still, self.solved = _still(m, q, v), m.createData()
         init_constraint_dynamics(m, self.solved, loops.welds, loops.data)
-        pin.constraintDynamics(m, self.solved, q, v, loops.push, loops.welds, loops.data, FINE)
+        pin.constraintDynamics(m, self.solved, q, v, loops.push, loops.welds, loops.data, _fine())
         self.mass = np.reshape(pin.crba(m, m.createData(), q), (m.nv, m.nv))
         self.force = loops.push - pin.nonLinearEffects(m, m.createData(), q, v)
         self.J = np.array(pin.getConstraintsJacobian(m, self.still, loops.welds, loops.data))
@@ -90,14 +93,14 @@ def closed_accelerations(
     yield from _by_derivatives(rows)
     # of version 3, with another name
     factors = solved.constraint_chol if hasattr(solved, "constraint_chol") else solved.contact_chol
-    a = rows.by(lambda b: np.ravel(factors.solve(b[:, None])), rows.bias, FINE.mu)
+    a = rows.by(lambda b: np.ravel(factors.solve(b[:, None])), rows.bias, _fine().mu)
     yield False, (by, "Data.constraint_chol"), a
     yield from _by_anchors(rows)
 
 
 def _by_derivatives(rows: _Rows) -> Iterator[tuple[bool, Call, Any]]:
     loops, m, v, J, solved = rows.loops, rows.m, rows.v, rows.J, rows.solved
-    derivatives = pin.computeConstraintDynamicsDerivatives(m, solved, loops.welds, loops.data, FINE)
+    derivatives = pin.computeConstraintDynamicsDerivatives(m, solved, loops.welds, loops.data, _fine())
     _, a_v, a_tau, _, f_v, f_tau = (np.array(x) for x in derivatives)
     pushed = loops.push - pin.computeGeneralizedGravity(m, m.createData(), rows.q)
     by = "computeConstraintDynamicsDerivatives"
@@ -173,7 +176,7 @@ def _by_anchors(rows: _Rows) -> Iterator[tuple[bool, Call, Any]]:
     yield False, by, rows.by_rows(np.vstack(points), np.concatenate(of_points))
     solved = m.createData()
     init_constraint_dynamics(m, solved, rigid, rigid_data)
-    a = pin.constraintDynamics(m, solved, rows.q, rows.v, loops.push, rigid, rigid_data, FINE).copy()
+    a = pin.constraintDynamics(m, solved, rows.q, rows.v, loops.push, rigid, rigid_data, _fine()).copy()
     yield False, ("convertToRigidConstraintModel",), a
     yield from _by_factors(rows, still, frames, data)
 

@@ -39,7 +39,13 @@ from adapters.pinocchio_common import (
     translation,
 )
 from plumbline.model.datatypes import Array, Indices, Model, State, StateQuantities, Unsupported
-from plumbline.model.kinematics import JointFrame, joint_coordinates, rotation_matrix, velocity_jacobian
+from plumbline.model.kinematics import (
+    JointFrame,
+    joint_coordinates,
+    rotate_vectors,
+    rotation_matrix,
+    velocity_jacobian,
+)
 from plumbline.model.loops import independent_rows
 from plumbline.model.welding import BodyParts
 
@@ -79,13 +85,13 @@ class _FreeFlyerSystem:
         """Return q, v and τ, and v of unit rates."""
         model, turn = self.source_model, rotation_matrix(state.p)
         self.u, self.udot, self.x, self.xdot = joint_coordinates(model, state)
-        local = np.matvec(turn.mT, state.v)
+        local = rotate_vectors(turn.swapaxes(-1, -2), state.v)
         q = np.hstack([state.r, np.roll(state.p, -1, axis=1)]).ravel()
         v = np.hstack([local, state.omega]).ravel()
-        force = np.matvec(turn.mT, model.force) - model.drag_force[:, None] * local
+        force = rotate_vectors(turn.swapaxes(-1, -2), model.force) - model.drag_force[:, None] * local
         moment = model.moment - model.drag_moment[:, None] * state.omega
         rates = velocity_jacobian(model, state)
-        rates.reshape(model.n, 6, -1)[:, :3] = turn.mT @ rates.reshape(model.n, 6, -1)[:, :3]
+        rates.reshape(model.n, 6, -1)[:, :3] = turn.swapaxes(-1, -2) @ rates.reshape(model.n, 6, -1)[:, :3]
         return q, v, np.hstack([force, moment]).ravel(), rates
 
     def quantities(self, state: State) -> StateQuantities:
@@ -96,12 +102,12 @@ class _FreeFlyerSystem:
             reaction, moment, _ = self._solve_constraint_rows(state, q, v, tau)
         else:
             pin.constraintDynamics(engine, data, q, v, tau, self.contacts, self.contact_data)
-            reaction = np.matvec(turn, [contact.contact_force.linear for contact in self.contact_data])
+            reaction = rotate_vectors(turn, np.array([one.contact_force.linear for one in self.contact_data]))
             moment = np.zeros_like(reaction)
         a = data.ddq.reshape(-1, 6)
         inertia = pin.crba(engine, data, q)
         return StateQuantities(
-            acceleration=np.matvec(turn, a[:, :3] + np.cross(state.omega, v.reshape(-1, 6)[:, :3])),
+            acceleration=rotate_vectors(turn, a[:, :3] + np.cross(state.omega, v.reshape(-1, 6)[:, :3])),
             angular_acceleration=a[:, 3:].copy(),
             joint_reaction=reaction,
             joint_moment=moment,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from adapters.pinocchio_common import WORLD_ALIGNED
+from adapters.pinocchio_common import WORLD_ALIGNED, joint_of
 from adapters.surface_record import SurfaceRecord
 from plumbline.model.datatypes import Array, Call, Float, Model
 from plumbline.model.probe_frames import PROBE_TURN, probe_points
@@ -26,7 +26,7 @@ def add_probe_frames(
     """
     own = enumerate(zip(joints, placements, probe_points(model), strict=True))
     kind = pin.FrameType.OP_FRAME
-    frames = [pin.Frame(f"probe {k}", j, at * pin.SE3(PROBE_TURN, x), kind) for k, (j, at, x) in own]
+    frames = [pin.Frame(f"probe {k}", j, 0, at * pin.SE3(PROBE_TURN, x), kind) for k, (j, at, x) in own]
     return [int(pin_model.addFrame(frame)) for frame in frames]
 
 
@@ -43,7 +43,7 @@ class Probed(SurfaceRecord):
         super().__init__(rates)
         self.m, self.frames = m, frames
         self.motion = self.q, self.v, self.a = motion
-        self.joints = [m.frames[f].parentJoint for f in frames]
+        self.joints = [joint_of(m.frames[f]) for f in frames]
         self.places = [m.frames[f].placement.copy() for f in frames]
 
     @property

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from adapters.pinocchio_common import armature
 from adapters.pinocchio_probes import Probed
 from plumbline.engines.missing_names import add_parts
 from plumbline.model.datatypes import Array, Call
@@ -232,7 +233,7 @@ def _add_mimic_torques(s: Probed, along_axis: bool) -> None:
 
 def _add_mimic_momenta(s: Probed, along_axis: bool) -> None:
     call, other = _with_mimics(s, along_axis)
-    momentum = s.square(pin.crba(other, other.createData(), s.q)) @ s.v + s.m.armature * s.v
+    momentum = s.square(pin.crba(other, other.createData(), s.q)) @ s.v + armature(s.m) * s.v
     s.add_forces("generalized_momentum", {call: momentum})
 
 

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 
+from adapters.pinocchio_common import armature, joint_of
 from adapters.pinocchio_probes import Probed
 from adapters.pinocchio_relations import mimics, relations
 from plumbline.engines.missing_names import add_parts
@@ -152,7 +153,7 @@ def _at_frame(s: Probed, name: str, f: int, data: pin.Data, reading: Reading) ->
     """Move what a function of a joint returns to the frame on it."""
     function, what, by, twist = reading
     vector, frame = np.array(getattr(twist, "vector", twist)), s.m.frames[f]
-    joint, place = frame.parentJoint, frame.placement
+    joint, place = joint_of(frame), frame.placement
     if what == "acceleration":  # a classical one is moved as the spatial one
         velocity = pin.getVelocity(s.m, data, joint, getattr(pin.ReferenceFrame, name))
         what, vector[:3] = SPATIAL, vector[:3] - cross(velocity.angular, velocity.linear)
@@ -352,7 +353,7 @@ def _add_torques(s: Probed) -> None:
     g = pin.computeGeneralizedGravity(m, data, q).copy()
     static: dict[Call, Array] = {("computeStaticTorque",): pin.computeStaticTorque(m, data, q, none).copy()}
     s.add_forces("generalized_gravity", {("computeGeneralizedGravity", "Data.g"): g} | static)
-    tau, rotors = pin.rnea(m, data, q, v, a).copy(), m.armature * a
+    tau, rotors = pin.rnea(m, data, q, v, a).copy(), armature(m) * a
     parameters = np.concatenate([inertia.toDynamicParameters() for inertia in m.inertias[1:]])
     _add_energies(s, parameters, g, none)
     rest = pin.rnea(m, data, q, zero, a).copy()  # without the terms of velocities
@@ -382,7 +383,7 @@ def _add_torques(s: Probed) -> None:
 def _add_batch(s: Probed) -> None:
     """Add what batched calls return, which the wheels of some versions lack."""
     tau = np.ravel(pin.rneaInParallel(1, pin.ModelPool(s.m, 1), *(x[:, None] for x in s.motion)))
-    s.add_forces("inverse_dynamics", {("rneaInParallel", "ModelPool"): tau - s.m.armature * s.a})
+    s.add_forces("inverse_dynamics", {("rneaInParallel", "ModelPool"): tau - armature(s.m) * s.a})
 
 
 def _add_products(s: Probed, terms: pin.Data) -> Array:
@@ -412,7 +413,7 @@ def _add_products(s: Probed, terms: pin.Data) -> Array:
 
 def _add_energies(s: Probed, parameters: Array, g: Array, none: pin.StdVec_Force) -> None:
     m, (q, v, a), data, zero = s.m, s.motion, s.m.createData(), np.zeros(s.m.nv)
-    kinetic = pin.computeKineticEnergyRegressor(m, data, q, v) @ parameters + m.armature @ v**2 / 2
+    kinetic = pin.computeKineticEnergyRegressor(m, data, q, v) @ parameters + armature(m) @ v**2 / 2
     gravity = pin.computePotentialEnergyRegressor(m, data, q) @ parameters
     both = pin.computeMechanicalEnergy(m, data, q, v)
     by_gravity = pin.computeGeneralizedGravityDerivatives(m, data, q).copy()

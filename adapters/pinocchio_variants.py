@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from adapters.pinocchio_common import composite
+from adapters.pinocchio_common import composite, joint_of
 from plumbline.engines.variants import Variant, has, variants_of
 from plumbline.model.datatypes import Array, Float, Model
 
@@ -172,7 +172,7 @@ def _appended_to_first(model: pin.Model) -> pin.Model:
     )
     for k, share in enumerate((0.25, 0.75)):
         part = away.actInv(pin.Inertia(share * own.mass, own.lever, share * own.inertia))
-        rest.addFrame(pin.Frame(f"part {k}", 0, away, pin.FrameType.BODY, part))
+        rest.addFrame(pin.Frame(f"part {k}", 0, 0, away, pin.FrameType.BODY, part))
     for j in range(2, model.njoints):
         number = rest.addJoint(
             model.parents[j] - 1, model.joints[j], model.jointPlacements[j], model.names[j]
@@ -180,7 +180,7 @@ def _appended_to_first(model: pin.Model) -> pin.Model:
         rest.addJointFrame(number)
         rest.appendBodyToJoint(number, model.inertias[j], pin.SE3.Identity())
     for frame in list(model.frames)[1:]:
-        rest.addFrame(pin.Frame(frame.name, frame.parentJoint - 1, frame.placement, frame.type))
+        rest.addFrame(pin.Frame(frame.name, joint_of(frame) - 1, 0, frame.placement, frame.type))
     whole = pin.appendModel(first, rest, place, pin.SE3.Identity())
     whole.gravity = model.gravity  # as above
     return whole

@@ -29,7 +29,7 @@ class SurfaceRecord:
 
     def add_axes(self, call: Call, turns: Any) -> None:
         """Add the axes of the probe frames, of attitudes as matrices."""
-        self.add("frame_axes", call, np.reshape(np.array(turns).mT, (-1, 3)))
+        self.add("frame_axes", call, np.reshape(np.array(turns).swapaxes(-1, -2), (-1, 3)))
 
     def add_forces(self, quantity: str, forces: Mapping[Call, Array]) -> None:
         """Add forces on ν in place of those on the engine's velocities."""

@@ -73,7 +73,7 @@ def rotate_body_frames(model: Model, state: State, q: Float[Array, "4"]) -> tupl
     moving, spring_end = model.body >= 0, model.spring_body >= 0
     rotated = replace(
         model,
-        inertia=(inertia + inertia.mT) / 2,
+        inertia=(inertia + inertia.swapaxes(-1, -2)) / 2,
         point=np.where(moving[..., None], model.point @ turn.T, model.point),
         turn=np.where(moving[..., None], normalised(quaternion_product(q, model.turn)), model.turn),
         moment=model.moment @ turn.T,

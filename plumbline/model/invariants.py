@@ -19,6 +19,7 @@ from plumbline.model.kinematics import (
     quaternion_conjugate,
     quaternion_exponential,
     quaternion_product,
+    rotate_vectors,
     rotation_matrix,
     rotation_vector,
     spring_vectors,
@@ -324,7 +325,8 @@ def _interpolation(samples: bytes, width: int) -> tuple[Array, NDArray[np.intp],
     for wanted in basis(at):
         matrix = np.zeros_like(wanted)
         for _ in range(2):  # refined once
-            matrix += np.linalg.solve(equations.mT, (wanted - matrix @ equations).mT).mT
+            missing = (wanted - matrix @ equations).swapaxes(-1, -2)
+            matrix += np.linalg.solve(equations.swapaxes(-1, -2), missing).swapaxes(-1, -2)
         found.append(matrix)
     return at.ravel(), window, found[0], found[1]
 
@@ -398,7 +400,7 @@ def element_energies(
         joint_vectors(model, run.r, run.p),
         joint_vector_rates(model, run, omega),
     )
-    spin = np.matvec(A, omega)
+    spin = rotate_vectors(A, omega)
     for k, (far, b) in enumerate(model.body):
         if not any(np.any(getattr(model, name)[k]) for name in JOINT_ELEMENTS):
             continue
@@ -408,7 +410,7 @@ def element_energies(
             above @ rotation_matrix(model.turn[k, 0]),
             A[:, b] @ rotation_matrix(model.turn[k, 1]),
         )
-        relative, turning = far_axes.mT @ near_axes, spin[:, b] - far_spin
+        relative, turning = far_axes.swapaxes(-1, -2) @ near_axes, spin[:, b] - far_spin
         if model.kinds[k].is_spherical:
             rest = ball_spring_rest(model, k)
             unloaded = quaternion_product(run.p[:, far], rest) if far >= 0 else np.tile(rest, (len(run.t), 1))
@@ -444,7 +446,7 @@ def _with_point_springs(
 ) -> ElementEnergies:
     """Add springs and dampers between points."""
     d, body = spring_vectors(model, run.r, run.p), model.spring_body
-    arm = np.matvec(rotation_matrix(run.p)[:, body], model.spring_point)
+    arm = rotate_vectors(rotation_matrix(run.p)[:, body], model.spring_point)
     ends = np.where((body < 0)[..., None], 0.0, run.v[:, body] + cross(spin[:, body], arm))
     length = np.linalg.norm(d, axis=-1)
     rate = _dot(d, ends[..., 1, :] - ends[..., 0, :]) / np.where(length > 0, length, 1.0)
@@ -494,12 +496,13 @@ def _across_slides(model: Model, p: Array, omega: Array, d: Array, ddot: Array) 
         axes, spin = rotation_matrix(model.turn[k, 0]) * np.ones((len(d), 1, 1)), np.zeros_like(d[:, k])
         if far >= 0:
             above = rotation_matrix(p[:, far])
-            axes, spin = above @ axes, np.matvec(above, omega[:, far])
+            axes, spin = above @ axes, rotate_vectors(above, omega[:, far])
         ddot[:, k] -= cross(spin, d[:, k])
         if kind.has_pitch:
             near, pitch = int(model.body[k, 1]), model.length[k]
             own = rotation_matrix(p[:, near]) @ rotation_matrix(model.turn[k, 1])
-            relative, turning = axes.mT @ own, np.matvec(rotation_matrix(p[:, near]), omega[:, near]) - spin
+            relative = axes.swapaxes(-1, -2) @ own
+            turning = rotate_vectors(rotation_matrix(p[:, near]), omega[:, near]) - spin
             z, angle = axes[..., 2], np.arctan2(relative[:, 1, 0], relative[:, 0, 0])
             angle = nearest_turn(angle, _dot(z, d[:, k]), pitch)
             d[:, k] -= pitch * angle[:, None] * z

@@ -300,7 +300,7 @@ def forward_kinematics(
             own = quaternion_product(p[..., far, :], relative) if far >= 0 else relative
             p[..., k, :] = normalised(own)
             A[..., k, :, :] = rotation_matrix(p[..., k, :])
-            omega[..., k, :] = rotate_vectors(A[..., k, :, :].mT, spin + turning)
+            omega[..., k, :] = rotate_vectors(A[..., k, :, :].swapaxes(-1, -2), spin + turning)
         near = cross(omega[..., k, :], own_point)
         r[..., k, :] = tip + d - rotate_vectors(A[..., k, :, :], own_point)
         v[..., k, :] = tip_v + d_rate - rotate_vectors(A[..., k, :, :], near)
@@ -529,7 +529,7 @@ def velocity_jacobian(model: Model, state: State) -> Float[Array, "... rows nu"]
                 for moved, vector in zip((tip, spin), pair, strict=True):
                     if vector is not None:
                         moved[..., own.start + i] += vector
-            out[..., k, 3:, :] = a[..., k, :, :].mT @ spin
+            out[..., k, 3:, :] = a[..., k, :, :].swapaxes(-1, -2) @ spin
         out[..., k, :3, :] = tip - near[..., k, :, :] @ out[..., k, 3:, :]
     return out.reshape(*a.shape[:-3], 6 * n, -1)
 
@@ -552,8 +552,8 @@ def mass_matrix(model: Model, state: State) -> Float[Array, "... nu nu"]:
     flat = velocity_jacobian(model, state)
     w = flat.reshape(*flat.shape[:-2], model.n, 6, -1)
     linear, angular = w[..., :3, :], w[..., 3:, :]
-    out = np.sum(model.mass[:, None, None] * (linear.mT @ linear), axis=-3)
-    out += np.sum(angular.mT @ model.inertia @ angular, axis=-3)
+    out = np.sum(model.mass[:, None, None] * (linear.swapaxes(-1, -2) @ linear), axis=-3)
+    out += np.sum(angular.swapaxes(-1, -2) @ model.inertia @ angular, axis=-3)
     for k, own in enumerate(own_rates(model) if np.any(model.armature) else ()):
         if not model.kinds[k].is_spherical:
             for i in range(len(model.kinds[k].motions)):
@@ -563,7 +563,7 @@ def mass_matrix(model: Model, state: State) -> Float[Array, "... nu nu"]:
             relative = a[..., k, :, :] @ angular[..., k, :, :]
             if far >= 0:
                 relative = relative - a[..., far, :, :] @ angular[..., far, :, :]
-            out += model.armature[k, 0] * (relative.mT @ relative)
+            out += model.armature[k, 0] * (relative.swapaxes(-1, -2) @ relative)
     return np.asarray(out)
 
 
@@ -641,7 +641,7 @@ def coordinates_of_joints(
             u[..., at, :], udot[..., at, :] = rod, (rate - rod * along) / model.length[..., k, None]
             continue
         motions = model.kinds[k].motions
-        frame = rotation_matrix(model.turn[..., k, 0, :]).mT @ above.mT
+        frame = rotation_matrix(model.turn[..., k, 0, :]).swapaxes(-1, -2) @ above.swapaxes(-1, -2)
         relative = frame @ a[..., near, :, :] @ rotation_matrix(model.turn[..., k, 1, :])
         shift = rotate_vectors(frame, own)
         for i, value in enumerate(_coordinates(motions, shift, relative)):

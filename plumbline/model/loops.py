@@ -405,7 +405,8 @@ def _joints_at_rest(cut: CutMechanism, state: State, rates: Array) -> NDArray[np
     a, tree, mobility = rotation_matrix(state.p), cut.model, len(rates)
     moving = (velocity_jacobian(tree, state) @ rates.T).reshape(tree.n, 6, mobility)
     moving[:, 3:] = a @ moving[:, 3:]
-    motion = np.concatenate([moving.mT, np.zeros((1, mobility, 6))])  # the world last, where body −1 is
+    # The world last, where body −1 is.
+    motion = np.concatenate([moving.swapaxes(-1, -2), np.zeros((1, mobility, 6))])
     place = np.concatenate([state.r, np.zeros((1, 3))])
     near = state.r + rotate_vectors(a, tree.proximal)
 

@@ -49,8 +49,8 @@ def random_inertias(rng: np.random.Generator, mass: Float[Array, "bodies"]) -> F
     axes = np.linalg.qr(rng.normal(size=(len(mass), 3, 3)))[0]
     size = rng.uniform(0.1, 0.6, (len(mass), 3)) ** 2
     principal = mass[:, None] / 5 * (size.sum(1, keepdims=True) - size)
-    inertia = axes @ (principal[..., None] * axes.mT)
-    return np.asarray((inertia + inertia.mT) / 2)
+    inertia = axes @ (principal[..., None] * axes.swapaxes(-1, -2))
+    return np.asarray((inertia + inertia.swapaxes(-1, -2)) / 2)
 
 
 def random_tree(

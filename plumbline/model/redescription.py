@@ -246,7 +246,8 @@ def joints_as_rods(model: Model) -> Model:
     size = float(np.mean(np.linalg.norm(model.point, axis=2))) or 1.0
     body, point, kind = [], [], list[Kind](model.kind)
     for k in chosen:
-        axes = rotation_matrix(model.turn[k]).mT * size  # [side, axis]: a vector in that side's body
+        # [side, axis]: a vector in that side's body
+        axes = rotation_matrix(model.turn[k]).swapaxes(-1, -2) * size
         for one, other in model.kinds[k].rows[3:]:
             ends = np.array([axes[0, "xyz".index(one)], axes[1, "XYZ".index(other)]])
             body.append(model.body[k])
