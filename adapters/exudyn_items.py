@@ -7,7 +7,7 @@ or what pushes it.  What is plane or one-dimensional is there once per coordinat
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import partial, wraps
 from typing import Any, NamedTuple
 
 import exudyn
@@ -30,7 +30,12 @@ from adapters.pose_functions import Pose, about, turned
 from adapters.surface_record import SurfaceRecord
 from plumbline.engines.missing_names import add_parts
 from plumbline.model.datatypes import Array, Call, Float, Model, State
-from plumbline.model.kinematics import quaternion_rate, rotate_vectors, rotation_matrix
+from plumbline.model.kinematics import (
+    quaternion_exponential,
+    quaternion_rate,
+    rotate_vectors,
+    rotation_matrix,
+)
 from plumbline.model.probe_frames import PROBE_TURN, anchor_point, probe_points
 
 AXES = np.eye(3)
@@ -154,13 +159,19 @@ def _call(*names: str) -> Call:
 def add_item_answers(record: SurfaceRecord, model: Model, state: State) -> None:
     """Add what all items say of the bodies of a state."""
     bodies, anchor = bodies_at(model, state), anchor_point(model)
-    add_parts(record.found, *(partial(_add_part_of_items, record, part, bodies, anchor) for part in PARTS))
+    add_parts(record.found, *(_with_own_system(record, part, bodies, anchor) for part in PARTS))
 
 
-def _add_part_of_items(
+def _with_own_system(
     record: SurfaceRecord, part: Callable[[_Items], None], bodies: Sequence[Body], anchor: Array
-) -> None:
-    part(_Items(record.found, bodies, anchor))
+) -> Callable[[], None]:
+    """Return what adds a part, under its name."""
+
+    @wraps(part)
+    def add() -> None:
+        part(_Items(record.found, bodies, anchor))
+
+    return add
 
 
 def _gathered(values: Sequence[Array] | Array, rows: Sequence[Sequence[int]]) -> Array:
@@ -211,6 +222,24 @@ def _add_created_points(s: _Items) -> None:
     call = ("MainSystem.CreateMassPoint",)
     s.add("body_position", call, [s.of_body(point, "Position") for point in points])
     s.add("body_velocity", call, np.array(s.momenta(points)) / s.masses)
+
+
+def _add_started_bodies(s: _Items) -> None:
+    """Bodies that start elsewhere than at their reference, by half of their places and by a turn."""
+    first, then = (rotation_matrix(quaternion_exponential(0.3 * axis)) for axis in AXES[:2])
+    call, bodies, attitude = ("MainSystem.CreateRigidBody",), [], first @ then
+    for one in s.bodies:
+        given = {"referencePosition": one.place / 2, "initialDisplacement": one.place / 2}
+        given |= {"referenceRotationMatrix": first, "initialRotationMatrix": then}
+        given |= {"initialVelocity": one.velocity, "initialAngularVelocity": one.spin}
+        inertia = utilities.RigidBodyInertia(one.mass, AXES)
+        bodies.append(s.mbs.CreateRigidBody(**given, inertia=inertia))
+    s.mbs.Assemble()
+    s.add("body_position", call, [s.of_body(body, "Position") for body in bodies])
+    turns = [s.of_body(body, "RotationMatrix").reshape(3, 3) @ attitude.T for body in bodies]
+    s.add_axes(call, [turn @ one.turn @ PROBE_TURN for turn, one in zip(turns, s.bodies, strict=True)])
+    spins = [s.of_body(body, "AngularVelocity") for body in bodies]
+    s.add("frame_angular_velocity_from_start", call, spins)
 
 
 def _to_x(axis: int) -> Array:
@@ -619,7 +648,7 @@ def _add_robots(s: _Items) -> None:
 
 PARTS: Sequence[Callable[[_Items], None]] = (
     _add_points("NodePoint", "ObjectMassPoint", SPACE), _add_points("Point", "MassPoint", SPACE),
-    _add_created_points,
+    _add_created_points, _add_started_bodies,
     _add_points("NodePoint2D", "ObjectMassPoint2D", PLANES), _add_points("Point2D", "MassPoint2D", PLANES),
     _add_points("Node1D", "ObjectMass1D", LINES), _add_points("Node1D", "Mass1D", LINES),
     _add_rotors("ObjectRotationalMass1D"), _add_rotors("Rotor1D"),
