@@ -30,7 +30,8 @@ WHO = RowContext("s", "f", "e", "The engine", "0")
 KINDS = ("rod", "ball", "hinge", "slide", "cylindrical", "free", "weld")
 RATES = ("_by_jacobian_rate", "_by_map_rate", "_by_coriolis_matrix", "_by_derivative", "_second_rate")
 RECORDED = {name for name in SURFACE_QUANTITIES if name.endswith(RATES)}  # known_issues.yaml, pinocchio
-WRONG = {"exudyn": {"body_velocity_by_tangent_operator"}}  # the same, of every mechanism
+# the same, of every mechanism that is asked for it
+WRONG = {"exudyn": {"body_velocity_by_tangent_operator", "body_position_from_start"}}
 
 
 def mechanism(kinds, seed=5, bodies=4):
@@ -71,7 +72,7 @@ def test_every_call_agrees_and_a_relative_change_of_1e_6_is_seen(engine, given, 
     answers = answers_of(engine, model, states)
     found = verdicts(truth, answers)
     wrong = {name for name, verdict in found.items() if verdict != Verdict.AGREES}
-    assert len(found) >= 10 and wrong == WRONG.get(engine, set()), found
+    assert len(found) >= 10 and wrong == WRONG.get(engine, set()) & set(found), found
     calls = {name for by_call in answers.values() for call in by_call for name in call}
     evaluation = Evaluation([], None, None, 0.0, surface=answers)
     assert set(exercised_names(truth, evaluation)) == calls
@@ -124,7 +125,7 @@ def test_bodies_of_a_loop_are_compared_and_a_relative_change_of_1e_6_is_seen(eng
     truth, answers = state_truth(s.model, states), answers_of(engine, s.model, states)
     found = verdicts(truth, answers)
     wrong = {name for name, verdict in found.items() if verdict != Verdict.AGREES}
-    assert len(found) >= 10 and wrong == WRONG.get(engine, set()), found
+    assert len(found) >= 10 and wrong == WRONG.get(engine, set()) & set(found), found
     more = {name: {call: x * (1 + 1e-6) for call, x in calls.items()} for name, calls in answers.items()}
     assert set(verdicts(truth, more).values()) == {Verdict.DISAGREES}
 
