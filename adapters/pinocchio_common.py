@@ -19,7 +19,7 @@ class PinocchioAdapter(MetamorphicHooks):
     """Declarations common to all columns of Pinocchio."""
 
     package = "pin"
-    supported_versions = ">=2.6.10,<5"
+    supported_versions = ">=2.6.21,<5"
     # What the wheels of version 3 were linked with.
     extra_requirements = (("<4", "cmeel-urdfdom<5"), ("<4", "cmeel-tinyxml2<11"))
     welding_unsupported_reason = ""

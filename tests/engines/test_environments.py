@@ -201,9 +201,12 @@ MENDED = [
     ("sprung-universal", "mujoco@3.4.0", "inverse_dynamics", "mjtBias.mjBIAS_AFFINE, mjtTrn.mjTRN_TENDON"),
     ("sprung-universal", "mujoco@3.17.0", "inverse_dynamics", "mjtBias.mjBIAS_AFFINE, mjtObj.mjOBJ_TENDON"),
     ("sprung-universal", "mujoco@3.17.0", "frame_acceleration", "mjtSensor.mjSENS_ACCELEROMETER"),
+    ("tumbling-ball", "pinocchio@2.7.0", "frame_acceleration_by_jacobian_rate", "getFrameJacobian"),
+    ("tumbling-ball", "pinocchio@2.7.0", "mass_matrix_by_spelling", "appendModel, FrameType.BODY"),
     ("helical-screw", "pinocchio@3.7.0", "acceleration_by_option", "buildReducedModel"),
     ("helical-screw", "pinocchio@3.7.0", "all", "add mimic momenta: crashed"),
     ("helical-screw", "pinocchio@3.8.0", "mass_matrix_by_spelling", "appendModel, FrameType.BODY"),
+    ("tumbling-ball", "exudyn@1.8.0", "all", "add started bodies"),
     ("sprung-hinge", "exudyn@1.10.0", "all_by_spelling", "MainSystem.CreateTorsionalSpringDamper"),
     ("tree-of-seven", "exudyn-tree@1.11.0", "acceleration", ""),
 ]
