@@ -724,7 +724,7 @@ class Document(SchemaModel):
     def _sample(cls, value: float, info: ValidationInfo) -> float:
         duration = info.data.get("duration", value)
         count = duration / value
-        message = f"{duration:g} s are {count:.9g} samples of {value:g} s"
+        message = f"{duration:g} s is {count:.9g} samples of {value:g} s"
         if count > MAX_SAMPLES:
             raise invalid_value_error(message, f"at most {MAX_SAMPLES} samples", "duration")
         if abs(count - round(count)) > 1e-9 * count or round(count) < 1:
