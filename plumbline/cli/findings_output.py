@@ -142,8 +142,9 @@ def explain(
     if smallest.reason != finding.sentence:
         yield ""
         yield from wrap(f"In {smallest.scenario}: {smallest.reason}", width, "")
-    diagnosis = smallest.diagnosis or ""
-    if diagnosis not in ("", finding.sentence, issue and issue.diagnosis):
+    recorded = (issue and issue.diagnosis) or ""
+    diagnosis = (smallest.diagnosis or "").removeprefix(recorded).strip()
+    if diagnosis and diagnosis != finding.sentence:
         yield from wrap(diagnosis, width, "")
     yield ""
     level = "state" if smallest.level == "surface" else smallest.level

@@ -228,7 +228,7 @@ class KnownIssue:
             and not (left := float(row.extra.get(UNEXPLAINED, math.inf))) <= 1
         ):
             return (
-                f"the entry {self.name} records a missing term; it leaves {left:.3g} tolerances unexplained"
+                f"the entry {self.name} records a missing term; it leaves {left:.3g} × tolerance unexplained"
             )
         shown = self.scatter_of(row, scatter)
         least = MIN_OWN_SCATTER if "scatter" in row.extra else MIN_SCATTER
@@ -707,11 +707,10 @@ class KnownIssues:
             diagnosis = own or match.diagnosis
             shown = match.scatter_of(row, scatter)
             if match.mechanism == "rounding" and not own and shown is not None:
-                diagnosis = f"{diagnosis} Checked: they differ by {shown:.2g} tolerances."
+                diagnosis = f"{diagnosis} Checked: they differ by {shown:.2g} × tolerance."
             if match.mechanism == "missing term" and not own:
-                diagnosis = (
-                    f"{diagnosis} Checked: without it {row.extra[UNEXPLAINED]:.2g} tolerances are left."
-                )
+                left = row.extra[UNEXPLAINED]
+                diagnosis = f"{diagnosis} Checked: what the term does not explain is {left:.2g} × tolerance."
             return replace(row, known_issue=match.name, is_declared=False, diagnosis=diagnosis)
         return replace(row, reason=f"{row.reason}; {objections[0]}") if objections else row
 
@@ -723,7 +722,7 @@ class KnownIssues:
 
         """
         return [
-            f"known entry {name} covers {share * covered:.2g} tolerances of at most {covered:.2g}: "
+            f"known entry {name} covers {share * covered:.2g} × tolerance of at most {covered:.2g}: "
             "a max_ratio nearer to what occurs hides less"
             for name, (share, covered) in self.worst_ratios.items()
             if share * WIDE_FACTOR < 1

@@ -140,6 +140,9 @@ def test_a_record_is_printed_once():
     shown = " ".join(explain(finding, issue, {}, 1000, ""))
     assert shown.count("read twice") == shown.count(MECHANISMS["rounding"]) == 1
     assert shown.count("2 × tolerance") == 1
+    checked = replace(finding.rows[0], diagnosis=f"{issue.diagnosis} Checked: so it is.")
+    again = list(explain(replace(finding, rows=(checked,)), issue, {}, 1000, ""))
+    assert " ".join(again).count("read twice") == 1 and "Checked: so it is." in again
 
 
 @pytest.mark.parametrize("width", [30, 40, 80, 200])

@@ -169,8 +169,8 @@ def test_a_missing_term_covers_what_its_effect_explains(tmp_path, left):
     row = replace(ratio_row(1e12), extra=extra)
     judged = judged_by([row], entries, whole=True).rows[0]
     assert (judged.known_issue == "a") is (left == 0.5)
-    assert ("tolerances unexplained" in judged.reason) is (left != 0.5)
-    assert ("0.5 tolerances are left" in (judged.diagnosis or "")) is (left == 0.5)
+    assert ("× tolerance unexplained" in judged.reason) is (left != 0.5)
+    assert ("does not explain is 0.5 × tolerance" in (judged.diagnosis or "")) is (left == 0.5)
 
 
 @pytest.mark.parametrize(
@@ -261,7 +261,7 @@ def test_a_checked_mechanism_is_in_the_rows_diagnosis():
     recorded = entry(level="*", quantity="*", max_ratio={10: 100.0}, mechanism="rounding")
     turned = replace(CONTEXT.make_row("relations", "-", "rotated world", "agrees", "why"), ratio=20.0)
     found = judged_by([replace(row(), ratio=50.0), turned], [recorded], whole=True).rows
-    assert "Checked: they differ by 20 tolerances." in found[0].diagnosis
+    assert "Checked: they differ by 20 × tolerance." in found[0].diagnosis
 
 
 def test_an_unresolved_row_has_the_size_of_its_entry():
@@ -430,7 +430,7 @@ def test_an_entry_that_covers_far_more_than_the_run_saw_is_named():
         (found,) = excuses.mark_known([ratio_row(ratio, engine="mujoco")], bodies=1)
         assert found.known_issue == "a"
     (sentence,) = excuses.wide_issues()
-    assert sentence.startswith("known entry a covers 5e+12 tolerances of at most 1e+19: ")
+    assert sentence.startswith("known entry a covers 5e+12 × tolerance of at most 1e+19: ")
     near = known_issues.KnownIssues([entry(max_ratio={1: 50.0}, mechanism="method")], False)
     near.mark_known([ratio_row(5.0, engine="mujoco")], bodies=1)
     assert near.wide_issues() == []
