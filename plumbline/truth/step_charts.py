@@ -385,17 +385,19 @@ class StepCharts:
         return tree.velocity_rates(found), found, tree
 
     def _damping(self, q: list[Array], v: Array, M: Array, forces: Forces) -> Array:
-        """−∂(M v̇)/∂v (B, nv, nv); M v̇ is quadratic in v: a central difference of any size is exact."""
-        units, found = np.eye(self.nv, dtype=LongDouble)[:, None], np.zeros((), LongDouble)
-        parts = ("drag_force", "drag_moment", "damping", "spring_damping")
-        undamped = replace(self.model, **{name: 0 * getattr(self.model, name) for name in parts})
-        for model, sign in ((self.model, 1), (undamped, -1))[: 1 + (forces == "applied")]:
-            before, after = (
-                (tree := _MovingTree(self, q, v + side * units, model)).velocity_rates(tree.solve())
-                for side in (-1, 1)
-            )
-            found = found + sign * (before - after) / 2
-        return np.asarray(M @ np.moveaxis(found, 0, -1))
+        """−∂(M v̇)/∂v (B, nv, nv) of forces: M v̇ is quadratic in v, and its part by applied forces linear."""
+        units = np.eye(self.nv, dtype=LongDouble)[:, None]
+        if forces == "applied":
+            parts = ("drag_force", "drag_moment", "damping", "spring_damping")
+            undamped = replace(self.model, **{name: 0 * getattr(self.model, name) for name in parts})
+            cases, size = ((units, undamped), (units, self.model)), 1
+        else:  # a central difference of any size is exact
+            cases, size = ((v - units, self.model), (v + units, self.model)), 2
+        before, after = (
+            (tree := _MovingTree(self, q, rates, model)).velocity_rates(tree.solve())
+            for rates, model in cases
+        )
+        return np.asarray(M @ np.moveaxis((before - after) / size, 0, -1))
 
     def _mass_matrix(self, q: list[Array]) -> Array:
         """M (B, nv, nv), by the velocities that each rate alone gives the bodies; rotors included."""
