@@ -396,6 +396,8 @@ class _MujocoChain:
         spec, self.change = mujoco.MjSpec(), change
         compiler_of(spec).autolimits = False
         self.model, self.use_dense_solve = model, dense
+        self.last_state: State | None = None  # and its coordinates, velocities and T
+        self.last_coordinates: tuple[Array, ...] = ()
         self.link_ids: list[int] = []
         self.ball_ids: list[int] = []
         self.mass: list[float] = [0.0]
@@ -541,6 +543,18 @@ class _MujocoChain:
     def set_state(self, state: State) -> Array:
         """Write a state into the engine's data; returns T (nv, nu)."""
         m, d = self.m, self.d
+        self.change.reset(m, d)
+        if state is not self.last_state:  # regularisations follow each other at one state
+            T = self._set_coordinates(state)
+            self.last_state = state
+            self.last_coordinates = d.qpos.copy(), T @ kinematics.minimal_rates(self.model, state), T
+        d.qpos, d.qvel, T = self.last_coordinates
+        d.xfrc_applied, d.qfrc_applied = self.applied_wrenches, self.effort
+        return np.asarray(T)
+
+    def _set_coordinates(self, state: State) -> Array:
+        """Write the joints' coordinates at a state; returns T."""
+        m, d = self.m, self.d
         q, E = self.body_frames(state)
         own, up = self.ball_ids, m.body_parentid[self.ball_ids]
         turn = kinematics.rotation_matrix(
@@ -549,7 +563,6 @@ class _MujocoChain:
         first = m.body_jntadr[own]
         T = np.zeros((m.nv, E.shape[-1]))
         T[m.jnt_dofadr[first][:, None] + np.arange(3)] = E[own] - turn @ E[up]
-        self.change.reset(m, d)
         relative = kinematics.quaternion_product(kinematics.quaternion_conjugate(q[up]), q[own])
         if self.change.ball_joints is HINGES:
             self._turn_hinges(relative, T)
@@ -563,9 +576,7 @@ class _MujocoChain:
             T[dof : dof + count, rates] = np.eye(count)
             x = np.concatenate([state.r[k], state.p[k]]) if kind.holds_nothing else state.x[k, :count]
             d.qpos[at : at + len(x)] = x
-        d.qvel = T @ kinematics.minimal_rates(self.model, state)
-        d.xfrc_applied, d.qfrc_applied = self.applied_wrenches, self.effort
-        return np.asarray(T)
+        return T
 
     def _turn_hinges(self, relative: Array, T: Array) -> None:
         """Set bodies on three hinges in place of a ball: the turn is the body's, the angles are constant."""
