@@ -7,7 +7,7 @@ or what pushes it.  What is plane or one-dimensional is there once per coordinat
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial, wraps
+from functools import partial
 from typing import Any, NamedTuple
 
 import exudyn
@@ -159,19 +159,7 @@ def _call(*names: str) -> Call:
 def add_item_answers(record: SurfaceRecord, model: Model, state: State) -> None:
     """Add what all items say of the bodies of a state."""
     bodies, anchor = bodies_at(model, state), anchor_point(model)
-    add_parts(record.found, *(_with_own_system(record, part, bodies, anchor) for part in PARTS))
-
-
-def _with_own_system(
-    record: SurfaceRecord, part: Callable[[_Items], None], bodies: Sequence[Body], anchor: Array
-) -> Callable[[], None]:
-    """Return what adds a part, under its name."""
-
-    @wraps(part)
-    def add() -> None:
-        part(_Items(record.found, bodies, anchor))
-
-    return add
+    add_parts(record.found, *(partial(part, _Items(record.found, bodies, anchor)) for part in PARTS))
 
 
 def _gathered(values: Sequence[Array] | Array, rows: Sequence[Sequence[int]]) -> Array:
@@ -227,22 +215,21 @@ def _add_created_points(s: _Items) -> None:
 def _add_started_bodies(s: _Items) -> None:
     """Bodies that start elsewhere than at their reference, by half of their places and by a turn.
 
-    Their angular velocities are how far they are from the anchor, rad/s for m: some bodies do not turn.
+    Their angular velocities are their places, rad/s for m: some bodies do not turn.
     """
     first, then = (rotation_matrix(quaternion_exponential(0.3 * axis)) for axis in AXES[:2])
     call, bodies, attitude = ("MainSystem.CreateRigidBody",), [], first @ then
     for one in s.bodies:
         given = {"referencePosition": one.place / 2, "initialDisplacement": one.place / 2}
         given |= {"referenceRotationMatrix": first, "initialRotationMatrix": then}
-        given |= {"initialVelocity": one.velocity, "initialAngularVelocity": one.place - s.anchor}
+        given |= {"initialVelocity": one.velocity, "initialAngularVelocity": one.place}
         inertia = utilities.RigidBodyInertia(one.mass, AXES)
         bodies.append(s.mbs.CreateRigidBody(**given, inertia=inertia))
     s.mbs.Assemble()
     s.add("body_position", call, [s.of_body(body, "Position") for body in bodies])
     turns = [s.of_body(body, "RotationMatrix").reshape(3, 3) @ attitude.T for body in bodies]
     s.add_axes(call, [turn @ one.turn @ PROBE_TURN for turn, one in zip(turns, s.bodies, strict=True)])
-    spins = np.array([s.of_body(body, "AngularVelocity") for body in bodies])
-    s.add("body_position_from_start", call, s.anchor + spins)
+    s.add("body_position_from_start", call, [s.of_body(body, "AngularVelocity") for body in bodies])
 
 
 def _to_x(axis: int) -> Array:
