@@ -359,7 +359,7 @@ def _coordinate_readings(model: Model, k: int) -> Iterator[Reading]:
                 if name == "x" or len(motions) > 1 or words != "reversed":  # else a factor
                     yield Reading(f"{term} {i + 1}", words, [coordinate(name, i, change)])
         if model.stiffness[k, i]:
-            pull = partial(lambda i, j: j.effort[i] + j.stiffness[i] * j.x[..., i], i)
+            pull = partial(lambda i, j: j.effort[..., i] + j.stiffness[..., i] * j.x[..., i], i)
             yield Reading(f"spring {i + 1}", "without its coordinate", [("effort", k, (i,), pull)])
 
 
