@@ -12,7 +12,7 @@ from plumbline.cli.verdict_matrix import VERDICT_COLOURS
 from plumbline.judging.findings import Finding
 from plumbline.judging.known_issue_text import entry_lines, entry_of
 from plumbline.judging.known_issues import KnownIssue
-from plumbline.judging.rows import SHOWN_STYLES, Row, Verdict, shown_verdict
+from plumbline.judging.rows import CHECKED, SHOWN_STYLES, Row, Verdict, shown_verdict
 from plumbline.scenario.line_and_column_errors import shorten
 
 WIDTH = 80  # columns, in a pipe and of lines that cut what does not fit
@@ -142,10 +142,9 @@ def explain(
     if smallest.reason != finding.sentence:
         yield ""
         yield from wrap(f"In {smallest.scenario}: {smallest.reason}", width, "")
-    recorded = (issue and issue.diagnosis) or ""
-    diagnosis = (smallest.diagnosis or "").removeprefix(recorded).strip()
+    diagnosis = smallest.extra.get(CHECKED, smallest.diagnosis)  # the record is above
     if diagnosis and diagnosis != finding.sentence:
-        yield from wrap(diagnosis, width, "")
+        yield from wrap(str(diagnosis), width, "")
     yield ""
     level = "state" if smallest.level == "surface" else smallest.level
     option = f" --level {level}" if level in ("state", "step", "trajectory") else ""

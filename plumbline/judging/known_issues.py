@@ -42,7 +42,7 @@ from plumbline.diagnosis.cause import CauseKind
 from plumbline.engines.declared_names import declared_integrators, declared_texts
 from plumbline.engines.registry import ENGINES, IMPORTERS, USER_ENGINES
 from plumbline.importers.neutral_model import MODEL_UNITS
-from plumbline.judging.rows import FAILED_CALLS, Level, Row, Verdict
+from plumbline.judging.rows import CHECKED, FAILED_CALLS, Level, Row, Verdict
 from plumbline.judging.state_level import SINGULAR_POSE, STATE_UNITS, VARIANT_QUANTITIES
 from plumbline.measurements.relation_result import OTHER_FORMULATIONS, REPEATABILITY, UNEXPLAINED
 from plumbline.measurements.run_relations import REVERSED_IN_TIME
@@ -703,15 +703,17 @@ class KnownIssues:
                 known = self.worst_ratios.get(match.id, (0.0, covered))
                 self.worst_ratios[match.id] = max(known, (row.ratio / covered, covered))
             is_measured = bool(row.causes) and all(cause["kind"] == "rounding" for cause in row.causes)
-            own = None if is_measured else row.diagnosis
-            diagnosis = own or match.diagnosis
-            shown = match.scatter_of(row, scatter)
-            if match.mechanism == "rounding" and not own and shown is not None:
-                diagnosis = f"{diagnosis} Checked: they differ by {shown:.2g} × tolerance."
-            if match.mechanism == "missing term" and not own:
+            row = replace(row, known_issue=match.name, is_declared=False)
+            if (row.diagnosis and not is_measured) or match.diagnosis is None:
+                return replace(row, diagnosis=None if is_measured else row.diagnosis)
+            checked, shown = "", match.scatter_of(row, scatter)
+            if match.mechanism == "rounding" and shown is not None:
+                checked = f"Checked: they differ by {shown:.2g} × tolerance."
+            if match.mechanism == "missing term":
                 left = row.extra[UNEXPLAINED]
-                diagnosis = f"{diagnosis} Checked: what the term does not explain is {left:.2g} × tolerance."
-            return replace(row, known_issue=match.name, is_declared=False, diagnosis=diagnosis)
+                checked = f"Checked: what the term does not explain is {left:.2g} × tolerance."
+            diagnosis = f"{match.diagnosis} {checked}".rstrip()
+            return replace(row, diagnosis=diagnosis, extra=row.extra | {CHECKED: checked})
         return replace(row, reason=f"{row.reason}; {objections[0]}") if objections else row
 
     def wide_issues(self) -> list[str]:
