@@ -64,7 +64,7 @@ def finding_lines(finding: Finding, width: int) -> list[str]:
 def recorded_line(finding: Finding, width: int) -> str:
     """Describe a recorded finding in one line: in fewer words where the whole is too long."""
     shown, ratio = shown_verdict(finding.verdict, finding.known_issue), finding.largest_ratio
-    size, short = ("", "") if ratio is None else (f", up to {ratio:.2g} × tolerance", f", {ratio:.2g} × tol.")
+    size, short = ("", "") if ratio is None else (f", up to {ratio:.2g} × tolerance", f", {ratio:.0e} × tol.")
     rows = _count_rows(finding)
     texts = [f"{finding.name}: {x}" for x in (coverage(finding) + size, rows + size, rows + short)]
     text = next((text for text in texts if len(text) <= width - 2), texts[-1])
