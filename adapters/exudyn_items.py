@@ -213,23 +213,21 @@ def _add_created_points(s: _Items) -> None:
 
 
 def _add_started_bodies(s: _Items) -> None:
-    """Bodies that start elsewhere than at their reference, by half of their places and by a turn.
-
-    Their angular velocities are their places, rad/s for m: some bodies do not turn.
-    """
+    """Bodies that start elsewhere than at their reference, by half of their places and by a turn."""
     first, then = (rotation_matrix(quaternion_exponential(0.3 * axis)) for axis in AXES[:2])
     call, bodies, attitude = ("MainSystem.CreateRigidBody",), [], first @ then
     for one in s.bodies:
         given = {"referencePosition": one.place / 2, "initialDisplacement": one.place / 2}
         given |= {"referenceRotationMatrix": first, "initialRotationMatrix": then}
-        given |= {"initialVelocity": one.velocity, "initialAngularVelocity": one.place}
+        given |= {"initialVelocity": one.velocity, "initialAngularVelocity": one.spin}
         inertia = utilities.RigidBodyInertia(one.mass, AXES)
         bodies.append(s.mbs.CreateRigidBody(**given, inertia=inertia))
     s.mbs.Assemble()
     s.add("body_position", call, [s.of_body(body, "Position") for body in bodies])
     turns = [s.of_body(body, "RotationMatrix").reshape(3, 3) @ attitude.T for body in bodies]
     s.add_axes(call, [turn @ one.turn @ PROBE_TURN for turn, one in zip(turns, s.bodies, strict=True)])
-    s.add("body_position_from_start", call, [s.of_body(body, "AngularVelocity") for body in bodies])
+    spins = [s.of_body(body, "AngularVelocity") for body in bodies]
+    s.add("frame_angular_velocity_from_start", call, spins)
 
 
 def _to_x(axis: int) -> Array:

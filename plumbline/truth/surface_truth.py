@@ -407,7 +407,7 @@ _BY_ALGORITHM = {
         "centroidal_angular_momentum_rate", "inverse_dynamics",
     ),
     "by_tangent_operator": ("body_velocity", "frame_angular_velocity"),
-    "from_start": ("body_position",),
+    "from_start": ("frame_angular_velocity",),
     "by_map_rate": ("momentum_rate", "centroidal_angular_momentum_rate"),
     "by_coriolis_matrix": ("inverse_dynamics",),
     "by_constraint_solver": ("frame_acceleration", "frame_angular_acceleration"),
