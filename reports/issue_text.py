@@ -51,8 +51,7 @@ def issue_text(results: Results, finding: Record) -> str:
     ]
     if scripted is not None:
         parts += [
-            f"The script needs the engine and NumPy only. It was shrunk from {scripted['scenario']}; it ends "
-            "with 1 while the difference shows.",
+            "The script stands alone; its head says what it shows.",
             f"```python\n{results.scripts[scripted['key']].rstrip()}\n```",
         ]
     else:

@@ -186,7 +186,7 @@ def run_nightly(
         write_table(coverage, folder / COVERAGE_FILE)
     write_random_scenario_files(result, random_scenarios, folder / "scenarios")
     with result.cpu_times.measure("report"):
-        write_scripts(folder)
+        result.cpu_times.seconds["report"] += write_scripts(folder).cpu_time
         reports.write(folder, history)
     history.mkdir(exist_ok=True)
     os.replace(folder, place)

@@ -122,7 +122,8 @@ def run(
         save(result, folder, command_line())
         with result.cpu_times.measure("report"):
             document = read_results(folder)
-            write_scripts(folder, results=cache, document=document)
+            scripts = write_scripts(folder, results=cache, document=document)
+            result.cpu_times.seconds["report"] += scripts.cpu_time
             report = reports.write(folder, document=document)
         cache.trim()
     if as_json:

@@ -113,6 +113,7 @@ class KnownIssue:
     cause: Mapping[str, str] = field(default_factory=dict)  # fields of a cause that rows must have
     needs: tuple[str, ...] | None = None  # of what no cause explains; None: not recorded
     entry: str = ""  # id of the entry; empty: its own
+    script: str = ""  # file of docs/surface that shows it; empty: none
 
     @property
     def name(self) -> str:
@@ -423,8 +424,7 @@ class _Entry(_Selector):
     def every_issue(self) -> Iterator[KnownIssue]:
         """Make the issues of all rows."""
         common = {
-            name: getattr(self, name)
-            for name in _Entry.model_fields.keys() - {"rows", "cause", "needs", "script"}
+            name: getattr(self, name) for name in _Entry.model_fields.keys() - {"rows", "cause", "needs"}
         }
         cause = {} if self.cause is None else self.cause.model_dump()
         common["cause"] = {name: value for name, value in cause.items() if value}

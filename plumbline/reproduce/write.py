@@ -15,6 +15,7 @@ import numpy as np
 from plumbline.engines import environments
 from plumbline.judging.known_issues import project_known_issues
 from plumbline.judging.rows import WRONG_CALL, Verdict
+from plumbline.layout import ROOT
 from plumbline.measurements.order_and_limit import STEP_EXPONENTS
 from plumbline.model.datatypes import BadInput, Model, State, Unsupported
 from plumbline.model.invariants import LONG_RUN_QUANTITIES
@@ -49,6 +50,7 @@ class WrittenScripts:
 
     files: dict[str, Path] = field(default_factory=dict)  # script of each row key that has one
     reasons: dict[str, str] = field(default_factory=dict)  # why there is none, for the others
+    cpu_time: float = 0.0  # s of the workers
 
 
 def list_disagreements(folder: Path) -> dict[str, str]:
@@ -77,8 +79,8 @@ def write_scripts(
     All rows of a cell and level (of one relation) share a script. Engines run in worker processes.
 
     Args:
-        keys: the wanted rows; by default all that disagree: less time is spent on each, and scripts of an
-            earlier run are removed.
+        keys: the wanted rows; by default all that disagree: less time is spent on each, those of a known
+            issue that has a script get that, and scripts of an earlier run are removed.
         results: scripts of earlier runs, used where nothing that they depend on has changed.
         document: content of the folder's results.json, where it has been read already.
 
@@ -103,9 +105,13 @@ def write_scripts(
             cells.setdefault(_cell(row), []).append(row)
         wanted = {cell: [r for r in rows if keys is None or r["key"] in keys] for cell, rows in cells.items()}
         wanted = {cell: rows for cell, rows in wanted.items() if rows}
+        recorded = _recorded_scripts() if keys is None else {}
         changes = read_version_changes(folder)
         jobs = int(document.get("run", {}).get("machine", {}).get("jobs", 1))
         for cell, rows in wanted.items():
+            if all(row["known_issue"] in recorded for row in rows):
+                written.files |= {row["key"]: recorded[row["known_issue"]] for row in rows}
+                continue
             try:
                 if keys is None:
                     _check_worthwhile(cell, rows, cells)
@@ -121,10 +127,15 @@ def write_scripts(
     if keys is None and scripts.is_dir():  # of an earlier run in the same folder
         for old in (*scripts.glob("*.py"), *scripts.glob("index.json")):
             old.unlink()
-    if not tasks:
+    if not tasks and not written.files:
         return written
     scripts.mkdir(exist_ok=True)
+    for key, shown_by in written.files.items():
+        written.files[key] = scripts / shown_by.name
+        write_atomically(written.files[key], shown_by.read_bytes())
     for outcome in _outcomes(tasks, results or ResultCache(), jobs):
+        if not outcome.is_cached:
+            written.cpu_time += outcome.cpu_time + outcome.overhead_cpu_time
         text, reason = outcome.value or ("", outcome.failure)
         if text:
             path = scripts / _file_name("/".join(outcome.key))
@@ -240,6 +251,13 @@ def _checked(folder: Path) -> Iterator[None]:
         raise NotReproducible(f"{folder / 'results.json'}: damaged results ({found})") from None
 
 
+def _recorded_scripts() -> dict[str, Path]:
+    """The scripts of known issues by their names; an installed package comes without them."""
+    folder = ROOT / "docs" / "surface"
+    every = {issue.name: folder / issue.script for issue in project_known_issues() if issue.script}
+    return {name: path for name, path in every.items() if path.is_file()}
+
+
 def _version_sentence(rows: list[StoredRow], changes: dict[str, dict[str, Any]]) -> str:
     """Since which version the rows are so, where `bisect` or a known issue says it; else empty."""
     for row in rows:
@@ -257,8 +275,8 @@ def _check_worthwhile(
     scenario, engine, level, integrator, *_ = cell
     if (level, integrator) == ("relations", "-") and (scenario, engine, "state", "-") in cells:
         raise NotReproducible(f"the state-level script of this engine and scenario shows it; {HINT}")
-    if level == "surface":  # one script of each mistake
-        same = (own[0] for own in cells.values() if _surface_mistake(own[0]) == _surface_mistake(rows[0]))
+    if level == "surface" or rows[0]["known_issue"]:  # one script of each mistake
+        same = (own[0] for own in cells.values() if _mistake(own[0]) == _mistake(rows[0]))
         if (first := next(same)["key"]) != rows[0]["key"]:
             raise NotReproducible(f"the script of {first} shows the same mistake; {HINT}")
     seconds = rows[0].get("cpu_time", 0.0) if level in ("trajectory", "invariants") else 0.0
@@ -266,8 +284,8 @@ def _check_worthwhile(
         raise NotReproducible(f"one candidate takes {seconds:.1f} s, too long at the end of a run; {HINT}")
 
 
-def _surface_mistake(row: StoredRow) -> tuple[str, ...]:
-    """What a row of the surface shows: the finding that it is recorded as, else the call that is wrong."""
+def _mistake(row: StoredRow) -> tuple[str, ...]:
+    """What a row shows: the finding that it is recorded as, else of the surface the call that is wrong."""
     return row["engine"], row["level"], str(row["known_issue"] or row["extra"].get(WRONG_CALL, ""))
 
 

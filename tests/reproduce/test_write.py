@@ -8,7 +8,9 @@ import pytest
 
 from plumbline.engines.registry import load_adapter
 from plumbline.execution.result_cache import DiskResultCache
+from plumbline.judging.known_issues import project_known_issues
 from plumbline.judging.rows import RowContext
+from plumbline.layout import ROOT
 from plumbline.processes.worker_pool import Outcome
 from plumbline.reproduce import write
 from plumbline.reproduce.write import NotReproducible, write_scripts
@@ -149,16 +151,43 @@ def test_at_the_end_of_a_run_nothing_long_is_begun(results):
         assert write_scripts(results, ["s"]).reasons == {"s": "began"}
 
 
-def test_at_the_end_of_a_run_a_mistake_of_the_surface_has_one_script(results):
+@pytest.mark.parametrize("level", ["surface", "state"])
+def test_at_the_end_of_a_run_a_recorded_mistake_has_one_script_at_each_level(level, results):
     document = results_store.read_results(results)
-    row = document["rows"][0] | {"level": "surface", "integrator": "-", "known_issue": "wrong"}
-    document["rows"] = [row | {"key": name, "quantity": name} for name in ("frame_axes", "frame_position")]
+    row = document["rows"][0] | {"level": level, "integrator": "-", "known_issue": "wrong"}
+    names = "frame_axes", "frame_position"
+    document["rows"] = [row | {"key": name, "quantity": name, "scenario": name} for name in names]
+    document["scenarios"] |= dict.fromkeys(names, document["scenarios"]["chain"])
     store(results, document)
     with patch("plumbline.reproduce.write.find_disagreement", side_effect=NotReproducible("began")):
         reasons = write_scripts(results).reasons
         assert write_scripts(results, ["frame_position"]).reasons == {"frame_position": "began"}
     same = "the script of frame_axes shows the same mistake; request this row by its key"
     assert reasons == {"frame_axes": "began", "frame_position": same}
+
+
+def test_rows_of_a_known_issue_get_its_script_at_the_end_of_a_run(results):
+    issue = next(one for one in project_known_issues() if one.script)
+    other = next(one for one in project_known_issues() if one.verdict == "disagrees" and not one.script)
+    document = results_store.read_results(results)
+    row = document["rows"][0]
+    document["rows"] = [
+        row | {"key": name, "level": level, "quantity": quantity, "known_issue": found.name}
+        for name, level, quantity, found in (
+            ("one", "surface", "frame_axes", issue),
+            ("two", "state", "energy", issue),
+            ("own", "surface", "frame_position", other),
+        )
+    ]
+    store(results, document)
+    with patch("plumbline.reproduce.write.find_disagreement", side_effect=NotReproducible("began")):
+        written = write_scripts(results)
+        by_key = write_scripts(results, ["one"])
+    assert written.reasons == {"own": "began"} and by_key.reasons == {"one": "began"}
+    assert set(written.files) == {"one", "two"} == set(read_script_index(results))
+    recorded = ROOT / "docs" / "surface" / issue.script
+    for path in written.files.values():
+        assert path.parent == results / "scripts" and path.read_bytes() == recorded.read_bytes()
 
 
 # --- damaged input ------------------------------------------------------------------------------------
