@@ -73,3 +73,91 @@ def test_wrenches_and_accelerations_of_joints_are_reciprocal(name):
             atol=1e-9 * np.max(np.abs(expected), initial=1.0),
         )
         first = last
+
+
+def forces_of_ends(model, found):
+    """Forces and moments (S, N, 3) that the bodies lack to move as they do: those of the ends."""
+    inertia = rotation_matrix(found.state.p) @ model.inertia @ rotation_matrix(found.state.p).mT
+    (acceleration, turning, force, moment), w = np.moveaxis(found.solution, 2, 0), found.omega
+    weight = model.mass[:, None] * model.gravity
+    forces = model.mass[:, None] * acceleration - found.load - weight - force
+    moments = np.matvec(inertia, turning) + np.cross(w, np.matvec(inertia, w)) - found.torque
+    moments -= moment + np.cross(found.arm, force)
+    for k, far in enumerate(found.far):
+        if far >= 0:
+            forces[:, far] += force[:, k]
+            moments[:, far] += moment[:, k] + np.cross(found.far_arm[:, k], force[:, k])
+    return forces, moments
+
+
+@pytest.mark.parametrize("name", ["flyball-governor", "crowded-loops-1", "bricard"])
+def test_ends_that_are_apart_keep_their_twists_and_push_each_other_at_one_point(name):
+    """V̇_b − V̇_c + (V_b − V_c) × V_c = 0 with spatial twists at r_b; in these states the loops are open."""
+    scenario = catalogue_scenarios()[name]
+    opened = cut_open(scenario.model)
+    model, start = opened.model, opened.state(scenario.state)
+    rounding = 10 * 6 * model.n * np.finfo(float).eps  # some ten sums of so many terms follow each other
+    states = compared_states(model, start, "open", 4)[1:]
+    found = Responses(model, states, opened.ends, opened.row_scale, "twists")
+    r, v, w = found.state.r, found.state.v, found.omega
+    forces, moments = forces_of_ends(model, found)
+    most = np.max(np.abs(found.solution))
+
+    def twist_with_rate(body, point):
+        arm = point - r[:, body]
+        rate = found.solution[:, body, 0] + np.cross(found.solution[:, body, 1], arm)
+        return v[:, body] + np.cross(w[:, body], arm), rate - np.cross(w[:, body], v[:, body])
+
+    for b, c in opened.ends:
+        apart = r[:, b] - r[:, c]
+        assert np.all(np.linalg.norm(apart, axis=1) > 0.01)
+        (of_b, rate_b), (of_c, rate_c) = (twist_with_rate(body, r[:, b]) for body in (b, c))
+        spin, turning = w[:, b] - w[:, c], found.solution[:, b, 1] - found.solution[:, c, 1]
+        linear = rate_b - rate_c + np.cross(spin, of_c) + np.cross(of_b - of_c, w[:, c])
+        assert np.max(np.abs(turning + np.cross(spin, w[:, c]))) <= rounding * most
+        assert np.max(np.abs(linear)) <= rounding * most
+        assert np.min(np.max(np.abs(forces[:, b]), axis=1)) > 0.1
+        assert np.max(np.abs(forces[:, b] + forces[:, c])) <= rounding * most
+        around_b = moments[:, b] + moments[:, c] - np.cross(apart, forces[:, c])
+        assert np.max(np.abs(around_b)) <= rounding * most
+
+
+@pytest.mark.parametrize("name", ["bricard", "squeezer"])
+def test_responses_to_errors_of_the_equations_are_differences_between_efforts(name):
+    """All joints are hinges: the unit of an error is its own, by which the rate of its hinge is given too."""
+    model, states, ends = cut(name)
+    found = Responses(model, states, *ends)
+    response, unknowns = found.to_factors()
+    for k, far in enumerate(found.far):
+        axis = np.cross(*np.moveaxis(found.held[k][:, 3:, 3:], -1, 0))  # across the two turns that it holds
+        turning = found.solution[:, k, 1] - (found.solution[:, far, 1] if far >= 0 else 0.0)
+        unit = np.abs(np.vecdot(axis, turning) / unknowns[:, k])
+        effort = model.effort.copy()
+        effort[k, 0] += 1e3
+        change = Responses(model.changed(effort=effort), states, *ends).solution - found.solution
+        expected = 1e3 * unit[:, None, None, None] * response[..., k]
+        np.testing.assert_allclose(change, expected, rtol=0, atol=1e-9 * np.max(np.abs(expected)))
+
+
+def test_responses_to_errors_of_rows_move_the_ends_apart_and_multipliers_are_their_forces():
+    model, states, ends = cut("crowded-loops-1")
+    found = Responses(model, states, *ends)
+    response, unknowns = found.to_factors()
+    gaps, first = found.to_gaps(), len(unknowns[0]) - 6 * len(found.ends)
+    units = response[..., first:]
+    forces, moments = forces_of_ends(model, found)
+    given = np.zeros((len(states), model.n, 6))
+    for loop, (b, c) in enumerate(found.ends):
+        apart = (gaps[:, b, :2] - gaps[:, c, :2]).reshape(len(states), 6, -1)
+        own = slice(6 * loop, 6 * loop + 6)
+        expected = np.zeros((6, gaps.shape[-1]))
+        expected[:, own] = np.eye(6)
+        np.testing.assert_allclose(apart, np.broadcast_to(expected, apart.shape), rtol=0, atol=1e-9)
+        squares = (np.sum(some[..., own] ** 2, axis=(1, 2, 3)) for some in (units, gaps))
+        size = np.sqrt(np.divide(*squares))
+        np.testing.assert_allclose(units[..., own], gaps[..., own] * size[:, None, None, None, :], rtol=1e-9)
+        multipliers = unknowns[:, first:][:, own] / size
+        given[:, b] += multipliers
+        given[:, c] -= multipliers
+    pushed = np.concatenate([forces, moments], -1)
+    np.testing.assert_allclose(given, pushed, rtol=0, atol=1e-9 * np.max(np.abs(found.solution)))
