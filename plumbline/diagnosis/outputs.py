@@ -26,7 +26,7 @@ from plumbline.diagnosis.prediction import (
     projectors_at,
     single_states,
 )
-from plumbline.equations.arithmetic import floats
+from plumbline.equations.arithmetic import floats, stacked
 from plumbline.equations.tree import Tree
 from plumbline.model.datatypes import Array
 from plumbline.model.kinematics import JointFrame, cross, rotate_vectors, rotation_matrix
@@ -351,9 +351,8 @@ class Outputs:
 
     def _loads(self, tree: Tree) -> Array:
         """Forces and moments (2, S, N, 3) of the bodies by loads, drag and springs between points."""
-        shape, places = (len(tree.state.p), 3, 1), self._cut.place[: self.case.model.n]
-        return np.array([np.stack([np.broadcast_to(some[k], shape)[..., 0] for k in places], 1)
-                         for some in zip(*tree.loads(), strict=True)])  # fmt: skip
+        every = [stacked(some, (len(tree.state.p),)) for some in zip(*tree.loads(), strict=True)]
+        return np.array(every)[:, :, self._cut.place[: self.case.model.n]]
 
     def _carried_parts(self, words: str, every: str, loads: Sequence[Array], first: int = 0) -> list[Part]:
         """What joints carry of each of some loads (2, S, N, 3), which are of places from the first on."""

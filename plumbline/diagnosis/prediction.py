@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plumbline.equations.arithmetic import floats
+from plumbline.equations.arithmetic import floats, quantity_arrays
 from plumbline.equations.responses import EndRows, Responses
 from plumbline.equations.tree import Tree
 from plumbline.model.datatypes import (
@@ -157,18 +157,8 @@ class Predictor:
             return {name: np.concatenate([x, second[name]]) for name, x in first.items()}
 
     def _of_trees(self, cases: Sequence[Case]) -> Answers:
-        model, state = self._stacked(cases)
-        tree = Tree(floats(), model, state)
-        found = tree.quantities(tree.solve())
-        lead, answers = (len(state.p),), dict[str, Any]()
-        for name, x in found.items():
-            if isinstance(x, list):
-                x = np.stack([np.broadcast_to(one, (*lead, 3, 1))[..., 0] for one in x], axis=1)
-            else:
-                x = np.broadcast_to(x, (*lead, *x.shape[-2:]))[..., 0]
-                x = x[..., 0] if x.shape[-1] == 1 else x
-            answers[name] = x
-        return answers
+        tree = Tree(floats(), *self._stacked(cases))
+        return quantity_arrays(tree.quantities(tree.solve()), (len(tree.state.p),))
 
     def _stacked(self, cases: Sequence[Case]) -> tuple[Model, State]:
         """One model and state of arrays (lanes times S, ...); what is the same in all has no such axis."""
@@ -211,7 +201,8 @@ class Predictor:
         cut = cut_open(self.case.model)
         found = Responses(model, state, cut.ends, cut.row_scale, self.view.end_rows)
         projectors = [self.projectors[i % self.count] for i in range(len(state.p))]
-        return self.vectors(found.solution, found.tree, cut.place, projectors) | sums_of(found.tree)
+        sums = quantity_arrays(dict(zip(SUMS, found.tree.totals(), strict=True)), (len(state.p),))
+        return self.vectors(found.solution, found.tree, cut.place, projectors) | sums
 
     def vectors(
         self, solution: Array, tree: Tree, joints: NDArray[np.intp], projectors: Sequence[Array | None]
@@ -284,10 +275,3 @@ def maximal_quantities(model: Model, state: State, missing_gamma: Sequence[int])
         "potential_energy": potential_energy(model, state.r) + elastic_energy(model, state),
         "angular_momentum": angular_momentum(model, state.r, state.p, state.v, state.omega),
     }
-
-
-def sums_of(tree: Tree) -> Answers:
-    """Return energies (S,) and angular momentum (S, 3) of a tree in doubles."""
-    count = len(tree.state.p)
-    kinetic, potential, momentum = (np.broadcast_to(x, (count, *x.shape[-2:])) for x in tree.totals())
-    return dict(zip(SUMS, (kinetic[:, 0, 0], potential[:, 0, 0], momentum[..., 0]), strict=True))

@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from plumbline.model.datatypes import Array
 from plumbline.model.kinematics import cross_matrix
@@ -278,6 +279,23 @@ class _Balls(Arithmetic):
 
 
 balls = _Balls
+
+
+def stacked(vectors: Sequence[Any], lead: tuple[int, ...]) -> NDArray[Any]:
+    """Return an array (*lead, N, 3) of a list of vectors of floating-point numbers, in batches."""
+    return np.stack([np.broadcast_to(x[..., 0], (*lead, 3)) for x in vectors], -2)
+
+
+def quantity_arrays(quantities: Mapping[str, Any], lead: tuple[int, ...]) -> dict[str, Array]:
+    """Return lists of vectors as arrays (*lead, N, 3), vectors (*lead, 3), and scalars (*lead)."""
+    found = dict[str, Array]()
+    for name, value in quantities.items():
+        if isinstance(value, list):
+            found[name] = stacked(value, lead)
+        else:
+            array = np.broadcast_to(value[..., 0], (*lead, value.shape[-2]))
+            found[name] = array if array.shape[-1] > 1 else array[..., 0]
+    return found
 
 
 def entries(v: Any) -> list[Any]:

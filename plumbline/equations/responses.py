@@ -19,7 +19,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from plumbline.equations.arithmetic import floats
+from plumbline.equations.arithmetic import floats, stacked
 from plumbline.equations.tree import Tree
 from plumbline.model.datatypes import Array, Model, State
 from plumbline.model.kinematics import (
@@ -144,7 +144,7 @@ class Responses:
 
     def _vectors(self, vectors: Sequence[Any]) -> Array:
         """(S, N, 3) of a list of vectors."""
-        return np.stack([np.broadcast_to(v, (self._count, 3, 1))[..., 0] for v in vectors], 1)
+        return stacked(vectors, (self._count,))
 
     def _find_directions(self, model: Model, tree: Tree) -> None:
         """Free and held directions of every joint, with rotors and efforts along the free ones."""

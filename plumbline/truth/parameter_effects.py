@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from plumbline.equations.arithmetic import floats
+from plumbline.equations.arithmetic import floats, quantity_arrays
 from plumbline.equations.jets import Jet, jets, with_slopes
 from plumbline.equations.tree import Tree
 from plumbline.model.datatypes import Array, Model, State
@@ -91,11 +91,11 @@ def _effects_by_jets(model: Model, states: Sequence[State], parameters: Sequence
     directions = [_derivatives(model, states, one) for one in parameters]
     tree = Tree(jets(), *with_slopes(model, stack_states(states), directions))
 
-    def slope(x: Jet) -> Array:
-        shape = len(parameters), len(states), *x.value.shape[-2:]
-        return np.broadcast_to(0.0 if x.slope is None else x.slope, shape)
+    def slope(x: Jet) -> Any:
+        return np.zeros(x.value.shape[-2:]) if x.slope is None else x.slope
 
-    return {name: _sizes(name, x) for name, x in _arrays(tree, slope).items()}
+    found = _arrays(tree, (len(parameters), len(states)), slope)
+    return {name: _sizes(name, x) for name, x in found.items()}
 
 
 def _derivatives(model: Model, states: Sequence[State], parameter: Parameter) -> dict[str, Array]:
@@ -105,16 +105,12 @@ def _derivatives(model: Model, states: Sequence[State], parameter: Parameter) ->
     return {name: np.stack([one[name] for one in each]) for name in each[0]}
 
 
-def _arrays(tree: Tree, array_of: Callable[[Any], Array]) -> dict[str, Array]:
-    """All quantities of a tree as arrays (..., N, 3), (..., 3), (...) and (..., nu, nu)."""
-    found = {"mass_matrix": array_of(tree.mass_matrix())}
-    for name, value in tree.quantities(tree.solve()).items():
-        if isinstance(value, list):
-            found[name] = np.stack([array_of(x)[..., 0] for x in value], axis=-2)
-        else:
-            array = array_of(value)[..., 0]
-            found[name] = array if array.shape[-1] > 1 else array[..., 0]
-    return found
+def _arrays(tree: Tree, lead: tuple[int, ...], part: Callable[[Any], Any] = lambda x: x) -> dict[str, Array]:
+    """All quantities of a tree, or a part of its numbers: (*lead, N, 3), (*lead, 3), (*lead) and matrices."""
+    mass_matrix, found = part(tree.mass_matrix()), tree.quantities(tree.solve())
+    parts = {name: [*map(part, x)] if isinstance(x, list) else part(x) for name, x in found.items()}
+    matrix = np.broadcast_to(mass_matrix, (*lead, *mass_matrix.shape[-2:]))
+    return {"mass_matrix": matrix} | quantity_arrays(parts, lead)
 
 
 def _sizes(name: str, change: Array) -> Array:
@@ -194,9 +190,8 @@ def _evaluate_together(cases: Sequence[tuple[Model, State]]) -> dict[str, Array]
         for name in vars(models[0]).keys() - {"kind", "body", "spring_body"}
     }
     tree = Tree(floats(), replace(models[0], **numbers), stack_states(states))
-    shape = len(cases), len(states[0].p)
     with np.errstate(divide="ignore", invalid="ignore"):  # a mechanism may move without inertia
-        return _arrays(tree, lambda x: np.broadcast_to(x, (*shape, *x.shape[-2:])))
+        return _arrays(tree, (len(cases), len(states[0].p)))
 
 
 def evaluate_to_first_order(

@@ -28,7 +28,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from plumbline.equations.arithmetic import floats
+from plumbline.equations.arithmetic import floats, stacked
 from plumbline.equations.tree import Solution, Tree
 from plumbline.model.datatypes import KINDS, EngineFailure, Model, State
 from plumbline.model.kinematics import (
@@ -491,8 +491,8 @@ class StepCharts:
         """
         tree, n = _MovingTree(self, q, v), self.model.n
         lead = v.shape[:-1]
-        omega = [A.mT @ w for A, w in zip(tree.A, tree.w, strict=True)]
-        r, velocity, omega_ = (_stacked(x, lead) for x in (tree.r, tree.v, omega))
+        omega = tree.in_bodies(tree.w)
+        r, velocity, omega_ = (stacked(x, lead) for x in (tree.r, tree.v, omega))
         u, udot, x, xdot = (
             np.zeros((*lead, n, size), LongDouble) for size in (3, 3, *[self.model.columns] * 2)
         )
@@ -518,8 +518,8 @@ class StepCharts:
         """
         q, v = self.start()
         _, found, tree = self._solved(q, v)
-        turning = [A.mT @ alpha for A, alpha in zip(tree.A, found.turning, strict=True)]
-        linear, angular = (_stacked(x, v.shape[:-1]) for x in (found.acceleration, turning))
+        turning = tree.in_bodies(found.turning)
+        linear, angular = (stacked(x, v.shape[:-1]) for x in (found.acceleration, turning))
         return linear[..., self.place, :], angular[..., self.place, :]
 
 
@@ -760,11 +760,6 @@ BERNOULLI = [
 
 
 # -- algebra in extended precision -------------------------------------------------------------------
-
-
-def _stacked(vectors: Sequence[Array], lead: tuple[int, ...]) -> Array:
-    """(..., N, 3) of a list of (..., 3, 1)."""
-    return np.stack([np.broadcast_to(x[..., 0], (*lead, 3)) for x in vectors], -2)
 
 
 def _joined(parts: Sequence[Array]) -> Array:

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plumbline.equations.arithmetic import floats
+from plumbline.equations.arithmetic import floats, stacked
 from plumbline.equations.tree import Tree
 from plumbline.model.datatypes import KINDS, Array, Model, State, StepRun, Trajectory
 from plumbline.model.kinematics import (
@@ -464,12 +464,11 @@ def _formula_errors(model: Model, states: Sequence[State]) -> Array:
     for dtype in (np.float64, LongDouble):
         tree = Tree(floats(dtype), model, state)
         solution = tree.solve()
-        # of a held body one for all states
-        each = [*solution.acceleration, *tree.in_bodies(solution.turning)]
-        found.append(np.stack([np.broadcast_to(x, (len(some), 3, 1)) for x in each]))
-    size = np.linalg.norm(np.asarray(found[0] - found[1], float)[..., 0], axis=-1).reshape(2, model.n, -1)
+        each = solution.acceleration, tree.in_bodies(solution.turning)
+        found.append(np.stack([stacked(x, (len(some),)) for x in each], axis=1))
+    size = np.linalg.norm(np.asarray(found[0] - found[1], float), axis=-1)
     share = float(np.finfo(LongDouble).eps / np.finfo(float).eps)
-    lost = LOST_DIGITS * share * np.moveaxis(size, -1, 0)
+    lost = LOST_DIGITS * share * size
     return lost if len(some) == len(states) else np.tile(np.max(lost, axis=0), (len(states), 1, 1))
 
 
