@@ -1,8 +1,8 @@
 """Calls made by a Python of another environment, for other versions of engines.
 
-A worker keeps one child process per environment and exchanges frames with it through its standard input and
-output: a length of 8 bytes, then a pickle. The child is killed when its worker exits and has the worker's
-limits; a crash of the child is reported as a crash of the worker.
+A worker keeps one child process per environment and exchanges pickles with it through its standard input and
+output. The child is killed when its worker exits and has the worker's limits; a crash of the child is
+reported as a crash of the worker.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ import atexit
 import os
 import pickle
 import signal
-import struct
 import subprocess
 import sys
 import time
@@ -35,7 +34,6 @@ if folder:
 from plumbline.processes.remote_python import serve_parent
 serve_parent(int(parent))
 """
-_FRAME_LENGTH = struct.Struct("<Q")
 
 
 class RemoteCrash(PlumblineError):
@@ -46,23 +44,9 @@ class RemoteError(PlumblineError):
     """An exception of the child, as text: its class may not exist in this environment."""
 
 
-def _send_frame(stream: IO[bytes], value: Any) -> None:
-    body = pickle.dumps(value, protocol=5)
-    stream.write(_FRAME_LENGTH.pack(len(body)))
-    stream.write(body)
+def _send(stream: IO[bytes], value: Any) -> None:
+    stream.write(pickle.dumps(value, protocol=5))  # all at once: nothing is sent of what cannot be pickled
     stream.flush()
-
-
-def _receive_frame(stream: IO[bytes]) -> Any:
-    """Read one frame; raises EOFError where the other process has ended."""
-    head = stream.read(_FRAME_LENGTH.size)
-    if len(head) < _FRAME_LENGTH.size:
-        raise EOFError
-    (size,) = _FRAME_LENGTH.unpack(head)
-    body = stream.read(size)
-    if len(body) < size:
-        raise EOFError
-    return pickle.loads(body)
 
 
 @cache
@@ -119,9 +103,9 @@ def call_fresh(python: str, function: Callable[..., Any], *arguments: Any) -> An
 def _ask(process: subprocess.Popen[bytes], function: Callable[..., Any], arguments: Any) -> Any:
     assert process.stdin is not None and process.stdout is not None
     try:
-        _send_frame(process.stdin, (function.__module__, function.__qualname__, arguments))
-        raised, value = _receive_frame(process.stdout)
-    except (EOFError, BrokenPipeError):
+        _send(process.stdin, (function.__module__, function.__qualname__, arguments))
+        raised, value = pickle.load(process.stdout)
+    except (EOFError, pickle.UnpicklingError, BrokenPipeError):  # it ended, perhaps within its answer
         raise RemoteCrash(describe_exit(process.wait())) from None
     if raised:
         raise RemoteError(value) if value else MemoryError
@@ -186,7 +170,7 @@ def serve_parent(parent: int) -> None:
     _accept_arrays_of_numpy_2()
     while True:
         try:
-            module, name, arguments = _receive_frame(questions)
+            module, name, arguments = pickle.load(questions)
         except EOFError:
             return
         try:
@@ -195,4 +179,4 @@ def serve_parent(parent: int) -> None:
             answer = True, ""
         except BaseException as error:  # the engine's own failure
             answer = True, describe_exception(error)
-        _send_frame(answers, answer)
+        _send(answers, answer)
