@@ -189,8 +189,7 @@ class _Diagnosing:
         if not self.evaluate or self.model.has_loops:
             return None
         problem = worst_difference(self.model, self.reported, self.truth, quantities)
-        loss = find_digit_loss(problem, self.evaluate)
-        return None if loss is None else loss.cause(quantities)
+        return find_digit_loss(problem, self.evaluate)
 
     # -- causes in what is evaluated -----------------------------------------------------------------
 

@@ -8,7 +8,7 @@ Rounding that an algorithm amplifies gives another error each time.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import ParamSpec, TypeVar
 
 import numpy as np
@@ -72,28 +72,19 @@ def scatter_cause(quantities: Sequence[str], scatter: float) -> Cause:
     return Cause(kind, quantity_words(quantities), "", text, (scatter,), quantities=tuple(quantities))
 
 
-@dataclass(frozen=True)
-class DigitLoss:
-    """How the error of an engine scatters, and how it depends on the number of bodies."""
+def growth_words(ratios: dict[int, float]) -> str:
+    """Say whether an error grows with the number of bodies by more than its bound does.
 
-    scatter: float  # median distance of the errors of equivalent problems from their mean, over their size
-    ratio_by_length: dict[int, float]  # error in rounding bounds of the first n bodies, by n, descending
+    Args:
+        ratios: errors in rounding bounds of the first n bodies, by n, descending.
 
-    @property
-    def grows(self) -> bool:
-        """Whether the error grows with the number of bodies by more than its bound does."""
-        ratios = list(self.ratio_by_length.values())
-        return len(ratios) > 1 and ratios[0] > MIN_GROWTH * ratios[1]
-
-    def cause(self, quantities: Sequence[str]) -> Cause:
-        """State the loss."""
-        found = scatter_cause(quantities, self.scatter)
-        text = "; rounding or noise in the algorithm"
-        if self.grows:
-            lengths = ", ".join(f"{ratio:.2g} for {n}" for n, ratio in self.ratio_by_length.items())
-            text = f", and the error grows with the number of bodies (in rounding bounds: {lengths})"
-            text += "; rounding in the algorithm"
-        return replace(found, change=found.change + text)
+    """
+    largest = list(ratios.values())
+    if len(largest) < 2 or not largest[0] > MIN_GROWTH * largest[1]:
+        return "; rounding or noise in the algorithm"
+    lengths = ", ".join(f"{ratio:.2g} for {n}" for n, ratio in ratios.items())
+    text = f", and the error grows with the number of bodies (in rounding bounds: {lengths})"
+    return f"{text}; rounding in the algorithm"
 
 
 def worst_difference(
@@ -108,7 +99,7 @@ def worst_difference(
     return Difference(model, reported, truth, View(tuple(quantities)), [at])
 
 
-def find_digit_loss(problem: Difference, evaluate: Evaluate) -> DigitLoss | None:
+def find_digit_loss(problem: Difference, evaluate: Evaluate) -> Cause | None:
     """Test whether the error at the worst state scatters when all axes are turned by a tiny angle.
 
     Returns:
@@ -118,7 +109,8 @@ def find_digit_loss(problem: Difference, evaluate: Evaluate) -> DigitLoss | None
     scatter = measure_scatter(problem, evaluate)
     if scatter is None or scatter < MIN_SCATTER:
         return None
-    return DigitLoss(scatter, _ratios(problem, evaluate))
+    found = scatter_cause(problem.names, scatter)
+    return replace(found, change=found.change + growth_words(_ratios(problem, evaluate)))
 
 
 def measure_scatter(problem: Difference, evaluate: Evaluate) -> float | None:
