@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal, get_args, get_type_hints
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model, model_validator
 
+from plumbline.diagnosis.cause import Cause, Condition, Occurrence
 from plumbline.judging.rows import Row
 from plumbline.model.datatypes import (
     JOINT_ELEMENTS,
@@ -173,47 +174,27 @@ class _Run(_Part):
     seed: int | None = None
 
 
-class _Condition(_Part):
-    quantity: str
-    unit: str
-    least: float | None
-    most: float | None
-    period: _Count
-
-
-class _Occurrence(_Part):
-    first_step: _Count
-    time: float
-    steps: _Count
-    compared: _Count
-    conditions: list[_Condition]
-    exceptions: _Count
-
-
-class _Cause(_Part):
-    kind: Literal["number", "term", "output", "frame", "method", "rounding", "refusal", "unexplained"]
-    term: str
-    place: str
-    change: str
-    amount: list[float | None]
-    nominal: list[float | None]
-    unit: str
-    uncertainty: float | None
-    left: float | None
-    states: _Count
-    quantities: list[str] = []
-    needs: list[str] = []
-    general: str = ""
-    equal: list[_Cause]
-    occurrence: _Occurrence | None = None
-
-
-_ROW_TYPES = get_type_hints(Row) | {
-    "key": str, "verdict": _VerdictWord, "declared_order": _Count | None, "causes": list[_Cause],
-    "cpu_time": _Duration, "extra": dict[str, float | str | None],
+_TYPES_IN_JSON: dict[Any, Any] = {  # of fields of records; numbers that are not finite are stored as null
+    int: _Count, float: float | None, tuple[float, ...]: list[float | None], tuple[str, ...]: list[str],
 }  # fmt: skip
-_ROW_FIELDS: dict[str, Any] = {name: (kind, ...) for name, kind in _ROW_TYPES.items()}
-_Row: Any = create_model("_Row", __base__=_Part, **_ROW_FIELDS)
+
+
+def _part_of(record: type, **others: Any) -> Any:
+    """The fields of a record as JSON has them; some of another type, or with a default."""
+    kinds = {name: (_TYPES_IN_JSON.get(kind, kind), ...) for name, kind in get_type_hints(record).items()}
+    return create_model(f"_{record.__name__}", __base__=_Part, __module__=__name__, **kinds | others)
+
+
+_Condition: Any = _part_of(Condition)
+_Occurrence: Any = _part_of(Occurrence, time=(float, ...), conditions=(list[_Condition], ...))
+_Cause: Any = _part_of(
+    Cause, quantities=(list[str], []), needs=(list[str], []), general=(str, ""),
+    equal=("list[_Cause]", ...), occurrence=(_Occurrence | None, None),
+)  # fmt: skip
+_Row: Any = _part_of(
+    Row, key=(str, ...), verdict=(_VerdictWord, ...), declared_order=(_Count | None, ...),
+    causes=(list[_Cause], ...), cpu_time=(_Duration, ...), extra=(dict[str, float | str | None], ...),
+)  # fmt: skip
 
 
 class _Finding(_Part):
