@@ -384,7 +384,7 @@ class _Cause(BaseModel):
     change: str = _field("missing, doubled, reversed, in the body frame, …", "")
 
 
-class _Entry(_Selector):
+class Entry(_Selector):
     """An entry as the file has it: a finding, and the rows that it covers."""
 
     id: _Name = _field("A name of the entry, unique in all files: the finding's.")
@@ -406,7 +406,7 @@ class _Entry(_Selector):
     )
 
     @model_validator(mode="after")
-    def _check_rows(self) -> _Entry:
+    def _check_rows(self) -> Entry:
         for selector in self._selectors:
             cause = self.cause.kind if self.cause else "unexplained" if self.needs is not None else ""
             selector.check(self.engine, self.mechanism, cause)
@@ -424,7 +424,7 @@ class _Entry(_Selector):
     def every_issue(self) -> Iterator[KnownIssue]:
         """Make the issues of all rows."""
         common = {
-            name: getattr(self, name) for name in _Entry.model_fields.keys() - {"rows", "cause", "needs"}
+            name: getattr(self, name) for name in Entry.model_fields.keys() - {"rows", "cause", "needs"}
         }
         cause = {} if self.cause is None else self.cause.model_dump()
         common["cause"] = {name: value for name, value in cause.items() if value}
@@ -460,7 +460,7 @@ def load_known_issues(
 
 def _load_entries(
     path: Path, other_scenarios: Iterable[str] = (), places: dict[str, str] | None = None
-) -> list[_Entry]:
+) -> list[Entry]:
     try:
         source = read_yaml(path)
     except ScenarioError as error:
@@ -470,12 +470,12 @@ def _load_entries(
     if not isinstance(source.data, list):
         raise source.fatal_error("is not a list", "a list of entries, each as `- id: …`", (1, 1))
     try:
-        entries = TypeAdapter(list[_Entry]).validate_python(source.data)
+        entries = TypeAdapter(list[Entry]).validate_python(source.data)
     except ValidationError as error:
         found = error.errors()
         for one in found:  # `_as_ratios` adds a key that the file does not have
             one["loc"] = tuple(key for key in one["loc"] if key != ANY_LENGTH)
-        problems = problems_from_validation(source, found, _Entry)
+        problems = problems_from_validation(source, found, Entry)
         raise ScenarioError([*source.problems, *problems]) from None
     beside = (file.stem for file in path.parent.glob("*.yaml")) if path != KNOWN_ISSUES_FILE else ()
     problems = [*source.problems, *_id_problems(source, entries, {} if places is None else places)]
@@ -485,25 +485,9 @@ def _load_entries(
     return entries
 
 
-@dataclass(frozen=True)
-class RecordedMistake:
-    """What the project's file says of a mistake of an engine."""
-
-    name: str  # id of the entry
-    engine: str  # name or pattern of columns
-    since: str
-    versions: str
-    reason: str
-    script: str  # file of docs/surface; empty: none
-
-
-def recorded_mistakes() -> list[RecordedMistake]:
+def recorded_mistakes() -> list[Entry]:
     """Read the engines' mistakes that the project's own file records, those that no row shows included."""
-    return [
-        RecordedMistake(one.id, one.engine, one.since, one.versions, one.reason, one.script)
-        for one in _load_entries(KNOWN_ISSUES_FILE)
-        if one.is_wrong
-    ]
+    return [one for one in _load_entries(KNOWN_ISSUES_FILE) if one.is_wrong]
 
 
 @cache
@@ -520,7 +504,7 @@ def project_known_issues() -> tuple[KnownIssue, ...]:
     return tuple(load_known_issues())
 
 
-def _id_problems(source: YamlSource, entries: Sequence[_Entry], places: dict[str, str]) -> Iterator[Problem]:
+def _id_problems(source: YamlSource, entries: Sequence[Entry], places: dict[str, str]) -> Iterator[Problem]:
     """Problems of ids that are used twice, in one file or in two."""
     for number, entry in enumerate(entries):
         path = (number, "id")
@@ -531,7 +515,7 @@ def _id_problems(source: YamlSource, entries: Sequence[_Entry], places: dict[str
         places.update(dict.fromkeys(ids - places.keys(), f"{source.file}:{source.value_positions[path][0]}"))
 
 
-def _name_problems(source: YamlSource, entries: Sequence[_Entry], others: set[str]) -> Iterator[Problem]:
+def _name_problems(source: YamlSource, entries: Sequence[Entry], others: set[str]) -> Iterator[Problem]:
     """Problems of names that nothing has."""
     known: dict[str, set[str]] = {
         "scenario": {

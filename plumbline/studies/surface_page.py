@@ -54,7 +54,7 @@ def _engine_tables(surface: Surface) -> Iterator[str]:
         if wrong.engine.partition("-")[0] == surface.engine:
             script = f" ([script]({wrong.script}))" if wrong.script else ""
             since = f", since {wrong.since}" if wrong.since else ""
-            text = f"- {wrong.name}: {wrong.reason} Versions {wrong.versions}{since}{script}."
+            text = f"- {wrong.id}: {wrong.reason} Versions {wrong.versions}{since}{script}."
             yield textwrap.fill(
                 text, 110, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False
             )
