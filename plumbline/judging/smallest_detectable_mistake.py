@@ -234,9 +234,7 @@ def _state_ratios(
             found.append((of_state, of_initial[0]))
         for indices, effects in found:
             for quantity, effect in effects.items():
-                if (tolerance := getattr(bounds, quantity)) is None:
-                    continue
-                bound = np.maximum(np.asarray(tolerance), TINY)
+                bound = np.maximum(bounds.tolerance(quantity), TINY)
                 with np.errstate(over="ignore"):  # a bound of zero, as that of the energy at rest
                     worst = np.max(effect / bound, axis=1)
                 for i, value in zip(indices, worst, strict=True):
@@ -633,7 +631,6 @@ def _natural_sizes(model: Model, state: State, level: Level) -> dict[str, Array]
     """What a change must pass to count, by quantity: bounds, or fractions of the accelerations."""
     bounds = remembered_rounding_bound(model, state)
     if level == "state":
-        names = [name for name in STATE_UNITS if getattr(bounds, name) is not None]
-        return {name: np.maximum(np.asarray(bounds.tolerance(name)), TINY) for name in names}
+        return {name: np.maximum(bounds.tolerance(name), TINY) for name in STATE_UNITS}
     names = ["acceleration", "angular_acceleration"]
     return {name: MAX_MISTAKE * NO_EFFECT * np.max(np.asarray(bounds.scale[name])) for name in names}

@@ -80,7 +80,7 @@ def run_all(
     tasks: Sequence[Task],
     what: str,
     progress: Callable[[int, int, str], None],
-    cpu_times: CpuTimes | None,
+    cpu_times: CpuTimes | None = None,
 ) -> dict[Any, Any]:
     """Run tasks, whose keys begin with a scenario's name: values by key.
 

@@ -17,7 +17,6 @@ from plumbline.model.features import ROLES, Feature, Place, features, without_fe
 from plumbline.model.kinematics import complete_state, stack_states
 from plumbline.model.random_mechanisms import mechanism_with_places
 from plumbline.model.sampling import compared_states
-from plumbline.processes.cpu_time import CpuTimes
 from plumbline.processes.worker_pool import Executor, Task
 from plumbline.scenario.line_and_column_errors import ScenarioError
 from plumbline.scenario.loader import Scenario, scenario_from_dict
@@ -96,12 +95,9 @@ def _is_shown(model: Model, state: State, some: Sequence[Feature]) -> NDArray[np
         found = evaluate_to_first_order(model, [state], cases) if model.has_loops else evaluate_models(cases)
     bound = state_rounding_bound(model, state)
     for name, values in found.items():
-        if (tolerance := getattr(bound, name)) is not None:
-            effect = np.abs(values[1:, 0] - values[0, 0])
-            limit = np.reshape(
-                tolerance, (*np.shape(tolerance), *[1] * (effect.ndim - 1 - np.ndim(tolerance)))
-            )
-            seen |= ~np.all(effect <= MIN_RATIO * limit, axis=tuple(range(1, effect.ndim)))
+        effect, tolerance = np.abs(values[1:, 0] - values[0, 0]), np.asarray(bound.tolerance(name))
+        limit = tolerance.reshape((*tolerance.shape, *[1] * (effect.ndim - 1 - tolerance.ndim)))
+        seen |= ~np.all(effect <= MIN_RATIO * limit, axis=tuple(range(1, effect.ndim)))
     return seen
 
 
@@ -109,7 +105,6 @@ def measure_features(
     executor: Executor,
     scenarios: Iterable[Scenario],
     progress: Callable[[int, int, str], None] = lambda done, total, what: None,
-    cpu_times: CpuTimes | None = None,
 ) -> dict[str, list[Feature]]:
     """Compute which features scenarios show.
 
@@ -117,7 +112,6 @@ def measure_features(
         executor: makes the calls, one per scenario.
         scenarios: which.
         progress: called with calls done, calls in all and the scenario of the last one.
-        cpu_times: gets the CPU time as "judging".
 
     Returns:
         By scenario the features of `shown_features`; each two of them are a covered pair.
@@ -135,7 +129,7 @@ def measure_features(
         )
         for s in sorted(scenarios, key=lambda s: -s.model.n)
     ]
-    found = run_all(executor, tasks, "features", progress, cpu_times)
+    found = run_all(executor, tasks, "features", progress)
     return {name: shown for (name,), shown in found.items()}
 
 

@@ -36,6 +36,7 @@ from plumbline.truth.step_charts import BodyStates, LongDouble, StepCharts
 Array = NDArray[Any]  # in this module of extended precision, where nothing else is stated
 Coordinates = list[Array]
 MAX_EXTENDED_EPSILON = 1e-18  # of the numbers that formulas of steps need
+POWER_ITERATIONS = 12
 HAS_EXTENDED_PRECISION = np.finfo(LongDouble).eps < MAX_EXTENDED_EPSILON
 
 
@@ -102,11 +103,10 @@ def coordinates_after(
     return q, v * LongDouble(method.rate_factor)
 
 
-def fastest_rates(model: Model, states: Sequence[State], iterations: int = 12) -> Array:
+def fastest_rates(model: Model, states: Sequence[State]) -> Array:
     """Estimate the spectral radius of the linearised equations of motion by power iteration.
 
-    Args:
-        iterations: how many; the growth over the second half counts.
+    The growth over the second half of the iterations counts.
 
     Returns:
         (B,) [1/s].
@@ -122,7 +122,7 @@ def fastest_rates(model: Model, states: Sequence[State], iterations: int = 12) -
         return np.asarray(np.sqrt(np.sum(theta * theta + rate * rate, axis=-1, keepdims=True)))
 
     tiny, growth = LongDouble(1e-7), []
-    for _ in range(iterations):
+    for _ in range(POWER_ITERATIONS):
         total = size(theta, rate)
         theta, rate = tiny * theta / total, tiny * rate / total
         change = system.acceleration(system.move(q, theta), v + rate) - a
@@ -130,7 +130,7 @@ def fastest_rates(model: Model, states: Sequence[State], iterations: int = 12) -
         theta, rate = rate - system.bracket(v, theta), change
         growth.append(size(theta, rate) / tiny)
     with np.errstate(divide="ignore"):  # nothing grows where no force depends on the motion
-        later = np.log(np.array(growth[iterations // 2 :], float))
+        later = np.log(np.array(growth[POWER_ITERATIONS // 2 :], float))
     return np.asarray(np.exp(np.mean(later, axis=0)).ravel())
 
 
