@@ -307,7 +307,7 @@ class Adapter(ABC):
         with self._checked_refusals(model):
             run = self._step(model, state, times, self.integrator(integrator), step)
         label = f"{self.name}._step, {integrator}"
-        check_record(run, StepRun, {"N": model.n, "T": len(times)}, label)
+        check_record(run, StepRun, {"bodies": model.n, "samples": len(times)}, label)
         _check_trajectory(model, times, run.trajectory, label)
         return run
 
@@ -421,7 +421,7 @@ def check_samples(model: Model, times: Float[Array, "samples"], run: Trajectory,
         EngineFailure: the run stopped early, or a row has another shape or is not finite.
 
     """
-    check_record(run, Trajectory, {"N": model.n, "T": len(times)}, label)
+    check_record(run, Trajectory, {"bodies": model.n}, label)
     common = min(len(run.t), len(times))
     with np.errstate(invalid="ignore"):
         wrong = np.flatnonzero(~(np.abs(run.t[:common] - times[:common]) <= 1e-9 * max(1.0, times[-1])))

@@ -1,8 +1,9 @@
-"""What an adapter may declare and return: one table, checked for every adapter, method and field."""
+"""What an adapter may declare and return, checked for every adapter, method and field."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import fields
 from functools import cache
 from typing import Any, ClassVar, get_args, get_origin, get_type_hints
 
@@ -11,52 +12,34 @@ from packaging.specifiers import InvalidSpecifier, SpecifierSet
 from packaging.version import InvalidVersion, Version
 from pydantic import ConfigDict, PydanticUserError, TypeAdapter, ValidationError
 
-from plumbline.model.datatypes import EngineFailure, Model, StateQuantities, StepRun, Trajectory
+from plumbline.model.datatypes import EngineFailure, Model, StateQuantities, Trajectory, shape_words
 from plumbline.model.kinematics import rate_count
 from plumbline.processes.exceptions import MAX_TEXT, one_line
 
 MAX_NAME = 200  # characters of names, titles and versions
 COUNT = "count"  # a whole number
 
-# By record and field the shape, "" for a number, and whether the field may be None. Sizes: N bodies, J joints
-# with the closing ones, T samples, U minimal rates; others are any. Where A is the first, another check names
-# the first sample that is missing or not finite.
-FIELDS: Mapping[type, Mapping[str, tuple[str, bool]]] = {
-    StateQuantities: {
-        "acceleration": ("N 3", False),
-        "angular_acceleration": ("N 3", False),
-        "joint_reaction": ("J 3", True),
-        "kinetic_energy": ("", True),
-        "potential_energy": ("", True),
-        "angular_momentum": ("3", True),
-        "mass_matrix": ("U U", True),
-        "joint_moment": ("J 3", True),
-    },
-    Trajectory: {
-        "t": ("A", False),
-        "r": ("A N 3", False),
-        "p": ("A N 4", False),
-        "v": ("A N 3", False),
-        "pdot": ("A N 4", False),
-        "steps": (COUNT, False),
-        "limit_error": ("A 4", True),
-        "coordinates": ("A Q", True),
-        "velocities": ("A V", True),
-    },
-    StepRun: {
-        "coordinate_acceleration": ("T N 7", True),
-        "multipliers": ("T N 4", True),
-        "angle_axes": ("K 3", True),
-    },
-}
+
+@cache
+def _fields(kind: type) -> Mapping[str, tuple[str, bool]]:
+    """Fields that are arrays or numbers: the shape, "" for a number, and whether the field may be None."""
+    found = {}
+    for one in fields(kind):
+        annotation = str(one.type)
+        shape = {"int": COUNT, "float": ""}.get(annotation.partition(" ")[0], shape_words(annotation))
+        if shape is not None:
+            found[one.name] = shape, annotation.endswith("None")
+    return found
 
 
 def check_record(record: Any, kind: type, sizes: Mapping[str, int], label: str) -> None:
-    """Check that a record is of its class and its fields of the types and shapes of `FIELDS`.
+    """Check that a record is of its class and its fields of the types and shapes of their annotations.
+
+    Of a trajectory another check names the first sample that is missing or not finite.
 
     Args:
         kind: the class that it must be of.
-        sizes: the sizes that the shapes name.
+        sizes: the sizes that the shapes name; others are any.
         label: adapter and method, for the message.
 
     Raises:
@@ -65,17 +48,16 @@ def check_record(record: Any, kind: type, sizes: Mapping[str, int], label: str) 
     """
     if not isinstance(record, kind):
         raise EngineFailure(f"{label} returned {describe_value(record)}, must be a {kind.__name__}")
-    for name, (shape, is_optional) in FIELDS[kind].items():
+    for name, (shape, is_optional) in _fields(kind).items():
         value = getattr(record, name)
         if value is not None or not is_optional:
-            is_checked_later = shape.startswith("A")
             check_numbers(
                 value,
                 shape,
                 sizes,
                 f"{label}: {name}",
                 is_optional=is_optional,
-                must_be_finite=not is_checked_later,
+                must_be_finite=kind is not Trajectory,
             )
 
 
@@ -93,14 +75,14 @@ def check_evaluation(answers: Any, model: Model, count: int, label: str) -> None
         raise EngineFailure(f"{label} returned {describe_value(answers)}, must be a list of StateQuantities")
     if len(answers) != count:
         raise EngineFailure(f"{label} answered {len(answers)} of {count} states")
-    sizes = {"N": model.n, "J": len(model.kind)}
+    sizes = {"bodies": model.n, "joints": len(model.kind)}
     if not model.has_loops:  # there the mass matrix is not compared
-        sizes["U"] = rate_count(model)
+        sizes["nu"] = rate_count(model)
     for index, answer in enumerate(answers):
         at = f"{label}, state {index}"
         check_record(answer, StateQuantities, sizes, at)
         limits = {} if answer.limit_error is None else answer.limit_error
-        if not isinstance(limits, Mapping) or not limits.keys() <= FIELDS[StateQuantities].keys():
+        if not isinstance(limits, Mapping) or not limits.keys() <= _fields(StateQuantities).keys():
             found = describe_value(limits)
             raise EngineFailure(f"{at}: limit_error is {found}, must be numbers by quantity, or None")
         for name, value in limits.items():
@@ -119,7 +101,7 @@ def check_numbers(
     """Check that a value is a number, a count, or an array of doubles of a shape.
 
     Args:
-        shape: as in `FIELDS`.
+        shape: sizes and their names, "" for a number, or `COUNT`.
         sizes: the sizes that the shape names.
         label: adapter, method and field, for the message.
         is_optional: whether None is valid too, for the message.
@@ -149,7 +131,7 @@ def check_numbers(
 
 
 def _dimensions(shape: str, sizes: Mapping[str, int]) -> tuple[int | str, ...]:
-    """The sizes of a shape; a letter for any size."""
+    """The sizes of a shape; a name for any size."""
     return tuple(int(s) if s.isdigit() else sizes.get(s, s) for s in shape.split())
 
 

@@ -9,8 +9,9 @@ velocity in the body frame (the notes' ω′ = 2 L(p) ṗ). N is the number of b
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -44,12 +45,12 @@ from reference_impl.mechanism import ZERO_INERTIA as ZERO_INERTIA
 from reference_impl.mechanism import Mechanism
 
 Model = Mechanism
-# axes of the value that a field of a mechanism or of a state has at one place, behind the axis of the places
-VALUE_AXES = (
-    dict.fromkeys(("mass", "length", "drag_force", "drag_moment", *SPRING_FIELDS[2:]), 0)
-    | dict.fromkeys(("force", "moment", "p", "omega", "u", "udot", "x", "xdot", "r", "v", *JOINT_ELEMENTS), 1)
-    | dict.fromkeys(("inertia", "point", "turn", "spring_point"), 2)
-)
+
+
+def shape_words(annotation: str) -> str | None:
+    """Return the shape in the annotation of an array, without the axes of a batch; None of other types."""
+    shape = re.search(r"""["'](?:\*#batch )?(.*)["']""", annotation)
+    return shape[1] if shape else None
 
 
 def _absent() -> Array:
@@ -108,6 +109,15 @@ class State:
     def __getitem__(self, at: Any) -> State:
         """Take the entries at an index of every array: bodies of one state, or states of many."""
         return State(*(x[at] for x in vars(self).values()))
+
+
+# sizes of the value that a field of a mechanism or of a state has at one place, behind the axis of the places
+VALUE_SHAPES = {
+    one.name: shape.split()[1:]
+    for one in (*fields(Model), *fields(State))
+    if (shape := shape_words(str(one.type)))
+}
+VALUE_AXES = {name: len(shape) for name, shape in VALUE_SHAPES.items()}
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,9 @@ from plumbline.model.datatypes import (
     JOINT_FIELDS,
     KINDS,
     SPRING_FIELDS,
+    VALUE_SHAPES,
     Model,
+    State,
     column_count,
 )
 from plumbline.processes.exceptions import PlumblineError
@@ -31,15 +33,6 @@ from plumbline.scenario.yaml_source import YamlSource
 MAX_LISTED_PROBLEMS = 5
 MAX_MAGNITUDE = 1e30  # of the model's numbers, as in scenario files
 
-_MODEL_SHAPES: dict[str, tuple[int, ...]] = {  # of one body; (3,) where none is named
-    "inertia": (3, 3), "mass": (), "length": (), "drag_force": (), "drag_moment": (),
-    "body": (2,), "point": (2, 3), "turn": (2, 4),
-    "spring_body": (2,), "spring_point": (2, 3), "spring_stiffness": (), "spring_damping": (),
-    "spring_length": (),
-}  # fmt: skip
-_STATE_SHAPES: dict[str, tuple[int, ...]] = {
-    "p": (4,), "omega": (3,), "u": (3,), "udot": (3,), "r": (3,), "v": (3,),
-}  # fmt: skip
 _Count = Annotated[int, Field(ge=0, le=2**53)]
 _Duration = Annotated[float, Field(ge=0, le=1e15)]  # s
 _VerdictWord = Literal[
@@ -90,12 +83,14 @@ class _Scenario(_Part):
         counts |= dict.fromkeys(JOINT_FIELDS, joints)
         if self.model is not None and not _are_kinds(model.get("kind"), joints):
             raise invalid_value_error("model.kind does not fit the bodies", f"{self.bodies} kinds of joints")
-        columns = (column_count(model.get("kind", ())),)
-        model_shapes = _MODEL_SHAPES | dict.fromkeys(JOINT_ELEMENTS, columns)
-        shapes = {name: (counts.get(name, self.bodies), *model_shapes.get(name, (3,))) for name in names}
-        _check_shapes("model", self.model, shapes | {"gravity": (3,)})
-        state_shapes = _STATE_SHAPES | {"x": columns, "xdot": columns}
-        _check_shapes("state", self.state, {k: (self.bodies, *shape) for k, shape in state_shapes.items()})
+        columns = column_count(model.get("kind", ()))
+
+        def shape(name: str) -> tuple[int, ...]:
+            sizes = (int(size) if size.isdigit() else columns for size in VALUE_SHAPES[name])
+            return counts.get(name, self.bodies), *sizes
+
+        _check_shapes("model", self.model, {name: shape(name) for name in names} | {"gravity": (3,)})
+        _check_shapes("state", self.state, {one.name: shape(one.name) for one in fields(State)})
         if self.model is not None and min(self.model["mass"], default=1.0) <= 0:
             raise invalid_value_error("has a mass that is not positive", "masses above 0 kg")
         return self
