@@ -127,7 +127,8 @@ class Difference:
         """Edits of terms of the equations."""
         changes = list[tuple[Cause, Answers]]()
         if self.view == View():
-            changes += Terms(self.predictor).changes()
+            terms = Terms(self.predictor)
+            changes += [*terms.linear(), *terms.fixed()]
         elif self.view.are_bodies_kept:
             changes += missing_gammas(self.predictor)
         return [Edit(cause, effect=self.flat_vectors(change)) for cause, change in changes]

@@ -32,11 +32,8 @@ class Terms:
         """Solve the right mechanism and its responses."""
         self.predictor, self.model = predictor, predictor.case.model
         cut = cut_open(self.model)
-        self.joints, self.ends, self.scale = (
-            cut.place,
-            cut.ends,
-            cut.row_scale,
-        )  # where joint k is in the tree
+        self.joints = cut.place  # where joint k is in the tree
+        self.ends, self.scale = cut.ends, cut.row_scale
         self.tree, self.state = cut.model, cut.state(predictor.case.state)
         self.found = self._solved(self.ends, "accelerations")
         self._responses = self.found.to_joints()  # (S, N, 4, 3, c)
@@ -49,11 +46,6 @@ class Terms:
     def answers(self, change: Array) -> Answers:
         """Turn changes (S, N, 4, 3) of the solution into those of the mechanism's vectors."""
         return self.predictor.vectors(change, self.found.tree, self.joints, self.predictor.projectors)
-
-    def changes(self) -> Iterator[tuple[Cause, Answers]]:
-        """List terms that may be multiplied, then those that may be left out, with their effects."""
-        yield from self.linear()
-        yield from self.fixed()
 
     def linear(self) -> Iterator[tuple[Cause, Answers]]:
         """List velocity terms, with the effect of one more of each."""

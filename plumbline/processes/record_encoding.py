@@ -230,7 +230,7 @@ def _list_decoder(hint: Any) -> _Decoder:
             case {"arrays": description} if len(arrays) == 1:
                 return list(_decoder(arrays[0])({"array": description}, contents))
             case {"records": [name, *columns]} if name in records:
-                decoders = _column_decoders(records[name])
+                decoders = _decoders_of_fields(records[name], _list_decoder)
                 values = [decode(column, contents) for decode, column in zip(decoders, columns, strict=True)]
                 return [records[name](*each) for each in zip(*values, strict=True)]
         return [item(one, contents) for one in _sequence(value)]
@@ -239,9 +239,9 @@ def _list_decoder(hint: Any) -> _Decoder:
 
 
 @cache
-def _column_decoders(record: Any) -> list[_Decoder]:
+def _decoders_of_fields(record: Any, decoder_of: Callable[[Any], _Decoder]) -> list[_Decoder]:
     hints = get_type_hints(record)
-    return [_list_decoder(hints[field.name]) for field in fields(record)]
+    return [decoder_of(hints[field.name]) for field in fields(record)]
 
 
 def _tuple_decoder(arguments: tuple[Any, ...]) -> _Decoder:
@@ -259,16 +259,10 @@ def _dataclass_decoder(record: Any) -> _Decoder:
 
     def decode(value: Any, contents: memoryview) -> Any:
         _require(isinstance(value, list) and value[:1] == [name], value, name)
-        items = _field_decoders(record)  # made here, since a record may hold others of its class
+        items = _decoders_of_fields(record, _decoder)  # made here: a record may hold others of its class
         return record(*[item(one, contents) for item, one in zip(items, value[1:], strict=True)])
 
     return decode
-
-
-@cache
-def _field_decoders(record: Any) -> list[_Decoder]:
-    hints = get_type_hints(record)
-    return [_decoder(hints[field.name]) for field in fields(record)]
 
 
 def _decode_any(value: Any, contents: memoryview) -> Any:
