@@ -16,7 +16,6 @@ from plumbline.diagnosis.cause import Cause, quantity_words, significant
 from plumbline.diagnosis.edits import WORDS, gyroscopic_moment
 from plumbline.diagnosis.prediction import (
     SUMS,
-    TINY,
     WRENCHES,
     Answers,
     Case,
@@ -31,6 +30,7 @@ from plumbline.equations.tree import Tree
 from plumbline.model.datatypes import Array
 from plumbline.model.kinematics import JointFrame, cross, rotate_vectors, rotation_matrix
 from plumbline.model.loops import CutMechanism, cut_open
+from plumbline.truth.rounding_bound import TINY
 
 Choose = Callable[[Array], Array]  # of the rows of some bodies or joints
 MakeCause = Callable[..., Cause]  # of words and amounts

@@ -37,7 +37,7 @@ from plumbline.model.kinematics import (
 )
 from plumbline.model.loops import cut_open, determinate_projectors, loop_gaps, wrench_length
 from plumbline.truth.ground_truth import StateTruth
-from plumbline.truth.rounding_bound import RoundingBound
+from plumbline.truth.rounding_bound import TINY, RoundingBound
 from reference_impl.direct import DirectSystem
 from reference_impl.joints import constraint_rows
 from reference_impl.singular_system import SingularSystem
@@ -47,7 +47,6 @@ WRENCHES = VECTORS[2:]
 SUMS = ("kinetic_energy", "potential_energy", "angular_momentum")
 QUANTITIES = (*VECTORS, *SUMS)
 CONSTANT_FIELDS = ("kind", "body", "spring_body")
-TINY = float(np.finfo(float).tiny)
 CLOSED = 1e-9  # m, rad and their rates: a larger gap is an open loop
 MAX_BATCH_BODIES = 12_000  # of one batch
 Answers = dict[str, Array]  # by quantity (S, N, 3), (S, 3) or (S,), or with an axis of lanes before

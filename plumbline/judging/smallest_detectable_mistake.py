@@ -42,7 +42,7 @@ from plumbline.model.step_methods import JointSpaceMethod, classical_runge_kutta
 from plumbline.truth.parameter_effects import difference_effects, effects_at_states
 from plumbline.truth.parameters import STATE_KINDS, Parameter, list_parameters, perturb
 from plumbline.truth.predictability_horizon import project_to_manifold
-from plumbline.truth.rounding_bound import EPS, remembered_rounding_bound
+from plumbline.truth.rounding_bound import EPS, TINY, remembered_rounding_bound
 from plumbline.truth.step_charts import StepCharts
 from plumbline.truth.step_comparison import FormulaSteps, StepsFromSamples
 from plumbline.truth.trajectory_truth import (
@@ -68,7 +68,6 @@ RUN_SAMPLES = 33  # of a run, from which steps with a mistake are taken
 RUN_MISTAKE = 1e-6  # of a parameter's scale in them, in extended precision
 MOTION_SAMPLES = 32  # of a motion, at which the effect of a mistake is measured; or all, where it has fewer
 PROOF_SAMPLES = 17  # of the motion, at which a parameter's term is shown to vanish
-TINY = float(np.finfo(float).tiny)
 # of free bodies the coordinates of the wider bound: what it reports, the others report too
 STEP_METHOD = classical_runge_kutta("joint rotations", free_coordinates="rigid motion")
 _PLACES: dict[str, str] = {

@@ -28,7 +28,7 @@ from plumbline.judging.surface_rows import judge_surface
 from plumbline.model.datatypes import Array
 from plumbline.model.loops import MIN_SINGULAR_VALUE
 from plumbline.truth.ground_truth import StateTruth
-from plumbline.truth.rounding_bound import MAX_RELATIVE_BOUND
+from plumbline.truth.rounding_bound import MAX_RELATIVE_BOUND, TINY
 
 STATE_UNITS = {
     "acceleration": "m/s²",
@@ -44,7 +44,6 @@ VARIANT_QUANTITIES = {  # and the quantity whose truth is theirs
     f"{quantity}_by_{kind}": quantity for kind in get_args(VariantKind) for quantity in ("all", *STATE_UNITS)
 }
 SINGULAR_POSE = "singular_pose"  # quantity of the row of an initial pose that is not compared
-TINY = float(np.finfo(float).tiny)  # replaces a bound of zero, so that an error of zero has the ratio 0
 
 
 def judge_states(context: RowContext, truth: StateTruth, evaluation: Evaluation) -> JudgingResult:

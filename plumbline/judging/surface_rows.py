@@ -12,10 +12,8 @@ from plumbline.engines.missing_names import FAILED_PARTS, MISSING_NAMES
 from plumbline.judging.rows import WRONG_CALL, Row, RowContext, Verdict, with_unit
 from plumbline.model.datatypes import Array
 from plumbline.truth.ground_truth import StateTruth
-from plumbline.truth.rounding_bound import MAX_RELATIVE_BOUND
+from plumbline.truth.rounding_bound import MAX_RELATIVE_BOUND, TINY
 from plumbline.truth.surface_truth import SURFACE_QUANTITIES, SurfaceTruth
-
-TINY = float(np.finfo(float).tiny)
 
 
 def judge_surface(context: RowContext, truth: StateTruth, evaluation: Evaluation) -> list[Row]:

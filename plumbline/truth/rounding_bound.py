@@ -62,6 +62,7 @@ from plumbline.model.welding import BodyParts, part_offsets, undivided_bodies
 from plumbline.processes.worker_pool import Pickled
 
 EPS = 2.0**-53
+TINY = float(np.finfo(float).tiny)  # replaces a bound of zero, so that an error of zero has the ratio 0
 ROUNDING_FACTOR = 64  # state quantities; the worst error of a sound engine is about a sixth of it (tests)
 SUM_ROUNDING_FACTOR = 256  # energies, momenta, entries of the mass matrix
 MAX_RELATIVE_BOUND = 1e-8  # a tolerance above this fraction of its scale could hide a mistake

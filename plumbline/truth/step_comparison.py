@@ -43,6 +43,7 @@ from plumbline.truth.rounding_bound import (
     EPS,
     ROUNDING_FACTOR,
     SUM_ROUNDING_FACTOR,
+    TINY,
     RoundingBound,
     remembered_rounding_bound,
     rounding_bounds,
@@ -78,7 +79,6 @@ CONSTANT_ROUNDINGS, CONSTANT_FACTORS = 16 / STEP_ROUNDINGS, 12 / ROUNDING_FACTOR
 MEAN_ALARM = 1e-9  # how probable it is that chance alone passes the bound of a mean
 CLOCK_ROUNDINGS = 2  # of a time that is a sum of steps
 RESIDUAL_STEPS = 2  # after one, Euler does not show the axial inertia of rods
-TINY = float(np.finfo(float).tiny)
 MAX_GROWTH = 1e4  # of perturbations; beyond it the method itself is unstable, and nothing is compared
 # By the quantity of a row what it is of, and its unit; "1" are multiples of what rounding explains.
 _MOTION = {"position": "m", "attitude": "rad", "velocity": "m/s", "rate": "rad/s"}
@@ -1000,7 +1000,7 @@ def quadrature_residuals(method: ConstrainedMethod, runs: Runs, has_loops: bool)
     found = []
     for _, h, run in runs:
         for difference, bound, _ in _quadrature_differences(method, run, h, has_loops):
-            found.append((difference / np.maximum(bound, np.finfo(float).tiny)[..., None]).ravel())
+            found.append((difference / np.maximum(bound, TINY)[..., None]).ravel())
     return np.concatenate(found)
 
 
