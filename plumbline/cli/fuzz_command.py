@@ -13,14 +13,7 @@ from plumbline import layout
 from plumbline.cli import options
 from plumbline.cli.findings_output import describe_run
 from plumbline.cli.help_texts import command
-from plumbline.cli.terminal_output import (
-    command_line,
-    count_noun,
-    line_width,
-    log,
-    make_console,
-    print_json,
-)
+from plumbline.cli.terminal_output import command_line, count_noun, line_width, log, make_console, print_json
 from plumbline.execution.exit_codes import ExitCode
 from plumbline.execution.plan import Plan
 from plumbline.judging.known_issues import KNOWN_ISSUES_FILE

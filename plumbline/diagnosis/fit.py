@@ -18,15 +18,7 @@ from numpy.typing import NDArray
 
 from plumbline.diagnosis.cause import FACTORS, Cause
 from plumbline.diagnosis.edits import LENGTHS, Edit, number_edits
-from plumbline.diagnosis.prediction import (
-    Answers,
-    Case,
-    Predictor,
-    View,
-    per_entry,
-    tolerances,
-    values_of,
-)
+from plumbline.diagnosis.prediction import Answers, Case, Predictor, View, per_entry, tolerances, values_of
 from plumbline.diagnosis.readings import change_key, reading_edits
 from plumbline.diagnosis.terms import Terms, missing_gammas
 from plumbline.model.datatypes import Array, Model, StateQuantities

@@ -17,13 +17,7 @@ from numpy.typing import NDArray
 from plumbline.equations.arithmetic import floats, quantity_arrays
 from plumbline.equations.responses import EndRows, Responses
 from plumbline.equations.tree import Tree
-from plumbline.model.datatypes import (
-    Array,
-    Model,
-    State,
-    StateQuantities,
-    StepRun,
-)
+from plumbline.model.datatypes import Array, Model, State, StateQuantities, StepRun
 from plumbline.model.invariants import angular_momentum, kinetic_energy, potential_energy
 from plumbline.model.kinematics import (
     angular_velocity,

@@ -22,13 +22,7 @@ import numpy as np
 from plumbline.equations.arithmetic import floats, stacked
 from plumbline.equations.tree import Tree
 from plumbline.model.datatypes import Array, Model, State
-from plumbline.model.kinematics import (
-    cross,
-    cross_matrix,
-    rotate_vectors,
-    rotation_matrix,
-    stack_states,
-)
+from plumbline.model.kinematics import cross, cross_matrix, rotate_vectors, rotation_matrix, stack_states
 
 DEPENDENT = 3e-7  # singular values of scaled rows, relative: below it a row depends on the others
 EndRows = Literal["accelerations", "twists", "without velocity terms"]

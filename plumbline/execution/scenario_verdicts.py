@@ -30,11 +30,7 @@ from plumbline.judging.known_issues import KnownIssues
 from plumbline.judging.long_runs import judge_long_runs
 from plumbline.judging.rows import Fingerprints, JudgingResult, Level, Row, RowContext, Verdict, mark_aliases
 from plumbline.judging.state_level import SINGULAR_POSE, judge_states, singular_pose_row
-from plumbline.judging.step_level import (
-    all_steps_agree,
-    compares_every_step,
-    judge_steps,
-)
+from plumbline.judging.step_level import all_steps_agree, compares_every_step, judge_steps
 from plumbline.judging.trajectory_level import judge_trajectory
 from plumbline.measurements.long_run_study import plan_long_run, run_long_run_study
 from plumbline.measurements.order_and_limit import refinement_resolutions

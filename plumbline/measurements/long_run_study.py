@@ -18,12 +18,7 @@ from plumbline.measurements.drift_order import (
 )
 from plumbline.measurements.order_and_limit import step_unit
 from plumbline.model.datatypes import Array, Integrator, Model, State, Trajectory, Unsupported
-from plumbline.model.invariants import (
-    INVARIANT_UNITS,
-    compute_invariants,
-    invariant_scales,
-    kinetic_energy,
-)
+from plumbline.model.invariants import INVARIANT_UNITS, compute_invariants, invariant_scales, kinetic_energy
 from plumbline.model.kinematics import angular_velocity, stretched_length
 from plumbline.processes.exceptions import describe_exception
 from plumbline.truth.ground_truth import singular_note

@@ -22,13 +22,7 @@ from plumbline.importers.lumping import fixed_parts, lump_fixed_bodies
 from plumbline.importers.neutral_model import ElementaryJoint, Feature, NeutralBody, NeutralModel, Source
 from plumbline.importers.xml_tree import ModelFileError, parse_numbers
 from plumbline.model.datatypes import BALL, FREE, KINDS, Array, Float, Kind, Model, State
-from plumbline.model.kinematics import (
-    mass_matrix,
-    own_rates,
-    quaternion_of,
-    rate_count,
-    rotation_matrix,
-)
+from plumbline.model.kinematics import mass_matrix, own_rates, quaternion_of, rate_count, rotation_matrix
 from plumbline.model.sampling import derive_seed
 from plumbline.model_files.prepared_file import MJCF_READER, BaseChoice, PreparedFile, prepare_file
 from plumbline.processes.isolation import ScratchFolder

@@ -26,12 +26,7 @@ from plumbline.importers.neutral_model import (
 from plumbline.judging.rows import Row, RowContext, Verdict
 from plumbline.model.datatypes import Array
 from plumbline.model_files.certified_model import CertifiedModelQuantities
-from plumbline.model_files.importer_cause import (
-    Cause,
-    Explanation,
-    damping_cause,
-    explain_importer,
-)
+from plumbline.model_files.importer_cause import Cause, Explanation, damping_cause, explain_importer
 from plumbline.model_files.model_comparison import (
     TINY,
     Mismatch,

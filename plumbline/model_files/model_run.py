@@ -9,11 +9,7 @@ from typing import Any, NamedTuple
 
 from plumbline.engines.adapter import EngineInfo
 from plumbline.engines.environments import declared_importer_attribute, split_version
-from plumbline.engines.importer_calls import (
-    evaluate_model_file,
-    read_model_file,
-    read_model_files,
-)
+from plumbline.engines.importer_calls import evaluate_model_file, read_model_file, read_model_files
 from plumbline.engines.registry import IMPORTERS
 from plumbline.execution.exit_codes import ExitCode
 from plumbline.execution.runner import describe_engines, exit_code_of_rows

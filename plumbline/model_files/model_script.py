@@ -22,11 +22,7 @@ from plumbline.importers.neutral_model import CanonicalState, NeutralModel, with
 from plumbline.importers.xml_tree import Element, write_xml
 from plumbline.judging.rows import Verdict
 from plumbline.model_files.importer_cause import Explanation
-from plumbline.model_files.model_comparison import (
-    certify_states,
-    joint_permutation,
-    mismatches_as_read,
-)
+from plumbline.model_files.model_comparison import certify_states, joint_permutation, mismatches_as_read
 from plumbline.model_files.model_rows import FileResult
 from plumbline.model_files.model_run import FileRun, ModelPlan, describe_importers, run_files
 from plumbline.model_files.prepared_file import BaseChoice

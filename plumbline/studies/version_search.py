@@ -14,11 +14,7 @@ from typing import Any
 from packaging.specifiers import SpecifierSet
 from packaging.version import Version
 
-from plumbline.engines.environments import (
-    declared_attribute,
-    declared_importer_attribute,
-    published_versions,
-)
+from plumbline.engines.environments import declared_attribute, declared_importer_attribute, published_versions
 from plumbline.execution.plan import Plan
 from plumbline.execution.runner import run_plan
 from plumbline.judging.rows import Row, Verdict

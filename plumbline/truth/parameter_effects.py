@@ -37,14 +37,7 @@ from plumbline.model.kinematics import (
     stack_states,
 )
 from plumbline.model.loops import determinate_wrenches
-from plumbline.truth.parameters import (
-    FRAME_KINDS,
-    STATE_KINDS,
-    Parameter,
-    derivative,
-    perturb,
-    perturb_model,
-)
+from plumbline.truth.parameters import FRAME_KINDS, STATE_KINDS, Parameter, derivative, perturb, perturb_model
 from reference_impl.direct import DirectSystem
 from reference_impl.elements import ElementForces
 from reference_impl.mechanism import side_by_side
