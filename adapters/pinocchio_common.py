@@ -76,6 +76,35 @@ def composite(*joints: Any) -> pin.JointModelComposite:
     return joint
 
 
+def parts_of(joint: Any) -> list[Any]:
+    """Return the joints of a composite one; of another one itself."""
+    own = joint.extract() if hasattr(joint, "extract") else joint
+    return list(getattr(own, "joints", (joint,)))
+
+
+def with_single_joints(pin_model: pin.Model) -> tuple[pin.Model, list[int]]:
+    """Rebuild a model with the parts of composite joints in turn, and nothing between them.
+
+    Returns:
+        The model, with the same q, v and numbers of frames, and by joint the number of its last part.
+
+    """
+    other, last = pin.Model(), [0]
+    other.gravity = pin_model.gravity
+    for j in range(1, pin_model.njoints):
+        number, place, name = last[pin_model.parents[j]], pin_model.jointPlacements[j], pin_model.names[j]
+        for i, part in enumerate(parts_of(pin_model.joints[j])):
+            number = other.addJoint(number, part, place, f"{name}, part {i}")
+            place = pin.SE3.Identity()
+        other.appendBodyToJoint(number, pin_model.inertias[j], pin.SE3.Identity())
+        last.append(number)
+    for frame in list(pin_model.frames)[1:]:
+        other.addFrame(pin.Frame(frame.name, last[joint_of(frame)], 0, frame.placement, frame.type))
+    if hasattr(other, "armature"):
+        other.armature = pin_model.armature
+    return other, last
+
+
 def add_frame(pin_model: pin.Model, name: str, joint: int, point: Float[Array, "3"]) -> int:
     """Add an operational frame with the axes of a joint.
 

@@ -59,10 +59,11 @@ from adapters.pinocchio_common import (
     point_acceleration,
     set_corrector,
     translation,
+    with_single_joints,
 )
-from adapters.pinocchio_loops import Loops, closed_accelerations
+from adapters.pinocchio_loops import Loops, closed_accelerations, welded
 from adapters.pinocchio_probes import Probed, add_probe_frames
-from adapters.pinocchio_surface import add_surface, pose_function
+from adapters.pinocchio_surface import add_composites, add_surface, pose_function
 from adapters.pinocchio_variants import VARIANTS, Change, Spelling
 from adapters.pose_functions import add_pose_answers
 from plumbline.engines.integrators import dop853, rkmk4, sample_steps, semi_implicit_euler
@@ -103,7 +104,7 @@ RIGID: Any = {"free_coordinates": "rigid motion", "gap_correction": STABILISATIO
 # Of constraintDynamics: accuracy, damping (any from 1e-12 to 1e-3 does), largest number of steps.
 PROXIMAL_SETTINGS = 1e-15, 1e-8, 50
 MAX_DENSE_JOINTS = 10  # joints up to which their 3 × 3 blocks are solved faster as one matrix
-CLOSED_STATES = 2  # at which loops are closed in all ways
+EARLY_STATES = 2  # at which loops are closed in all ways, and composite joints asked
 FIXED_STEPS = {"semi-implicit-euler": semi_implicit_euler, "rkmk4": rkmk4}
 
 
@@ -168,13 +169,8 @@ class PinocchioChain:
         self.has_constraints = bool(ends) or self.algorithm == "constraintDynamics"
         self.welds, self.weld_data = list[Any](), list[Any]()
         if self.has_constraints:
-            self.welds, self.weld_data = pin.StdVec_RigidConstraintModel(), pin.StdVec_RigidConstraintData()
-        for ends_of_loop in ends:
-            places = [(self.body_joints[k], self.placements[k]) for k in ends_of_loop]
-            kind, frame = pin.ContactType.CONTACT_6D, pin.ReferenceFrame.LOCAL
-            self.welds.append(pin.RigidConstraintModel(kind, self.pin_model, *places[0], *places[1], frame))
-            self.weld_data.append(self.welds[-1].createData())
-        if self.has_constraints:
+            places = [(self.body_joints[k], self.placements[k]) for k in range(model.n)]
+            self.welds, self.weld_data = welded(self.pin_model, ((places[a], places[b]) for a, b in ends))
             init_constraint_dynamics(self.pin_model, self.data, self.welds, self.weld_data)
         self._init_loads()
 
@@ -720,9 +716,9 @@ def _joint_turns(model: Model, k: int, x: Array) -> Array:
     return turn
 
 
-def _add_closed(s: Probed, chain: PinocchioChain) -> None:
+def _add_closed(s: Probed, loops: Loops) -> None:
     """Add accelerations by all ways to close loops."""
-    for by_derivative, call, a in closed_accelerations(chain.loops(s.q, s.v), s.q, s.v):
+    for by_derivative, call, a in closed_accelerations(loops, s.q, s.v):
         s.add_accelerations(call, a, "by_derivative" if by_derivative else "by_constraint_solver")
 
 
@@ -809,14 +805,25 @@ class Pinocchio(PinocchioAdapter):
             place.act(pin.Inertia(mass, np.zeros(3), inertia))
             for place, mass, inertia in zip(placements, model.mass, model.inertia, strict=True)
         ]
+        single, numbers = with_single_joints(chain.pin_model)
+        is_single = single.njoints == chain.pin_model.njoints
         found = list[dict[str, dict[Call, Array]]]()
         for state in states:
             q, v = chain.coordinates(cut.state(state))
             motion = q, v, chain.acceleration(q, v)
-            s = Probed(chain.pin_model, frames, motion, None if cut.ends else chain.rate_map(state))
-            add_surface(s, inertias)
-            if cut.ends and len(found) < CLOSED_STATES:
-                add_parts(s.found, partial(_add_closed, s, chain))
+            rates, is_early = None if cut.ends else chain.rate_map(state), len(found) < EARLY_STATES
+            loops = chain.loops(q, v) if cut.ends and is_early else None
+
+            def ask(m: pin.Model, loops: Loops | None) -> Probed:
+                s = Probed(m, frames, motion, rates)  # noqa: B023
+                add_surface(s, inertias)
+                if loops:
+                    add_parts(s.found, partial(_add_closed, s, loops))
+                return s
+
+            s = ask(single, loops.on(single, numbers) if loops else None)
+            if is_early and not is_single:
+                add_composites(s, ask(chain.pin_model, loops))
             found.append(s.found)
         add_pose_answers(found, states, "pinocchio", pose_function)
         return found

@@ -9,7 +9,7 @@ the right side −γ + μ λ in turn leads to the solution for μ = 0, also wher
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import starmap
 from typing import Any, NamedTuple
 
@@ -30,6 +30,16 @@ def _fine() -> Any:
     return pin.ProximalSettings(1e-15, 1e-14, 50)
 
 
+def welded(m: pin.Model, pairs: Iterable[tuple[tuple[int, pin.SE3], tuple[int, pin.SE3]]]) -> tuple[Any, Any]:
+    """Return constraints that hold pairs of places together, each given by joint and place in its frame."""
+    welds, data = pin.StdVec_RigidConstraintModel(), pin.StdVec_RigidConstraintData()
+    kind, frame = pin.ContactType.CONTACT_6D, pin.ReferenceFrame.LOCAL
+    for near, far in pairs:
+        welds.append(pin.RigidConstraintModel(kind, m, *near, *far, frame))
+        data.append(welds[-1].createData())
+    return welds, data
+
+
 class Loops(NamedTuple):
     """A tree with the constraints that close its loops, and what moves it."""
 
@@ -37,6 +47,11 @@ class Loops(NamedTuple):
     welds: Any
     data: Any  # of the welds
     push: Float[Array, "nv"]  # τ with loads
+
+    def on(self, m: pin.Model, numbers: Sequence[int]) -> Loops:
+        """Return the same on another model with the same velocities, in which joints have these numbers."""
+        ends = ([(numbers[j], place) for j, place in _ends(weld)] for weld in self.welds)
+        return Loops(m, *welded(m, ((near, far) for near, far in ends)), self.push)
 
 
 class _Rows:

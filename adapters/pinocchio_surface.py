@@ -23,7 +23,7 @@ import pinocchio as pin
 from adapters.pinocchio_common import armature, joint_of
 from adapters.pinocchio_probes import Probed
 from adapters.pinocchio_relations import mimics, relations
-from plumbline.engines.missing_names import add_parts
+from plumbline.engines.missing_names import FAILED_PARTS, MISSING_NAMES, add_parts
 from plumbline.model.datatypes import Array, Call
 from plumbline.model.kinematics import cross
 
@@ -45,6 +45,9 @@ FRAMES = {
 }
 OF_MOTIONS = ("exp6", "Jexp6")  # take a pin.Motion
 ANGULAR = {"velocity": "velocity", "acceleration": "acceleration", SPATIAL: "acceleration"}
+# Ways that take the rates of the joints' axes, and what is compared of them where joints are composite.
+BY_RATES = ("jacobian_rate", "map_rate", "coriolis_matrix", "derivative", "inverse")
+OF_COMPOSITES = ("frame_acceleration", "momentum_rate", "inverse_dynamics")
 BY_RATE, BY_DERIVATIVE = "_by_jacobian_rate", "_by_derivative"
 Reading = tuple[str, str, str, Any]  # functions, what they return, by what, and the spatial vector
 Reader = Callable[[Probed, str, str, int, pin.Data, pin.Data], Iterator[Reading]]
@@ -67,6 +70,17 @@ def add_surface(s: Probed, bodies: Sequence[pin.Inertia]) -> None:
     parts += [partial(_add_regressors, bodies=bodies)]
     parts += [] if s.rates is None else [_add_torques, _add_batch, *mimics(s)]
     add_parts(s.found, *(partial(part, s) for part in parts))
+
+
+def add_composites(s: Probed, whole: Probed) -> None:
+    """Add what a model with composite joints reports; apart what takes their axes' rates, which it lacks."""
+    for quantity, calls in whole.found.items():
+        base, _, by = quantity.partition("_by_")
+        if by in BY_RATES and base not in OF_COMPOSITES:
+            continue
+        quantity = f"{base}_of_composite_joints" if by in BY_RATES else quantity
+        names = () if quantity in (FAILED_PARTS, MISSING_NAMES) else ("JointModelComposite",)
+        s.found[quantity] |= {(*call, *names): value for call, value in calls.items()}
 
 
 def pose_function(name: str, given: Sequence[Any], _: Sequence[str]) -> list[Any]:
@@ -428,7 +442,7 @@ def _add_energies(s: Probed, parameters: Array, g: Array, none: pin.StdVec_Force
         ("gravity_energy", ("computePotentialEnergyRegressor", "Data.potentialEnergyRegressor"), gravity),
         ("mechanical_energy", ("computeMechanicalEnergy", "Data.mechanical_energy"), both),
         *(
-            ("gravity_energy_second_rate", call, v @ s.square(matrix) @ v + g @ a)
+            ("gravity_energy_second_rate_by_derivative", call, v @ s.square(matrix) @ v + g @ a)
             for call, matrix in (
                 (("computeGeneralizedGravityDerivatives",), by_gravity),
                 (("computeStaticTorqueDerivatives",), by_torque),

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from adapters.pinocchio_common import composite, joint_of
+from adapters.pinocchio_common import composite, joint_of, parts_of
 from plumbline.engines.variants import Variant, has, variants_of
 from plumbline.model.datatypes import Array, Float, Model
 
@@ -67,15 +67,9 @@ def _of_axes(kinds: str, spelling: Spelling) -> dict[str, Spelling]:
     return {f"JointModel{kind}{axis}": spelling for kind in kinds for axis in "XYZ"}
 
 
-def _parts(joint: Any) -> list[Any]:
-    """The joints of a composite one."""
-    own = joint.extract() if hasattr(joint, "extract") else joint
-    return list(own.joints)
-
-
 def _universal(joint: Any) -> Any:
     """The engine's own joint in place of a composite one of two turns."""
-    parts = _parts(joint)
+    parts = parts_of(joint)
     is_meant = all(part.shortname().startswith("JointModelR") for part in parts)
     return pin.JointModelUniversal(*map(_axis, parts)) if is_meant else joint
 
@@ -93,7 +87,7 @@ def _made(*kinds: str) -> Callable[[Any], Any]:
 
 def _planar(joint: Any) -> Any:
     """The engine's own joint in place of a composite one of two slides and a turn."""
-    return pin.JointModelPlanar() if len(_parts(joint)) == len(ANGLES) else joint
+    return pin.JointModelPlanar() if len(parts_of(joint)) == len(ANGLES) else joint
 
 
 def _planar_coordinates(q: Array) -> Array:

@@ -380,7 +380,7 @@ _FORMULAS: Mapping[str, tuple[str, Callable[[Motion], Rounded]]] = {
     "subtree_mass": ("kg", _subtree_mass),
     "kinetic_energy": ("J", _kinetic_energy),
     "gravity_energy": ("J", lambda m: _gravity_energy(m, m.r)),
-    "gravity_energy_second_rate": ("W/s", lambda m: _gravity_energy(m, m.through_origin().a)),
+    "gravity_energy_second_rate": ("W/s", lambda m: _gravity_energy(m, m.a)),
     "mechanical_energy": ("J", lambda m: _kinetic_energy(m).plus(_gravity_energy(m, m.r))),
     "body_force_local": ("N", lambda m: m.local(_force_of_probe(m))),
     "body_moment_local": ("N m", lambda m: m.local(_body_moment(m))),
@@ -404,19 +404,21 @@ _BY_ALGORITHM = {
         "frame_spatial_acceleration", "frame_spatial_acceleration_local",
         "frame_spatial_acceleration_at_origin", "frame_angular_acceleration",
         "frame_angular_acceleration_local", "centre_of_mass_acceleration", "momentum_rate",
-        "centroidal_angular_momentum_rate", "inverse_dynamics",
+        "centroidal_angular_momentum_rate", "inverse_dynamics", "gravity_energy_second_rate",
     ),
     "by_tangent_operator": ("body_velocity", "frame_angular_velocity"),
     "from_start": ("frame_angular_velocity",),
     "by_map_rate": ("momentum_rate", "centroidal_angular_momentum_rate"),
     "by_coriolis_matrix": ("inverse_dynamics",),
+    "of_composite_joints": ("frame_acceleration", "momentum_rate", "inverse_dynamics"),
     "by_constraint_solver": ("frame_acceleration", "frame_angular_acceleration"),
     "by_inverse": ("frame_acceleration", "frame_angular_acceleration"),
     "by_aba": (
         "inverse_dynamics", "momentum_through_inverse", "frame_acceleration", "frame_angular_acceleration",
     ),
 }  # fmt: skip
-_THROUGH_ORIGIN = ("by_derivative", "by_map_rate", "by_coriolis_matrix")  # but for those of frames
+# but for those of frames
+_THROUGH_ORIGIN = ("by_derivative", "by_map_rate", "by_coriolis_matrix", "of_composite_joints")
 
 
 def _by_algorithm(name: str, by: str) -> tuple[str, Callable[[Motion], Rounded]]:
