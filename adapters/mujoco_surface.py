@@ -18,6 +18,7 @@ import numpy as np
 
 from adapters.mujoco_arrays import ARRAYS
 from adapters.mujoco_common import (
+    DOFS,
     add_actuator,
     add_sensor,
     data_like,
@@ -94,12 +95,15 @@ JACOBIANS = {
     "mj_jacSubtreeCom": ("subtree_velocity",),
     "mj_angmomMat": ("subtree_angular_momentum",),
 }
+MAX_AWAKE = 12  # steps after which what may sleep does
 INVERSE_STAGES = ("mj_invPosition", "mj_invVelocity", "mj_invConstraint")
 STILL_SENSORS = {"FRAMELINACC": False, "ACCELEROMETER": True}  # by name whether in own axes
-# By range of forces the names that only a step with it uses.
+# By what makes forces of dampers zero the names that only a step with it uses.
 CLAMPED = {
     "actuator_forcerange": ("mjtBias.mjBIAS_AFFINE", "mjtTrn.mjTRN_TENDON"),
     "tendon_actfrcrange": ("mjtBias.mjBIAS_AFFINE", "mjtObj.mjOBJ_TENDON"),
+    "jnt_actfrcrange": ("mjtBias.mjBIAS_AFFINE", "mjtTrn.mjTRN_JOINT"),
+    "actuator_actearly": ("mjtGain.mjGAIN_AFFINE", "mjtDyn.mjDYN_INTEGRATOR"),
 }
 SENSOR_STAGES = ("mj_sensorPos", "mj_sensorVel", "mj_sensorAcc")
 SIZES = {"p": 4, "R": 9, "r": 3, "phi": 3, "w": 3, "pdot": 4, "2pdot": 4}
@@ -145,6 +149,8 @@ def add_probes(spec: Any, links: Sequence[Any], model: Model) -> None:
     for joint in named_joints(spec):
         for name in own.get(joint.type, JOINT_SENSORS):
             add_sensor(spec, name, "JOINT", joint.name)
+        if DOFS[joint.type] == 1:
+            add_actuator(spec, f"on {joint.name}", "JOINT", joint.name, np.eye(6)[0])
     _add_relative_probes(spec, links, model)
 
 
@@ -172,7 +178,7 @@ def _add_relative_probes(spec: Any, links: Sequence[Any], model: Model) -> None:
         tendon = set_attributes(spec.add_tendon(), name=probe, limited=limited, range=[0.0, far])
         for end in (ANCHOR, probe, "", probe, ANCHOR):
             _ = tendon.wrap_site(end) if end else tendon.wrap_pulley(2.0)
-        add_actuator(spec, probe, "TENDON", probe, 2.0 * np.eye(6)[0])
+        add_actuator(spec, probe, "TENDON", probe, 2.0 * np.eye(6)[0], dyntype=mujoco.mjtDyn.mjDYN_INTEGRATOR)
         for i, gear in enumerate(np.eye(6)[:3]):
             add_actuator(spec, f"{probe} {i}", "SITE", probe, gear, refsite=ANCHOR)
         slide = {"slidersite": ANCHOR, "cranklength": 1.0}
@@ -186,7 +192,7 @@ def _add_relative_probes(spec: Any, links: Sequence[Any], model: Model) -> None:
 def add_surface(s: Probed) -> None:
     """Read all after the forward dynamics at one state."""
     parts = (_add_sensors, _add_energies, _add_frames, _add_momenta, _add_relative, _add_still, _add_cranks,
-             _add_tendon_limits, *ARRAYS, _add_torques)  # fmt: skip
+             _add_tendon_limits, _add_asleep, *ARRAYS, _add_torques)  # fmt: skip
     add_parts(s.found, *(partial(part, s) for part in parts))
 
 
@@ -321,6 +327,19 @@ def _add_tendon_limits(s: Probed) -> None:
     s.add("frame_distance_rate", ("MjData.efc_vel", limit), rate / 1.5)
     s.add("frame_distance", ("mjtSensor.mjSENS_TENDONLIMITPOS", limit), (place + far) / 1.5)
     s.add("frame_distance_rate", ("mjtSensor.mjSENS_TENDONLIMITVEL", limit), speed / 1.5)
+
+
+def _add_asleep(s: Probed) -> None:
+    """Let all fall asleep where it is, since it is slow enough, and add the energy of its position."""
+    own = copy(s.m)
+    own.tree_sleep_policy[:] = member("mjtSleepPolicy.mjSLEEP_ALLOWED")
+    own.opt.enableflags |= int(member("mjtEnableBit.mjENBL_SLEEP"))
+    own.opt.sleep_tolerance, own.opt.timestep = 1e9, 1e-30
+    other = data_like(own, s.d)
+    for _ in range(MAX_AWAKE):
+        mujoco.mj_step(own, other)
+    call = "mj_energyPos", "mjtSleepPolicy"
+    s.add("gravity_energy", call, other.energy[0] - s.elastic)
 
 
 def _add_jacobians(s: Probed) -> None:
@@ -502,15 +521,26 @@ def _add_force_of_step(s: Probed, call: Call, end: Any, D: Array, h: float) -> N
 
 
 def _add_clamped_step(s: Probed, usual: Any, limit: str, call: Call, D: Array) -> None:
-    """Take an implicit step with dampers on the tendons whose force a limit makes zero."""
-    own, a = copy(usual), s.ids("actuator")
+    """Take an implicit step with dampers on tendons or joints whose force is zero.
+
+    By a limit, or by activations that are zero at the end of the step, from where the force comes early.
+    """
+    own, transmission = copy(usual), "JOINT" if limit.startswith("jnt") else "TENDON"
+    a = np.flatnonzero(own.actuator_trntype == member(f"mjtTrn.mjTRN_{transmission}"))
+    if not len(a):
+        return
     own.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
     own.actuator_gainprm[:] = own.actuator_biasprm[:] = 0.0  # of all others
-    own.actuator_biastype[a], own.actuator_biasprm[a, 2] = mujoco.mjtBias.mjBIAS_AFFINE, -7.0
-    of = s.ids("tendon") if limit.startswith("tendon") else a
-    getattr(own, limit)[of] = 0.0
-    getattr(own, limit.replace("range", "limited"))[of] = True
+    if limit.endswith("early"):
+        own.actuator_gaintype[a], own.actuator_gainprm[a, 2] = mujoco.mjtGain.mjGAIN_AFFINE, -7.0
+        own.actuator_actearly[a] = True
+    else:
+        own.actuator_biastype[a], own.actuator_biasprm[a, 2] = mujoco.mjtBias.mjBIAS_AFFINE, -7.0
+        of = a if limit.startswith("actuator") else own.actuator_trnid[a, 0]
+        getattr(own, limit)[of] = 0.0
+        getattr(own, limit.replace("range", "limited"))[of] = True
     other = data_like(own, s.d, "qfrc_applied", "xfrc_applied")
+    other.act[:], other.ctrl[:] = 1.0, -1.0 / own.opt.timestep
     mujoco.mj_forward(own, other)
     mujoco.mj_implicit(own, other)
     _add_force_of_step(s, (*call, *CLAMPED[limit]), other, D, own.opt.timestep)

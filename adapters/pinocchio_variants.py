@@ -119,13 +119,21 @@ def _moves(*motions: str) -> Callable[[Model], bool]:
     )
 
 
+def _unlimited(model: pin.Model) -> pin.Model:
+    """Give infinite limits of positions."""
+    other = model.copy()
+    for name, limit in (("lowerPositionLimit", -np.inf), ("upperPositionLimit", np.inf)):
+        setattr(other, name, np.full(model.nq, limit))
+    return other
+
+
 def _saved(form: str, end: str) -> Callable[[pin.Model], pin.Model]:
     """Write a model and read it again."""
 
     def remake(model: pin.Model) -> pin.Model:
         other = pin.Model()
         if form == "String":
-            other.loadFromString(model.saveToString())
+            other.loadFromString(_unlimited(model).saveToString())
             return other
         with tempfile.TemporaryDirectory() as folder:
             given = (str(Path(folder) / f"model{end}"), *(["model"] if form == "XML" else []))
@@ -239,7 +247,7 @@ VARIANTS = (
     _option("constraintDynamics initConstraintDynamics", algorithm="constraintDynamics"),
     _option("aba Convention.LOCAL", _is_short, algorithm="aba"),
     _option("Model.copy", remake=lambda model: model.copy()),
-    _option("Model", remake=lambda model: pickle.loads(pickle.dumps(model))),
+    _option("Model", remake=lambda model: pickle.loads(pickle.dumps(_unlimited(model)))),
     *(
         _option(f"Model.saveTo{form} Model.loadFrom{form}", remake=_saved(form, end))
         for form, end in (("XML", ".xml"), ("Text", ".txt"), ("String", ""), ("Binary", ".bin"))

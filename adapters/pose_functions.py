@@ -11,7 +11,8 @@ the body, which has no letter, and
 
     R p xyzw phi xyz rpy zyz skew   attitude: matrix, quaternion with the scalar first and last, rotation
                             vector, angles of Rx Ry Rz, Rz Ry Rx and Rz Ry Rz, matrix of the rotation vector;
-                            x y z are the three of xyz, axis and angle the parts of phi
+                            x y z are the three of xyz, axis and angle the parts of phi;
+                            phi+ is phi and a whole turn more, and R+ p+ xyzw+ what is returned of it
     r S                     position, and its matrix of a cross product
     rp rxyzw rphi rxyz      position and attitude; shift: what takes rphi of M to that of Q, and
                             dr what takes r of L to that of the body
@@ -35,6 +36,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache, cached_property, partial
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -130,6 +132,7 @@ class Pose:
         named |= {"r" + form: np.append(self.r, named[form]) for form in ("p", "xyzw", "phi", "xyz")}
         named |= {"r": self.r, "rpy": -xyz_angles(self.R.T), "H": H, "X": X, "XI": XI, "G": G, "xi": xi}
         named |= {"S": cross_matrix(self.r), "axis": phi / angle if angle else np.eye(3)[2], "angle": angle}
+        named["phi+"] = (angle + 2 * np.pi) * named["axis"]
         return named | dict(zip(("x", "y", "z", "rx", "ry", "rz"), map(float, [*xyz, *self.r]), strict=True))
 
 
@@ -201,9 +204,11 @@ class _Body:
             spin = self.spin + turned - self.bends[form.removesuffix("w")]
             return {"frame_angular_velocity": self.Q.R @ spin}
         pose, _, form = form.rpartition(".")
+        axes = "frame_axes_by_whole_turns" if form.endswith("+") else "frame_axes"
+        form = form.removesuffix("+")
         found, above = {}, self.pose * self.poses[pose].inverse() if pose else None
         if (turn := self._attitude(form, value)) is not None:
-            found["frame_axes"] = ((above.R @ turn if above else turn) @ PROBE_TURN).T
+            found[axes] = ((above.R @ turn if above else turn) @ PROBE_TURN).T
         if (place := self._place(form, value)) is not None:
             found["body_position"] = above.r + above.R @ place if above else place
         return found
@@ -316,11 +321,13 @@ def _add_pose_answer(
 ) -> None:
     """Call a function, whose name and forms are given, on all bodies."""
     rows: dict[str, list[Array]] = {}
-    name, text = function
-    given, _, returned = text.partition(" -> ")
-    for body in bodies():
+    name, texts = function
+    for body, text in product(bodies(), texts.split("; ")):
+        given, _, returned = text.partition(" -> ")
         forms = returned.split()
-        results = call(name, [body.given(one) for one in given.split()], forms)
+        results = call(
+            name, [body.given(one) for one in given.split()], [form.removesuffix("+") for form in forms]
+        )
         if forms[0].startswith("@"):
             rate = body.given(forms.pop(0)[1:])
             results = [np.reshape(results[0], (-1, len(rate))) @ rate]

@@ -407,6 +407,7 @@ _BY_ALGORITHM = {
         "centroidal_angular_momentum_rate", "inverse_dynamics", "gravity_energy_second_rate",
     ),
     "by_tangent_operator": ("body_velocity", "frame_angular_velocity"),
+    "by_whole_turns": ("frame_axes",),
     "from_start": ("frame_angular_velocity",),
     "by_map_rate": ("momentum_rate", "centroidal_angular_momentum_rate"),
     "by_coriolis_matrix": ("inverse_dynamics",),

@@ -185,7 +185,10 @@ def test_the_supported_versions_work_beside_the_installed_ones(tmp_path):
         "pinocchio@3.3.1": {
             ("surface", "appendModel, FrameType.BODY"),
             ("surface", "buildReducedModel, Model.addJointFrame"),
+            ("surface", "Model"),
         },
+        "pinocchio@3.9.0": {("surface", "Model")},  # stored with infinite limits
+        "pinocchio@4.0.0": {("surface", "Model")},
         "exudyn@1.9.0": sparse | no_rates,
         "exudyn@1.10.0": sparse | no_rates | turned,
         "exudyn@1.11.0": no_rates,
@@ -203,6 +206,10 @@ MENDED = [
     ("sprung-universal", "mujoco@3.4.0", "inverse_dynamics", "mjtBias.mjBIAS_AFFINE, mjtTrn.mjTRN_TENDON"),
     ("sprung-universal", "mujoco@3.17.0", "inverse_dynamics", "mjtBias.mjBIAS_AFFINE, mjtObj.mjOBJ_TENDON"),
     ("sprung-universal", "mujoco@3.17.0", "frame_acceleration", "mjtSensor.mjSENS_ACCELEROMETER"),
+    ("sprung-hinge", "mujoco@3.4.0", "inverse_dynamics", "mjtGain.mjGAIN_AFFINE, mjtDyn.mjDYN_INTEGRATOR"),
+    ("sprung-hinge", "mujoco@3.17.0", "inverse_dynamics", "mjtBias.mjBIAS_AFFINE, mjtTrn.mjTRN_JOINT"),
+    ("sprung-hinge", "mujoco@3.17.0", "gravity_energy", "mj_energyPos, mjtSleepPolicy"),
+    ("tumbling-ball", "pinocchio@4.0.0", "all_by_option", "by Model: RuntimeError"),
     ("tumbling-ball", "pinocchio@2.7.0", "frame_acceleration_by_jacobian_rate", "getFrameJacobian"),
     ("tumbling-ball", "pinocchio@2.7.0", "mass_matrix_by_spelling", "appendModel, FrameType.BODY"),
     ("helical-screw", "pinocchio@3.7.0", "acceleration_by_option", "buildReducedModel"),
