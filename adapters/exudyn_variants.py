@@ -246,7 +246,7 @@ class Change:
     are_meant: Callable[[JointKind], bool] = lambda _: True  # the joints that ``joints`` adds
     assemble: Callable[[Any], None] = lambda mbs: mbs.Assemble()
     ways: Ways = field(default_factory=dict)  # of loads and spring-dampers
-    solver: Callable[[], Any] = exudyn.MainSolverImplicitSecondOrder
+    solver: Callable[[], Any] = lambda: exudyn.MainSolverImplicitSecondOrder()  # looked up when it is called
     initialize: Callable[[Any, Any, Any], bool] = lambda solver, *rest: bool(solver.InitializeSolver(*rest))
     mass_matrix: Callable[[Any, Array], Array] = lambda _, M: M  # of the chain, and the solver's
     jacobian: Callable[[Any, Array], Array] = lambda _, C: C
