@@ -34,6 +34,7 @@ from plumbline.model.datatypes import (
     Model,
     State,
     StateQuantities,
+    StepRun,
     Trajectory,
 )
 from plumbline.model.kinematics import (
@@ -82,22 +83,41 @@ def plant(defect: Defect) -> Adapter:
     real = type(load_adapter(defect.engine))
 
     class Planted(real):  # type: ignore[misc, valid-type]
+        is_stepping = False  # what steps simulate is altered once, by `_step`
+
         def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
             given = [defect.inputs(model, s) if defect.inputs else (model, s) for s in states]
             reported = [super(Planted, self)._evaluate(m, [s])[0] for m, s in given]
             return defect.answers(model, list(states), reported) if defect.answers else reported
 
-        def _simulate(
-            self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
-        ) -> Trajectory:
-            if defect.inputs:
-                model, state = defect.inputs(model, state)
+        def _simulate(self, *given: Any) -> Trajectory:
             real_run = super()._simulate
-            if defect.run:
-                return defect.run(real_run, model, state, times, integrator, resolution)
-            return real_run(model, state, times, integrator, resolution)
+            return real_run(*given) if self.is_stepping else altered_run(defect, real_run, *given)
+
+        def _step(self, *given: Any) -> StepRun:
+            found = list[StepRun]()
+
+            def real_run(*given: Any) -> Trajectory:
+                found.append(super(Planted, self)._step(*given))
+                return found[-1].trajectory
+
+            self.is_stepping = True
+            try:
+                trajectory = altered_run(defect, real_run, *given)
+            finally:
+                self.is_stepping = False
+            return replace(found[-1], trajectory=trajectory) if found else StepRun(trajectory)
 
     return Planted()
+
+
+def altered_run(
+    defect: Defect, run: Callable[..., Trajectory], model: Model, state: State, *given: Any
+) -> Trajectory:
+    """A run, or steps, with the defect's inputs and changes."""
+    if defect.inputs:
+        model, state = defect.inputs(model, state)
+    return defect.run(run, model, state, *given) if defect.run else run(model, state, *given)
 
 
 @contextmanager
