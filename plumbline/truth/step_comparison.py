@@ -34,6 +34,8 @@ from plumbline.model.kinematics import (
     angular_velocity,
     bodies_beyond,
     complete_state,
+    rotate_vectors,
+    rotation_matrix,
     stack_states,
     stretched_length,
 )
@@ -453,6 +455,27 @@ def _sample_bound(method: JointSpaceMethod, model: Model, sizes: dict[str, Array
     return {name: np.maximum(x, TINY) for name, x in bound.items()}
 
 
+def _rod_spins(model: Model, charts: StepCharts, v: Array, states: State) -> Array:
+    """(S, N) rates [rad/s] of rods about themselves, which move no body; 0 of other joints.
+
+    They start from 0 and stay there, but for rounding, where a step resolves the motion.
+
+    Args:
+        v: (S, nv) in the charts.
+
+    """
+    found = np.zeros(states.r.shape[:-1])
+    for k, place in enumerate(charts.place):
+        chart, far = charts.of_rod.get(place), model.body[k, 0]
+        if chart is None or not charts.charts[chart].is_group:  # of angles none is the rod's about itself
+            continue
+        found[:, k] = v[:, charts.own[chart].stop - 1]
+        if far >= 0:  # about the same axis, with which the body before turns already
+            carried = rotate_vectors(rotation_matrix(states.p[:, far]), states.omega[:, far])
+            found[:, k] += np.sum(carried * states.u[:, k], axis=-1)
+    return np.abs(found)
+
+
 def _formula_errors(model: Model, states: Sequence[State]) -> Array:
     """(S, 2, N) errors of r̈ and ω̇′ by the formula itself, in extended precision.
 
@@ -590,6 +613,7 @@ class StepsFromSamples:
         self.bounds = acceleration_bounds(method, model, self.states)
         self.states_r, self.middle_cosine = rounded.r, charts.middle_cosine(q)
         sizes = _sizes(rounded, self.bounds) | charts.coordinate_sizes(coordinates)
+        sizes["rate"] = np.maximum(sizes["rate"], _rod_spins(model, charts, v, rounded))
         # Angles whose axes meet at the cosine c have rates of W/c and accelerations of (α + W²/c²)/c; their
         # torques, too, are converted by a matrix of norm 1/c.
         converted = 1 / np.maximum(self.middle_cosine, TINY)[:, None]

@@ -14,10 +14,13 @@ from plumbline.engines.registry import load_adapter
 from plumbline.judging.rows import RowContext, Verdict
 from plumbline.judging.step_level import judge_steps
 from plumbline.measurements.single_steps import run_counts, run_step_study
+from plumbline.model.kinematics import angular_velocity
 from plumbline.model.sampling import compared_states
+from plumbline.scenario.generator import random_scenario
 from plumbline.studies.random_steps import mechanism_of
 from plumbline.truth import step_formulas
-from plumbline.truth.step_comparison import RUN_QUANTITIES
+from plumbline.truth.step_charts import StepCharts
+from plumbline.truth.step_comparison import RUN_QUANTITIES, StepsFromSamples
 from tests.helpers.catalogue import catalogue_scenarios
 from tests.helpers.nightly_tests import SLOW, some_fast
 from tests.helpers.pinocchio_by_crba import steps_by_crba
@@ -190,6 +193,24 @@ def test_an_adapter_without_coordinates_says_so():
         rows = rows_of(adapter, adapter.integrator("RK4"), model, states)
     (row,) = [row for row in rows if row.quantity == "run"]
     assert row.verdict == Verdict.INFORMATION and "coordinates" in row.reason
+
+
+def test_a_rod_that_spins_about_itself_is_as_fast_as_it_turns():
+    """Beyond step 440 it turns a thousand times as fast as the bodies, and the one on it turns back by it."""
+    scenario, h, last = random_scenario(11, 3), 0.0079, slice(440, 461)
+    model, adapter = scenario.model, load_adapter("mujoco")
+    motion = adapter.step(model, scenario.state, "implicit", h, last.stop - 1).trajectory
+    method = adapter.integrator("implicit").method
+    steps = StepsFromSamples(
+        method, model, StepCharts(model, method, [scenario.state]),
+        motion.coordinates[last], motion.velocities[last], h, last.stop - last.start - 1,
+    )  # fmt: skip
+    rates = np.linalg.norm(angular_velocity(motion.p[last], motion.pdot[last]), axis=-1)
+    assert np.max(steps.fastest / np.max(rates, axis=1)) > 100
+    off = np.linalg.norm(
+        angular_velocity(motion.p[last].astype(np.longdouble), motion.pdot[last]) - steps.here.omega, axis=-1
+    )
+    assert np.all(off <= steps.of_samples["step_rate"])
 
 
 def alarms(adapter, integrator, model, state):
