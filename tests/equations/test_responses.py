@@ -161,3 +161,23 @@ def test_responses_to_errors_of_rows_move_the_ends_apart_and_multipliers_are_the
         given[:, c] -= multipliers
     pushed = np.concatenate([forces, moments], -1)
     np.testing.assert_allclose(given, pushed, rtol=0, atol=1e-9 * np.max(np.abs(found.solution)))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_velocities_alone_accelerate_a_joint_along_what_it_holds(name):
+    """Along the held directions nothing else does: neither rates of the joint's coordinates nor wrenches."""
+    model, states, ends = cut(name)
+    found = Responses(model, states, *ends)
+    acceleration, turning = found.solution[:, :, 0], found.solution[:, :, 1]
+    carried = acceleration + np.cross(turning, found.arm), turning
+    expected = np.concatenate(carried, -1)
+    for k, far in enumerate(found.far):
+        if far >= 0:
+            point = acceleration[:, far] + np.cross(turning[:, far], found.far_arm[:, k])
+            expected[:, k] -= np.concatenate([point, turning[:, far]], -1)
+    apart = expected - found.velocity_terms()
+    terms = np.max(np.abs(expected)) * 10 * 6 * model.n * np.finfo(float).eps
+    for k, held in enumerate(found.held):
+        along = np.matvec(held.mT, apart[:, k])
+        assert np.max(np.abs(along), initial=0.0) <= terms
+    assert np.max(np.abs(found.velocity_terms())) > 0.1

@@ -165,6 +165,22 @@ def test_the_mass_matrix_gives_the_kinetic_energy_of_bodies_and_rotors(seed):
         assert energy == pytest.approx(float(found["kinetic_energy"]), rel=0, abs=rounding)
 
 
+def test_wrenches_of_ends_balance_each_other_about_every_point():
+    scenario = catalogue_scenarios()["chain-3-balls"]
+    rng = np.random.default_rng(1)
+    tree = Tree(floats(), scenario.model, compared_states(scenario.model, scenario.state, "ends", 0)[0])
+    axis, of_c, lever = rng.normal(size=(3, 3, 1))
+    for is_force, apart in ((True, lever), (True, None), (False, None)):
+        wrenches = tree.end_wrench(2, 0, axis, is_force, apart)
+        assert list(wrenches) == [2, 0]
+        at = {0: of_c, 2: of_c + (0.0 if apart is None else apart)}
+        forces, moments = zip(*wrenches.values(), strict=True)
+        around_origin = sum(np.cross(at[body], force, axis=0) for body, (force, _) in wrenches.items())
+        np.testing.assert_array_equal(sum(forces), 0)
+        np.testing.assert_allclose(sum(moments) + around_origin, 0, atol=20 * EPS * np.sum(np.abs(of_c)))
+        np.testing.assert_array_equal((forces if is_force else moments)[0], axis)
+
+
 def test_a_batch_is_its_states():
     scenario = catalogue_scenarios()["tree-of-seven-sprung"]
     states = states_of(scenario, 3)
