@@ -104,7 +104,7 @@ class KnownIssue:
     min_bodies: int = 0  # with fewer it does not occur
     min_loops: int = 0  # the same of loops
     joints: tuple[str, ...] = ()  # kinds, of which the mechanism has one; empty: any
-    failed_calls: tuple[str, ...] = ()  # names or patterns: no other call failed; empty: any
+    failed_calls: tuple[str, ...] = ()  # names or patterns: no other call failed or is off; empty: any
     mechanism: Mechanism | None = None
     shown_by: str = ""  # the engine whose rows show the mechanism; empty: the row's own
     intermittent: str = ""  # why the verdict may or may not occur; empty: it must
@@ -328,7 +328,7 @@ class _Selector(BaseModel):
     min_bodies: PositiveInt | None = _field("The smallest number of bodies with which it occurs.", None)
     min_loops: PositiveInt | None = _field("The smallest number of loops with which it occurs.", None)
     joints: _Texts | None = _field("A kind of joint, or a list: the mechanism has one of them.", None)
-    failed_calls: _Texts | None = _field("The calls that fail, or patterns: no other has failed.", None)
+    failed_calls: _Texts | None = _field("The calls that fail or are off, or patterns: no other does.", None)
     shown_by: str = _field("The engine whose rows show the mechanism.", "")
     intermittent: str = _field("Why the verdict may or may not occur.", "")
     extra_refinements_only: bool = _field("Whether the nightly's smaller steps alone show it.", False)

@@ -78,7 +78,7 @@ VERDICT_STYLES = {
     ),
 }
 WRONG_CALL = "wrong_call"  # in ``extra`` of a row: of the engine's calls that are off the first by name
-FAILED_CALLS = "failed_calls"  # the same: all that failed, one per line
+FAILED_CALLS = "failed_calls"  # the same: all that failed or are off, one per line
 CHECKED = "checked"  # the same: what was checked of it where its diagnosis is a record's; may be empty
 RUN_FAMILY = "run"  # of a row that is about the whole run, in place of a scenario's family
 RECORDED = "recorded"  # what terminal and report show for a disagreement or failure that is recorded

@@ -9,7 +9,7 @@ import numpy as np
 
 from plumbline.engines.engine_calls import Evaluation
 from plumbline.engines.missing_names import FAILED_PARTS, MISSING_NAMES
-from plumbline.judging.rows import WRONG_CALL, Row, RowContext, Verdict, with_unit
+from plumbline.judging.rows import FAILED_CALLS, WRONG_CALL, Row, RowContext, Verdict, with_unit
 from plumbline.model.datatypes import Array
 from plumbline.truth.ground_truth import StateTruth
 from plumbline.truth.rounding_bound import MAX_RELATIVE_BOUND, TINY
@@ -76,7 +76,7 @@ def _row(context: RowContext, quantity: str, true: SurfaceTruth, evaluation: Eva
         f"its terms are rounded once each; at most {loosest:.1g} of the scale at {count} states",
         cpu_time=evaluation.cpu_time,
         extra={"states": float(count), "state": float(state), "calls": float(len(found))}
-        | ({WRONG_CALL: wrong[0]} if wrong else {}),
+        | ({WRONG_CALL: wrong[0], FAILED_CALLS: "\n".join(wrong)} if wrong else {}),
     )  # fmt: skip
 
 

@@ -227,6 +227,7 @@ def test_a_wrong_call_is_named(tree):
     (row,) = judge_surface(WHO, truth, evaluation)
     assert row.verdict == Verdict.DISAGREES
     assert "by mjtSensor.mjSENS_GYRO, mj_sensorVel is off by" in row.reason and "too" not in row.reason
+    assert row.extra["failed_calls"] == "mjtSensor.mjSENS_GYRO, mj_sensorVel"
 
 
 def test_calls_are_what_findings_are_about_whatever_quantities_they_get_wrong(tree):
