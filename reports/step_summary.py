@@ -53,7 +53,9 @@ def render(results: Results) -> str:
         f"## {escape_markdown(run['sentence'], 2000)}",
         "",
         " · ".join(
-            f"{style.glyph} **{counts[v]}** {style.plural}" for v, style in SHOWN_STYLES.items() if counts[v]
+            f"{style.glyph} **{counts[v]}** {style.counted(counts[v])}"
+            for v, style in SHOWN_STYLES.items()
+            if counts[v]
         ),
         "",
         *_verdict_table(results),

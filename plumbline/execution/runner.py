@@ -365,7 +365,7 @@ def summarize_verdicts(result: RunResult) -> str:
         count = len(rows) + result.random_batch.counts_by_verdict[verdict]
         if not count:
             continue
-        part = f"{count:,} {verdict if count == 1 else verdict.style.plural}"
+        part = f"{count:,} {verdict.style.counted(count)}"
         checks += count if verdict.is_comparison else 0
         new = [row for row in rows if row.known_issue is None]
         if verdict in (Verdict.DISAGREES, Verdict.FAILED, Verdict.HARNESS_FAILED) and new:

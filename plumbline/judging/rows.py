@@ -59,22 +59,29 @@ class VerdictStyle(NamedTuple):
     meaning: str  # short, for legends
     severity: int  # 10 (worst) … 0, where no known issue expects the verdict; from 6 on it needs attention
     known_severity: int  # the same where a known issue expects the verdict
+    singular: str = ""  # the word after a count of one, where it is another one: "1 disagrees"
+
+    def counted(self, count: int) -> str:
+        """Return the word after a count."""
+        return self.singular if self.singular and count == 1 else self.plural
 
 
 VERDICT_STYLES = {
     Verdict.HARNESS_FAILED: VerdictStyle(
         "☒", "without a truth", "the truth is in doubt or missing: the engine is not judged", 10, 10
     ),
-    Verdict.DISAGREES: VerdictStyle("✗", "disagree", "the error is above its derived tolerance", 8, 5),
+    Verdict.DISAGREES: VerdictStyle(
+        "✗", "disagree", "the error is above its derived tolerance", 8, 5, "disagrees"
+    ),
     Verdict.FAILED: VerdictStyle(
         "!", "failed", "raised, crashed, timed out, ran out of memory or was not finite", 9, 5
     ),
     Verdict.UNRESOLVED: VerdictStyle("?", "unresolved", "the data cannot decide", 7, 3),
     Verdict.UNSUPPORTED: VerdictStyle("–", "unsupported", "the engine cannot do this", 6, 2),
     Verdict.NOT_INSTALLED: VerdictStyle("∅", "not installed", "the engine is not on this machine", 1, 1),
-    Verdict.AGREES: VerdictStyle("✓", "agree", "the error is within its derived tolerance", 4, 4),
+    Verdict.AGREES: VerdictStyle("✓", "agree", "the error is within its derived tolerance", 4, 4, "agrees"),
     Verdict.INFORMATION: VerdictStyle(
-        "i", "are information", "implied by other rows, or not compared: not a check", 0, 0
+        "i", "are information", "implied by other rows, or not compared: not a check", 0, 0, "is information"
     ),
 }
 WRONG_CALL = "wrong_call"  # in ``extra`` of a row: of the engine's calls that are off the first by name

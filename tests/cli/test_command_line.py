@@ -175,6 +175,8 @@ def test_information_is_counted_apart_and_changes_no_exit_code():
     result = result_of([row("agrees")] * 1200 + [row("information")] * 3)
     assert summarize_verdicts(result) == "1,200 independent checks: 1,200 agree, 3 are information"
     assert exit_code(result) == 0
+    one = result_of([row("agrees"), row("information")])
+    assert summarize_verdicts(one) == "1 independent check: 1 agrees, 1 is information"
     result.rows.append(row("unsupported", quantity="all"))
     assert summarize_verdicts(result).startswith("1,200 independent checks: "), "nothing was compared there"
 
