@@ -266,6 +266,7 @@ def build_scenario(source: YamlSource, path: Path) -> Scenario:
     if problems or document is None:
         raise ScenarioError(problems)
     places, bodies, turns = map(list, zip(*_expand_repeats(document), strict=True))
+    _refuse_repeated_names(source, places, bodies)
     far = _resolve_parents(source, places, bodies)
     springs = _resolve_springs(source, document, bodies)
     closed = _resolve_closes(source, document, bodies)
@@ -372,6 +373,21 @@ def _expand_repeats(document: Document) -> Iterator[tuple[tuple[PathKey, ...], B
 def _is_free(item: dict[str, Any]) -> bool:
     joint = item.get("joint")
     return isinstance(joint, dict) and joint.get("kind") == FREE
+
+
+def _refuse_repeated_names(source: YamlSource, paths: list[tuple[PathKey, ...]], bodies: list[Body]) -> None:
+    """Refuse a name that the file gives to two bodies; copies by ``repeat`` share theirs."""
+    owners: dict[str | None, str] = {"world": "the world"}
+    problems = []
+    for path, body in dict(zip(paths, bodies, strict=True)).items():
+        place = (*path, "name")
+        if body.name in owners:
+            message = f"is {body.name!r}, the name of {owners[body.name]} too"
+            problems.append(source.problem(place, message, "a name that nothing else has"))
+        elif body.name is not None:
+            owners[body.name] = f"the body in line {source.position(place)[0]}"
+    if problems:
+        raise ScenarioError(problems)
 
 
 def _resolve_parents(source: YamlSource, paths: list[tuple[PathKey, ...]], bodies: list[Body]) -> list[int]:

@@ -497,7 +497,9 @@ class Body(SchemaModel):
 
     omitted = ("parent", "anchor")
     name: str | None = _optional(
-        "A name for readers; absent: its place in the chain.", max_length=80, examples=["bob"]
+        "A name that no other body has, except copies by `repeat`; absent: its place in the chain.",
+        max_length=80,
+        examples=["bob"],
     )
     mass: float = _field("Mass, greater than 0.", "kg", gt=0)
     inertia: Inertia = _field("Inertia about the centre of mass, body frame.")

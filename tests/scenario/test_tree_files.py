@@ -75,6 +75,17 @@ ARM = "name: arm, joint: {kind: hinge, axis: [0, 0, 1]}, distal: [0, 0, -1]"
 BOB = f"name: bob, {BALL}"
 
 
+@pytest.mark.parametrize("more", [
+    f"  - {{{BODY}, parent: bob, anchor: [0, 0, 1], {BALL}}}\n",
+    "springs:\n  - {bodies: [world, bob], points: [[0, 0, 1], [0, 1, 0]], stiffness: 1}\n",
+])  # fmt: skip
+def test_repeated_bodies_share_their_name_and_it_names_none_of_them(more):
+    repeated = f"  - {{repeat: 2, cycle: [{{{BODY}, {BOB}, distal: [0, 0, -1]}}]}}\n"
+    assert load_scenario_text(HEAD + repeated).body_names == ("bob", "bob")
+    with pytest.raises(ScenarioError, match="is 'bob', the name of 2 bodies"):
+        load_scenario_text(HEAD + repeated + more)
+
+
 def test_passive_elements_are_built_as_written():
     s = load(
         ARM.replace("1]}", "1], armature: 0.5, stiffness: [3], rest: 1, effort: -2}"),
