@@ -36,6 +36,7 @@ from plumbline.model_files.importer_cause import Explanation
 from plumbline.model_files.mechanism_of_file import feature_words, load_model_file
 from plumbline.model_files.model_rows import IS_REFUSED, FileResult
 from plumbline.model_files.model_run import ModelPlan, ModelRunResult, run_model_files
+from plumbline.processes.user_cache import naming_file
 from plumbline.processes.worker_pool import Limits
 from plumbline.scenario.line_and_column_errors import MAX_LISTED_PROBLEMS, ScenarioError, shorten
 from plumbline.scenario.mechanism_document import scenario_text
@@ -171,7 +172,7 @@ def _write_scenario(files: Sequence[str], base: Any, root: Path | None, to: Path
         scenario, document = load_model_file(Path(files[0]), base, root)
     except ScenarioError as error:
         options.exit_on_bad_file(error)
-    with options.exit_on_io_error():
+    with options.exit_on_io_error(), naming_file(to):
         to.write_text(scenario_text(document), encoding="utf-8")
     click.echo(f"{to}: {count_noun(scenario.model.n, 'body', 'bodies')}. {scenario.purpose}")
 

@@ -10,7 +10,7 @@ import pickle
 import shlex
 import stat
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -133,7 +133,7 @@ def replace_file(path: Path, data: bytes, *, is_public: bool = False) -> None:
     """
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
-        with os.fdopen(handle, "wb") as file:
+        with naming_file(path), os.fdopen(handle, "wb") as file:
             file.write(data)
             if is_public:
                 file.flush()
@@ -144,6 +144,24 @@ def replace_file(path: Path, data: bytes, *, is_public: bool = False) -> None:
     except BaseException:
         with contextlib.suppress(OSError):  # the first error is the one to report
             os.unlink(temporary)
+        raise
+
+
+@contextlib.contextmanager
+def naming_file(path: Path) -> Iterator[None]:
+    """Let errors of writing name the file: that of a full disk has no name.
+
+    Args:
+        path: the file that is written.
+
+    Yields:
+        Nothing.
+
+    """
+    try:
+        yield
+    except OSError as error:
+        error.filename = error.filename or str(path)
         raise
 
 
