@@ -152,8 +152,10 @@ def parse_xml(data: bytes, shown: str) -> Element:
         handler.parser.Parse(data, True)
     except expat.ExpatError as error:
         words = expat.ErrorString(error.code)
-        problem = Problem(shown, error.lineno, error.offset + 1, "", f"is not well-formed XML: {words}")
-        raise ModelFileError([problem]) from None
+        is_scenario = shown.endswith((".yaml", ".yml"))
+        hint = f"scenario files are for: plumbline run {shown}" if is_scenario else ""
+        place, message = (error.lineno, error.offset + 1), f"is not well-formed XML: {words}"
+        raise ModelFileError([Problem(shown, *place, "", message, hint=hint)]) from None
     except ModelFileError:  # of the handler
         raise
     except (ValueError, LookupError) as error:  # of an encoding that expat leaves to Python

@@ -203,3 +203,14 @@ def test_one_state_can_be_given(tmp_path):
     (file,) = json.loads(result.stdout)["files"]
     assert file["degrees_of_freedom"] == 7
     assert {row["verdict"] for row in file["rows"]} <= {"agrees", "information"}
+
+
+def test_a_scenario_file_is_sent_to_run(tmp_path):
+    path = tmp_path / "arm.yaml"
+    path.write_text("schema_version: 1\n")
+    result = run(path)
+    assert result.exit_code == 2
+    assert (
+        f"{path}:1:1: is not well-formed XML: syntax error; scenario files are for: plumbline run {path}"
+        in (result.stderr)
+    )
