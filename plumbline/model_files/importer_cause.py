@@ -116,11 +116,17 @@ def explain_importer(
     """
     found = _explain(title, model, model, reading, answers, states)
     without = _without_missing(model, reading)
-    if without is model or (found.is_proved and len(found.causes) == 1):
+    if without is model or (found.is_proved and len(found.causes) == 1 and not _is_gone(found, answers)):
         return found
     left_out = _explain(title, without, model, reading, answers, states)
     is_simpler = len(left_out.causes) <= len(found.causes)  # of one length: the importer has no such body
     return left_out if left_out.is_proved and (is_simpler or not found.is_proved) else found
+
+
+def _is_gone(found: Explanation, answers: Sequence[ModelQuantities]) -> bool:
+    """Whether bodies that a cause says to be fixed are nowhere among the importer's."""
+    changes = [change for cause in found.causes if cause.field == "joints" for change in cause.changes]
+    return any(change.body not in answers[0].poses for change in changes)
 
 
 def _explain(

@@ -285,6 +285,13 @@ def test_a_body_that_is_missing_beside_another_cause_is_left_out_and_not_fixed(t
     assert "leaves out the body b (line 2)" in causes[0].sentence
 
 
+def test_a_body_on_the_world_that_is_missing_is_left_out_and_not_fixed(tmp_path):
+    more = '<body name="b"><joint name="k"/><inertial pos="1 0 0" mass="1" diaginertia="1 1 1"/></body>'
+    result = judged(tmp_path, TWO_ROOTS.replace("BODY", more), TWO_ROOTS.replace("BODY", ""), ".xml")
+    ((cause,),) = (explanation.causes for explanation in result.explanations.values())
+    assert "leaves out the body b (line 2)" in cause.sentence
+
+
 FREE = """<mujoco><worldbody><body name="a" pos="0 0 1" quat="1 1 0 0"><freejoint/>
 <inertial pos="0 0 -1" mass="1" diaginertia="1 1 1"/>
 <body name="b"><joint name="j" axis="0 1 0"/><inertial pos="1 0 0" mass="1" diaginertia="1 1 1"/></body>
