@@ -7,8 +7,9 @@ The neutral model's conventions are MuJoCo's: ordered joints in a body, coordina
     f   qfrc_passive               v̇   qacc_smooth
     energies   mj_energyVel, and mj_energyPos without springs
 
-What is not compared is switched off after compiling: actuators with their armature, tendon forces, buoyancy
-and drag of a fluid, gravity compensation.  Contacts, limits, equalities and friction loss do not enter these
+What is not compared is switched off after compiling: actuators with their armature and damping, forces of
+tendons and flexes, terms of joint springs and dampers that are not linear, buoyancy and drag of a fluid,
+gravity compensation.  Contacts, limits, equalities and friction loss do not enter these
 quantities.  A URDF's root link is fused with the world, MuJoCo's default; with a free base links are not
 fused and the root link gets a free joint.
 """
@@ -42,7 +43,10 @@ KINDS: dict[int, JointKind] = {
     int(mujoco.mjtJoint.mjJNT_FREE): "free",
 }
 NOT_COMPARED = (  # arrays of a compiled model whose features are not compared
-    "actuator_armature", "tendon_stiffness", "tendon_damping", "tendon_armature", "body_gravcomp",
+    "actuator_armature", "actuator_damping", "actuator_dampingpoly",
+    "tendon_stiffness", "tendon_stiffnesspoly", "tendon_damping", "tendon_dampingpoly", "tendon_armature",
+    "dof_dampingpoly", "jnt_stiffnesspoly", "jnt_springyield", "body_gravcomp",
+    "flex_stiffness", "flex_bending", "flex_damping", "flex_edgestiffness", "flex_edgedamping",
 )  # fmt: skip
 
 
@@ -154,6 +158,12 @@ def _body(m: Any, i: int) -> NeutralBody:
     )
 
 
+def _is_disabled(m: Any, what: str) -> bool:
+    """Whether a flag of the file switches springs or dampers off; in older versions one flag does both."""
+    bits = (getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}", 0) for name in (what, "PASSIVE"))
+    return any(int(m.opt.disableflags) & int(bit) for bit in bits)
+
+
 def _joint(m: Any, j: int, body: str) -> ElementaryJoint:
     kind, dof, q = KINDS[int(m.jnt_type[j])], m.jnt_dofadr[j], m.jnt_qposadr[j]
     is_scalar = kind in ("hinge", "slide")
@@ -164,8 +174,8 @@ def _joint(m: Any, j: int, body: str) -> ElementaryJoint:
         anchor=m.jnt_pos[j] if kind in ("hinge", "ball") else (0, 0, 0),
         reference=m.qpos0[q] if is_scalar else 0.0,
         armature=m.dof_armature[dof],
-        damping=m.dof_damping[dof],
-        stiffness=m.jnt_stiffness[j],
+        damping=0.0 if _is_disabled(m, "DAMPER") else m.dof_damping[dof],
+        stiffness=0.0 if _is_disabled(m, "SPRING") else m.jnt_stiffness[j],
         spring_reference=m.qpos_spring[q] if is_scalar else 0.0,
         friction_loss=m.dof_frictionloss[dof],
     )

@@ -19,10 +19,16 @@ _JOINT_FIELDS = {
     "axis": "axis", "anchor": "pos", "reference": "ref", "armature": "armature", "damping": "damping",
     "stiffness": "stiffness", "spring_reference": "springref", "friction_loss": "frictionloss",
 }  # fmt: skip
+_JOINT_FEATURES = {  # attribute: what is not compared of it, and with how many numbers
+    "range": ("limit", 1), "frictionloss": ("friction", 1), "springyield": ("yield of a spring", 1),
+    "damping": ("damping that is not linear", 2), "stiffness": ("stiffness that is not linear", 2),
+}  # fmt: skip
 _ASSET_FOLDERS = {"mesh": "meshdir", "hfield": "meshdir", "skin": "meshdir", "texture": "texturedir"}
 _FILES = {"file", "fileright", "fileleft", "fileup", "filedown", "filefront", "fileback"}
 _SECTIONS = ("actuator", "tendon", "equality", "contact", "sensor", "keyframe", "deformable", "extension")
-_STRIPPED = ("contact", "sensor", "keyframe", "visual")  # what refers to geometry
+_STRIPPED = ("contact", "sensor", "keyframe", "visual", "custom")  # what refers to geometry
+_GEOMETRY = ("geom", "light", "camera")
+_FRAMES = ("frame", "replicate")  # whose content belongs to the body around them
 
 
 def expand_includes(root: Element, path: Path, root_folder: Path, shown: str) -> None:
@@ -56,6 +62,10 @@ def expand_includes(root: Element, path: Path, root_folder: Path, shown: str) ->
             name = str(Path(shown).parent / child.attributes["file"])
             element.children[place : place + 1] = read_xml(target, name).children
         stack.extend(element.children)
+    if len(included) > 1:  # one world, as before: Pinocchio reads the bodies of two worlds twice
+        first, *others = root.find_all("worldbody") or [root]
+        first.children += [child for world in others for child in world.children]
+        root.children = [c for c in root.children if c is first or c.tag != "worldbody"]
 
 
 def _include_target(element: Element, folder: Path, root_folder: Path) -> Path:
@@ -115,7 +125,7 @@ def joint_elements(body: Element) -> list[Element]:
         element = stack.pop()
         if element.tag in ("joint", "freejoint"):
             found.append(element)
-        elif element.tag in ("frame", "replicate"):
+        elif element.tag in _FRAMES:
             stack.extend(reversed(element.children))
     return found
 
@@ -186,22 +196,31 @@ def strip_geometry(root: Element) -> None:
 
     """
     from_geoms = any(c.attributes.get("inertiafromgeom") == "true" for c in root.find_all("compiler"))
-    kept = False
-    for world in root.find_all("worldbody"):
-        for holder in world.walk():
-            explicit = holder.tag == "worldbody" or holder.find("inertial") is not None
-            if explicit and not from_geoms:
-                holder.children = [c for c in holder.children if c.tag not in ("geom", "light", "camera")]
-        kept |= any(e.tag == "geom" and {"mesh", "hfield"} & e.attributes.keys() for e in world.walk())
-    for default in root.find_all("default"):
-        kept |= any(e.tag == "geom" and "mesh" in e.attributes for e in default.walk())
+    wrapped = {e.attributes.get("geom") for t in root.find_all("tendon") for e in t.walk()} - {None}
+    stack = [(world, True) for world in root.find_all("worldbody")]
+    while stack:
+        holder, is_explicit = stack.pop()
+        if is_explicit and not from_geoms:
+            holder.children = [
+                c for c in holder.children if c.tag not in _GEOMETRY or c.attributes.get("name") in wrapped
+            ]
+        for child in holder.children:
+            has_inertial = is_explicit if child.tag in _FRAMES else child.find("inertial") is not None
+            stack.append((child, has_inertial))
     root.children = [child for child in root.children if child.tag not in _STRIPPED]
-    dropped = {"texture", "skin"} | (set() if kept else {"mesh", "hfield"})
+    shapes = ("mesh", "hfield")
+    used = {(tag, e.attributes.get(tag)) for e in root.walk() if e.tag == "geom" for tag in shapes}
     for asset in root.find_all("asset"):
-        asset.children = [child for child in asset.children if child.tag not in dropped]
+        asset.children = [
+            c for c in asset.children if c.tag not in _ASSET_FOLDERS or (c.tag, _asset_name(c)) in used
+        ]
         for material in asset.find_all("material"):
             material.attributes.pop("texture", None)
             material.children = []
+
+
+def _asset_name(element: Element) -> str:
+    return element.attributes.get("name") or Path(element.attributes.get("file", "")).stem
 
 
 def with_sources(model: NeutralModel, root: Element) -> NeutralModel:
@@ -226,6 +245,12 @@ def with_sources(model: NeutralModel, root: Element) -> NeutralModel:
         if section.tag in _SECTIONS
         for element in section.children
     ]
+    features += [
+        Feature("flex", _name_of(element), element.source)
+        for world in root.find_all("worldbody")
+        for element in world.walk()
+        if element.tag == "flexcomp"
+    ]
     features += _joint_features(root, defaults)
     return replace(model, bodies=tuple(found), not_compared=tuple(features), gravity_source=gravity)
 
@@ -241,10 +266,10 @@ def _joint_features(root: Element, defaults: DefaultClasses) -> list[Feature]:
     found = []
     for body in body_elements(root):
         for joint in joint_elements(body):
-            for attribute, what in (("range", "limit"), ("frictionloss", "friction")):
-                source = defaults.source(joint, attribute)
-                if source is not None:
-                    found.append(Feature(what, joint.attributes.get("name", ""), source))
+            for attribute, (what, least) in _JOINT_FEATURES.items():
+                element = defaults.setter(joint, attribute)
+                if element is not None and len(element.attributes[attribute].split()) >= least:
+                    found.append(Feature(what, joint.attributes.get("name", ""), element.source))
         if "gravcomp" in body.attributes:
             found.append(Feature("gravity compensation", body.attributes["name"], body.source))
     return found
@@ -281,25 +306,22 @@ class DefaultClasses:
         """
         return self.classes.get(self.class_of.get(id(element), "main"), [])
 
-    def source(self, joint: Element, attribute: str) -> Source | None:
-        """Find where the file sets an attribute.
+    def setter(self, joint: Element, attribute: str) -> Element | None:
+        """Find the element that sets an attribute.
 
         Args:
             joint: an element <joint> or <freejoint>.
 
         Returns:
-            The place; None where the file does not set it.
+            The joint, or the <joint> of a default class; None where the file does not set it.
 
         """
         if attribute in joint.attributes:
-            return joint.source
+            return joint
         if joint.tag == "freejoint":
             return None
-        for element in self.chain(joint):
-            default = element.find("joint")
-            if default is not None and attribute in default.attributes:
-                return default.source
-        return None
+        defaults = (element.find("joint") for element in self.chain(joint))
+        return next((d for d in defaults if d is not None and attribute in d.attributes), None)
 
 
 def _body_with_sources(
@@ -320,6 +342,6 @@ def _joint_with_sources(
 ) -> ElementaryJoint:
     if element is None:
         return replace(joint, source=nowhere)
-    sources = {name: defaults.source(element, attribute) for name, attribute in _JOINT_FIELDS.items()}
-    fields = {name: source for name, source in sources.items() if source is not None}
+    setters = {name: defaults.setter(element, attribute) for name, attribute in _JOINT_FIELDS.items()}
+    fields = {name: setter.source for name, setter in setters.items() if setter is not None}
     return replace(joint, source=element.source, fields=fields)

@@ -144,7 +144,7 @@ def _change_angles(root: Element) -> bool:
     for world in root.find_all("worldbody"):
         for element in world.walk():
             kind = element.attributes.get("type", "hinge") if element.tag == "joint" else ""
-            angles = {"hinge": ("ref", "springref", "range"), "ball": ("range",)}.get(kind, ())
+            angles = {"hinge": ("ref", "springref", "springyield", "range"), "ball": ("range",)}.get(kind, ())
             for name in ("euler", "axisangle", *angles):
                 if name in element.attributes:
                     values = _numbers(element, name)

@@ -20,6 +20,7 @@ from plumbline.scenario.line_and_column_errors import shorten
 from plumbline.scenario.yaml_reader import is_file
 
 BaseChoice = Literal["fixed", "free", "auto"]
+STRIP_HINT = "--strip-geometry leaves meshes out"
 MJCF_READER = "mujoco"  # whose compiled model is the neutral reading of MJCF
 _LINE = re.compile(r"\bline (\d{1,9})\b")
 _ELEMENT = re.compile(r"\bElement '([^']*)'")  # as MuJoCo names elements; other importers name lines at most
@@ -159,7 +160,8 @@ def prepare_file(
         for link in tree.find_all("link"):
             link.children = [c for c in link.children if c.tag not in ("visual", "collision")]
     model = read_urdf(tree, chosen) if kind == "urdf" else None
-    _check_references(tree, kind, path.parent, folder)
+    leave_out = "the mass of a body without <inertial> is made of it" if strip else STRIP_HINT
+    _check_references(tree, kind, path.parent, folder, f"{leave_out}; --root names another folder")
     opened, lines = path.resolve(), dict[int, list[Element]]()
     if is_copied:
         if kind == "mjcf":
@@ -200,7 +202,7 @@ def _format_of(tree: Element, shown: str) -> Format:
     raise ModelFileError([tree.source.problem(message, "<robot> (URDF) or <mujoco> (MJCF)", hint)])
 
 
-def _check_references(tree: Element, kind: Format, folder: Path, root: Path) -> None:
+def _check_references(tree: Element, kind: Format, folder: Path, root: Path, hint: str) -> None:
     """Refuse files that are missing, outside the root, or on the network."""
     problems = []
     if kind == "mjcf":
@@ -227,13 +229,11 @@ def _check_references(tree: Element, kind: Format, folder: Path, root: Path) -> 
         else:
             candidates = [path]
         inside = [target for c in candidates if (target := mjcf.resolve_inside(c, root)) is not None]
-        hint = "--strip-geometry leaves meshes out; --root names another folder"
         if not inside:
             problems.append(element.problem(f"{shorten(repr(name))} is outside {root}", attribute, hint=hint))
         elif not any(is_file(target) for target in inside):
-            problems.append(
-                element.problem(f"there is no file {shorten(repr(name))} in {root}", attribute, hint=hint)
-            )
+            message = f"there is no file {shorten(repr(name))} in {root}"
+            problems.append(element.problem(message, attribute, hint=hint))
     if problems:
         raise ModelFileError(problems)
 

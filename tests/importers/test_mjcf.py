@@ -4,6 +4,8 @@ import pytest
 
 from plumbline.engines.importer_calls import read_model_file
 from plumbline.importers.xml_tree import ModelFileError
+from plumbline.judging.rows import Verdict
+from plumbline.model_files.model_run import ModelPlan, run_model_files
 from plumbline.model_files.prepared_file import package_folder, prepare_file
 
 MAIN = """<mujoco model="m">
@@ -83,6 +85,75 @@ def test_stripping_keeps_geometry_that_defines_the_mass(tmp_path):
     prepared = prepare_file(str(tmp_path / "robot.xml"), tmp_path / "copy", strip=True)
     found = prepared.neutral_model(read_model_file("mujoco", prepared.file))
     assert [body.mass for body in found.bodies] == [2.0, 3.0]
+
+
+STRIPPED = """<mujoco model="m">
+<asset><mesh file="own.stl"/><mesh name="other" file="missing.stl"/><hfield name="own" file="no.png"/></asset>
+<worldbody>
+<body name="b"><joint name="j"/><inertial pos="0 0 1" mass="2" diaginertia="1 1 1"/>
+<frame pos="1 0 0"><geom type="mesh" mesh="other"/></frame><geom name="pulley" size="0.1"/>
+<site name="end" pos="0 0 1"/></body>
+<body name="c"><joint name="k"/><geom type="mesh" mesh="own"/></body>
+<site name="start" pos="1 1 1"/>
+</worldbody>
+<tendon><spatial><site site="start"/><geom geom="pulley"/><site site="end"/></spatial></tendon>
+<custom><tuple name="t"><element objtype="geom" objname="g" prm="0"/></tuple></custom>
+</mujoco>
+"""
+
+
+def test_stripping_leaves_out_each_mesh_that_no_mass_needs(tmp_path):
+    path = tmp_path / "robot.xml"
+    path.write_text(STRIPPED)
+    with pytest.raises(ModelFileError) as error:
+        prepare_file(str(path), tmp_path, strip=True)
+    (problem,) = error.value.problems
+    assert problem.line == 2 and problem.column == 8
+    assert "'own.stl'" in problem.message and "the mass of a body without <inertial>" in problem.hint
+    path.write_text(STRIPPED.replace('type="mesh" mesh="own"', 'size="0.1" mass="3"'))
+    (tmp_path / "copy").mkdir()
+    prepared = prepare_file(str(path), tmp_path / "copy", strip=True)
+    found = prepared.neutral_model(read_model_file("mujoco", prepared.file))  # the tendon has its pulley
+    assert [body.mass for body in found.bodies] == [2.0, 3.0]
+
+
+def test_a_scene_and_the_robot_that_it_includes_are_in_one_world(tmp_path):
+    (tmp_path / "robot.xml").write_text(f"<mujoco>{STRIPPED.split('</asset>')[1]}".replace("other", "own"))
+    scene = '<mujoco><include file="robot.xml"/>\n<worldbody><body name="floor"/></worldbody></mujoco>'
+    (tmp_path / "scene.xml").write_text(scene)
+    prepared = prepare_file(str(tmp_path / "scene.xml"), tmp_path, strip=False)
+    (world,) = prepared.tree.find_all("worldbody")
+    assert [body.attributes["name"] for body in world.find_all("body")] == ["b", "c", "floor"]
+    assert prepared.tree.find("tendon") is not None
+
+
+NOT_LINEAR = """<mujoco model="m">
+<option><flag spring="disable"/></option>
+<default><default class="d"><joint damping="1 2 3" stiffness="5 6"/></default></default>
+<worldbody>
+<body name="b"><joint class="d" name="j" axis="0 1 0" springyield="0.1" springref="0.5"/>
+<inertial pos="0.1 0 0" mass="1" diaginertia="1 1 1"/></body>
+<flexcomp name="f" type="grid" count="2 2 2" spacing=".1 .1 .1" pos="0 0 1" dim="3" mass="1">
+<elasticity young="1e4" poisson=".2" damping=".01"/></flexcomp>
+</worldbody>
+<actuator><motor name="drive" joint="j" damping="7" armature="1"/></actuator></mujoco>
+"""
+
+
+@pytest.mark.parametrize("is_sprung", [False, True])
+def test_forces_that_the_neutral_model_does_not_have_are_listed_and_not_compared(tmp_path, is_sprung):
+    path = tmp_path / "robot.xml"
+    path.write_text(NOT_LINEAR.replace('spring="disable"', "") if is_sprung else NOT_LINEAR)
+    plan = ModelPlan((str(path),), importers=("mujoco",), state_count=2)
+    (file,) = run_model_files(plan, lambda *_: None).files
+    assert {row.verdict for row in file.rows} == {Verdict.AGREES}
+    found = {(f.what, f.name, f.source.line) for f in file.model.not_compared}
+    assert found == {
+        ("damping that is not linear", "j", 3), ("stiffness that is not linear", "j", 3),
+        ("yield of a spring", "j", 5), ("flex", "f", 7), ("actuator", "drive", 10),
+    }  # fmt: skip
+    joint = file.model.joints[0]
+    assert (joint.damping, joint.stiffness) == (1.0, 5.0 if is_sprung else 0.0)
 
 
 def test_the_base_of_an_mjcf_is_its_own(tmp_path):
