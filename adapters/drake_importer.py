@@ -12,7 +12,8 @@ body, are merged into that body.
         refuses plants with constraints (mimic joints among them)
     f = damping of the joints, AddInDamping, and what force elements besides gravity add to inverse dynamics
 
-A URDF's root link is free in Drake; with a fixed base it is welded to the world.
+A URDF's root link is free in Drake; with a fixed base it is welded to the world.  Its actuators have no rotor
+here: transmissions are not compared.
 """
 
 from __future__ import annotations
@@ -46,13 +47,15 @@ class _Layout(LayoutWithOwnVelocities):
     """A plant; a joint's own: Drake's joint, R_M (body axes → axes of the frame M), and places in q."""
 
     def __init__(self, plant: Any, file: ModelFile) -> None:
+        rotors = [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
+        for rotor in rotors if file.format == "urdf" else ():  # of transmissions, by Drake's own elements
+            rotor.set_default_rotor_inertia(0.0)
         self.plant, self.context = plant, plant.CreateDefaultContext()
         self.q = plant.GetPositions(self.context)
         joints = [plant.get_joint(j) for j in plant.GetJointIndices()]
         self.parent_joint = {joint.child_body().index(): joint for joint in joints}
         self.rotor_inertia: dict[str, float] = {}
-        for index in plant.GetJointActuatorIndices():
-            rotor = plant.get_joint_actuator(index)
+        for rotor in rotors:
             inertia = rotor.default_rotor_inertia() * rotor.default_gear_ratio() ** 2
             name = rotor.joint().name()
             self.rotor_inertia[name] = self.rotor_inertia.get(name, 0.0) + inertia
