@@ -33,7 +33,19 @@ GRAVITY = (0.0, 0.0, -9.81)  # m/s²; a URDF does not say it
 _TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
 _INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 _NOT_DYNAMIC = {"material", "verbose"}  # children of <robot> that no dynamics depends on
-_JOINT_PARTS = {"origin", "parent", "child", "axis", "dynamics"}
+_READ = {  # what is read of each element: its attributes, and the first of each of these elements in it
+    "link": ({"name"}, {"inertial"}),
+    "inertial": (set[str](), {"origin", "mass", "inertia"}),
+    "joint": ({"name", "type"}, {"origin", "parent", "child", "axis", "dynamics"}),
+    "origin": ({"xyz", "rpy"}, set[str]()),
+    "mass": ({"value"}, set[str]()),
+    "inertia": (set(_INERTIA), set[str]()),
+    "parent": ({"link"}, set[str]()),
+    "child": ({"link"}, set[str]()),
+    "axis": ({"xyz"}, set[str]()),
+    "dynamics": ({"damping", "friction"}, set[str]()),
+}
+_GEOMETRY = {"visual", "collision"}
 _TRIANGLE_ROUNDING = 1e-9  # relative; published inertias are rounded to a few decimals
 
 
@@ -300,15 +312,30 @@ class _UrdfReader:
             name = element.attributes.get("name", element.attributes.get("reference", ""))
             if element.tag not in {"link", "joint"} | _NOT_DYNAMIC:
                 self.features.append(Feature(element.tag, name, element.source))
+        for name, link in self.links.items():
+            self.note_unread(link, name)
         for name, joint in self.joints.items():
-            for element in joint.children:
-                if element.tag not in _JOINT_PARTS and not (
-                    element.tag == "limit" and joint.attributes.get("type") == "fixed"
-                ):
-                    self.features.append(Feature(element.tag, name, element.source))
+            self.note_unread(joint, name)
             dynamics = joint.find("dynamics")
             if dynamics is not None and dynamics.attributes.get("friction", "0").strip("0.") != "":
                 self.features.append(Feature("friction", name, dynamics.source))
+
+    def note_unread(self, element: Element, owner: str) -> None:
+        """List attributes and elements of a link or joint that are not read, misspelt ones too."""
+        attributes, parts = _READ[element.tag]
+        for name in sorted(element.attributes.keys() - attributes):
+            what = f"attribute {shorten(name)} of <{element.tag}>"
+            self.features.append(Feature(what, owner, element.source))
+        for child in element.children:
+            if child.tag not in parts:
+                is_still = child.tag == "limit" and element.attributes.get("type") == "fixed"
+                if child.tag not in _GEOMETRY and not is_still:
+                    self.features.append(Feature(child.tag, owner, child.source))
+            elif child is element.find(child.tag):
+                self.note_unread(child, owner)
+            else:
+                what = f"more than one <{child.tag}> in <{element.tag}>: the first is read"
+                self.ambiguous.append(Feature(what, owner, child.source))
 
 
 def _joint(name: str, kind: JointKind, axis: Array, source: Source, **more: Any) -> ElementaryJoint:

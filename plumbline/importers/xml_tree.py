@@ -19,7 +19,8 @@ MAX_BYTES = 64 * 2**20  # the largest robot of the known collections has 2 MB
 MAX_DEPTH = 500  # nested elements; MuJoCo's own limit is 500 bodies deep
 _DECLARATION = re.compile(rb"\A(?:\xef\xbb\xbf)?\s*<\?xml([^>]*)\?>")
 _ENCODING = re.compile(rb"encoding\s*=\s*[\"']([A-Za-z][\w.-]*)[\"']")
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\Z")
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\Z", re.ASCII)
+_WORD = re.compile(r"[^ \t\r\n]+")  # XML has no other blanks
 
 
 class ModelFileError(ScenarioError):
@@ -96,7 +97,7 @@ def parse_numbers(
         ``count`` finite numbers; zeros where something is wrong.
 
     """
-    words = element.attributes[attribute].split()
+    words = _WORD.findall(element.attributes[attribute])
     valid = f"{count} finite number{'s' if count > 1 else ''}"
     values = [float(word) if _NUMBER.match(word) else math.nan for word in words]
     if len(words) != count:

@@ -80,3 +80,22 @@ def test_decimals_are_rounded_once_and_axes_normalised(tmp_path):
     model = prepared_file(tmp_path, text).urdf_model
     assert model.bodies[0].mass == 0.1
     np.testing.assert_array_equal(model.joints[0].axis, np.array([1, 0, 1]) / np.sqrt(2))
+
+
+MISSPELT = """<robot name="r"><link name="a" colour="red"/>
+<link name="b"><inertial><mass value="1"/><mass value="2"/>
+<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1" unit="g"/></inertial><inertail/></link>
+<joint name="j" type="fixed"><parent link="a"/><child link="b"/><orgin xyz="1 0 0"/>
+<origin xzy="1 0 0"/><limit effort="1"/></joint></robot>
+"""
+
+
+def test_attributes_and_elements_that_are_not_read_are_listed_with_their_lines(tmp_path):
+    model = prepared_file(tmp_path, MISSPELT).urdf_model
+    assert {(f.what, f.name, f.source.line) for f in model.not_compared} == {
+        ("attribute colour of <link>", "a", 1), ("attribute unit of <inertia>", "b", 3), ("inertail", "b", 3),
+        ("orgin", "j", 4), ("attribute xzy of <origin>", "j", 5),
+    }  # fmt: skip
+    what = "more than one <mass> in <inertial>: the first is read"
+    assert (what, "b", 2) in {(f.what, f.name, f.source.line) for f in model.ambiguous}
+    assert model.bodies[1].mass == 1
