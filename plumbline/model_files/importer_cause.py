@@ -9,7 +9,7 @@ dropped.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any
@@ -38,6 +38,7 @@ from plumbline.model_files.parameter_changes import (
     ORIGIN,
     RELATIVE_CHANGE,
     SLIDE_SCALE,
+    TURNED_ARMATURE,
     Change,
     apply_changes,
     change_of,
@@ -526,14 +527,17 @@ def _as_shown(
 ) -> CertifiedModelQuantities:
     """Quantities with the changes that are not in the model.
 
-    Armatures left out of the kinetic energy, slides scaled, free bodies displaced, and frames elsewhere in
-    their bodies: X → X Y.
+    Armatures left out of the kinetic energy or turned with free bodies, slides scaled, free bodies displaced,
+    and frames elsewhere in their bodies: X → X Y.
     """
     kinds = grouped(changes, _field)
     offsets = {change.body: change.theirs for change in kinds.get(FRAME, ())}
     scales = {change.joint: change.theirs for change in kinds.get(SLIDE_SCALE, ())}
     shifts = {change.body: change.theirs for change in kinds.get(ORIGIN, ())}
     still = {change.joint for change in kinds.get(ARMATURE_ENERGY, ())}
+    turned = {change.joint for change in kinds.get(TURNED_ARMATURE, ())}
+    if turned:
+        truth = _with_turned_armature(model, turned, state, truth)
     if not (offsets or scales or shifts or still):
         return truth
     poses, energy = truth.quantities.poses, truth.quantities.kinetic_energy
@@ -552,6 +556,22 @@ def _as_shown(
     poses = {name: np.column_stack([X[:, :3], X[:, 3] + by[name]]) for name, X in poses.items()}
     poses = {body: _composed(X, offsets[body]) if body in offsets else X for body, X in poses.items()}
     return replace(truth, quantities=replace(truth.quantities, poses=poses, kinetic_energy=energy))
+
+
+def _with_turned_armature(
+    model: NeutralModel, joints: Collection[str], state: CanonicalState, truth: CertifiedModelQuantities
+) -> CertifiedModelQuantities:
+    """Armatures a of free joints on d(Rᵀv)/dt in place of v̇: h changes by −a ω × v, in world axes."""
+    own, change = truth.quantities, np.zeros(len(state.velocities))
+    for joint, x, v in model.joint_slices():
+        if joint.name in joints:
+            velocity, rate = np.split(state.velocities[v], 2)
+            turn = rotation_matrix(state.coordinates[x][3:]) @ rate
+            change[v.start : v.start + 3] = -joint.armature * np.cross(turn, velocity)
+    if own.bias_force is None or own.mass_matrix is None or own.acceleration is None:
+        return truth
+    bias, acceleration = own.bias_force + change, own.acceleration - np.linalg.solve(own.mass_matrix, change)
+    return replace(truth, quantities=replace(own, bias_force=bias, acceleration=acceleration))
 
 
 def _in_parent(model: NeutralModel, body: NeutralBody, poses: Mapping[str, Array]) -> Array:

@@ -25,7 +25,14 @@ ORIGIN = "origin"  # from which a free body's coordinates count
 MISSING = "missing body"
 ADDITIONAL = "additional body"
 ARMATURE_ENERGY = "armature in the kinetic energy"
-NOT_IN_THE_MODEL = (ARMATURE_ENERGY, FRAME, SLIDE_SCALE, ORIGIN)  # change quantities, not the equations
+TURNED_ARMATURE = "armature in body axes"  # of a free joint, on rates of change in the axes of its body
+NOT_IN_THE_MODEL = (
+    ARMATURE_ENERGY,
+    FRAME,
+    SLIDE_SCALE,
+    ORIGIN,
+    TURNED_ARMATURE,
+)  # change quantities, not the equations
 FIELD_WORDS = {
     "center": "centre of mass", "spring_reference": "spring reference", "position": "position in its parent",
     "attitude": "attitude in its parent", "reference": "reference coordinate", "joints": "joints",
@@ -192,7 +199,7 @@ def joint_kinds(joints: Sequence[ElementaryJoint]) -> list[tuple[str, str]]:
 
 
 def omissions(model: NeutralModel) -> list[list[Change]]:
-    """List terms of a model that an engine's dynamics may leave out, per field all joints together.
+    """List terms of a model that an engine's dynamics may leave out or turn, per field all joints together.
 
     Args:
         model: a model, fixed bodies lumped.
@@ -210,6 +217,11 @@ def omissions(model: NeutralModel) -> list[list[Change]]:
         ]
         for field in OMITTED_FIELDS
     ]
+    groups.append([
+        change_of(TURNED_ARMATURE, body, joint, 0.0, joint.armature, "armature", is_omitted=True)
+        for body, joint in joints
+        if joint.kind == "free" and joint.armature
+    ])  # fmt: skip
     if np.any(model.gravity):
         gravity = model.gravity, np.zeros(3), model.gravity_source
         groups.append([Change("gravity", "", "", *gravity, is_omitted=True)])
@@ -365,6 +377,8 @@ def describe_changes(members: Sequence[Change]) -> str:
         )
     if first.field == ARMATURE_ENERGY:
         return f"leaves the armature of {owners} out of its kinetic energy ({first.source})"
+    if first.field == TURNED_ARMATURE:
+        return f"applies the armature of {owners} in the axes of the body, not of the world ({first.source})"
     if first.is_omitted:
         return f"holds the {first.word} of {owners} but leaves it out of its equations ({first.source})"
     if count == 1:

@@ -11,6 +11,7 @@ from plumbline.importers.xml_tree import parse_xml, write_xml
 from plumbline.judging.rows import Verdict
 from plumbline.model_files.model_comparison import model_states
 from plumbline.model_files.model_rows import Answer, state_seed
+from plumbline.model_files.model_run import ModelPlan, run_model_files
 from plumbline.model_files.prepared_file import prepare_file
 from tests.helpers.importer_columns import MUJOCO, judge_file
 from tests.helpers.nightly_tests import some_fast
@@ -307,3 +308,18 @@ def test_a_free_body_whose_coordinates_count_from_elsewhere_is_named(tmp_path):
     ((cause,),) = (explanation.causes for explanation in result.explanations.values())
     assert "coordinates of the free joint of body a from (0, 1, 1) and not from" in cause.sentence
     assert "this alone explains every quantity" in cause.sentence
+
+
+TURNED = """<mujoco><default><joint armature="0.1"/></default><worldbody>
+<body name="a"><joint name="f" type="free"/><inertial pos="0 0.1 0" mass="1" diaginertia="1 1 1"/></body>
+</worldbody></mujoco>
+"""
+
+
+def test_an_armature_that_turns_with_a_free_body_is_named(tmp_path):
+    path = tmp_path / "robot.xml"
+    path.write_text(TURNED)
+    plan = ModelPlan((str(path),), importers=("pinocchio",), state_count=STATES)
+    (file,) = run_model_files(plan, lambda *_: None).files
+    (cause,) = file.explanations["pinocchio"].causes
+    assert "applies the armature of joint f in the axes of the body, not of the world" in cause.sentence
