@@ -151,6 +151,9 @@ def _explain(
     found = trial.first_that_explains(changes)
     if found is None:
         found = trial.smallest([*changes, *_finer(changes, differences(own, theirs, 0.0))])
+    masses = [change for change in changes if change.field in ("mass", "inertial")]
+    if found is None and masses and trial.fits(masses, len(answers)):
+        found = masses  # which no quantity depends on, as on an upright axis through the centre of mass
     if found is None and len(own.bodies) < len(moved.bodies):
         # a fixed body that is elsewhere, though everything moves alike
         trial = _Trial(moved, reading, reading, answers, states, moved, bool(structure))

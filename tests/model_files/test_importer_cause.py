@@ -293,6 +293,17 @@ def test_a_body_on_the_world_that_is_missing_is_left_out_and_not_fixed(tmp_path)
     assert "leaves out the body b (line 2)" in cause.sentence
 
 
+WHEEL = """<mujoco><worldbody><body name="a"><joint name="j" axis="0 0 1"/>
+<inertial pos="0 0 1" mass="1" diaginertia="1 1 1"/></body></worldbody></mujoco>
+"""
+
+
+def test_a_mass_that_moves_nothing_is_named(tmp_path):
+    result = judged(tmp_path, WHEEL, WHEEL.replace('mass="1"', 'mass="1.001"'), ".xml")
+    ((cause,),) = (explanation.causes for explanation in result.explanations.values())
+    assert "reads the mass of body a as 1.001; the file says 1 (line 2)" in cause.sentence
+
+
 FREE = """<mujoco><worldbody><body name="a" pos="0 0 1" quat="1 1 0 0"><freejoint/>
 <inertial pos="0 0 -1" mass="1" diaginertia="1 1 1"/>
 <body name="b"><joint name="j" axis="0 1 0"/><inertial pos="1 0 0" mass="1" diaginertia="1 1 1"/></body>
