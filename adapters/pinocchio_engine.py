@@ -104,6 +104,7 @@ RIGID: Any = {"free_coordinates": "rigid motion", "gap_correction": STABILISATIO
 # Of constraintDynamics: accuracy, damping (any from 1e-12 to 1e-3 does), largest number of steps.
 PROXIMAL_SETTINGS = 1e-15, 1e-8, 50
 MAX_DENSE_JOINTS = 10  # joints up to which their 3 × 3 blocks are solved faster as one matrix
+Motion = tuple[Array, Array, Array]  # q, v and v̇
 EARLY_STATES = 2  # at which loops are closed in all ways, and composite joints asked
 FIXED_STEPS = {"semi-implicit-euler": semi_implicit_euler, "rkmk4": rkmk4}
 
@@ -128,6 +129,8 @@ class PinocchioChain:
         change: Change = Change(),  # noqa: B008
     ):
         self.source_model, self.algorithm = model, change.algorithm or algorithm
+        self.last_state: State | None = None  # and its coordinates and T
+        self.last_motion: tuple[Array, Array] = np.zeros(0), np.zeros((0, 0))
         self.parts = parts = parts or undivided_bodies(model)
         self.pin_model = pin.Model()
         self.pin_model.gravity = pin.Motion(model.gravity, np.zeros(3))
@@ -297,6 +300,11 @@ class PinocchioChain:
 
     def _motion(self, state: State) -> tuple[Array, Array]:
         """Return q, and T of v = T ν, ν = (udot of rods, ω′ of bodies or rates of joints)."""
+        if state is not self.last_state:  # coordinates and rates are asked for in turn
+            self.last_state, self.last_motion = state, self._motion_at(state)
+        return self.last_motion
+
+    def _motion_at(self, state: State) -> tuple[Array, Array]:
         model, (frames, S) = self.source_model, self._frames(state)
         up = np.array(self.parent_rows)
         own = np.flatnonzero(up >= 0)
@@ -805,26 +813,27 @@ class Pinocchio(PinocchioAdapter):
             place.act(pin.Inertia(mass, np.zeros(3), inertia))
             for place, mass, inertia in zip(placements, model.mass, model.inertia, strict=True)
         ]
-        single, numbers = with_single_joints(chain.pin_model)
-        is_single = single.njoints == chain.pin_model.njoints
-        found = list[dict[str, dict[Call, Array]]]()
+        motions, rates, loops = list[Motion](), list[Array | None](), list[Loops]()
         for state in states:
             q, v = chain.coordinates(cut.state(state))
-            motion = q, v, chain.acceleration(q, v)
-            rates, is_early = None if cut.ends else chain.rate_map(state), len(found) < EARLY_STATES
-            loops = chain.loops(q, v) if cut.ends and is_early else None
+            motions.append((q, v, chain.acceleration(q, v)))
+            rates.append(None if cut.ends else chain.rate_map(state))
+            if cut.ends and len(loops) < EARLY_STATES:
+                loops.append(chain.loops(q, v))
 
-            def ask(m: pin.Model, loops: Loops | None) -> Probed:
-                s = Probed(m, frames, motion, rates)  # noqa: B023
-                add_surface(s, inertias)
-                if loops:
-                    add_parts(s.found, partial(_add_closed, s, loops))
-                return s
+        def ask(m: pin.Model, loops: Sequence[Loops], count: int) -> list[Probed]:
+            asked = [Probed(m, frames, *given) for given in zip(motions, rates, strict=True)][:count]
+            add_surface(asked, inertias)
+            for s, own in zip(asked, loops, strict=False):
+                add_parts(s.found, partial(_add_closed, s, own))
+            return asked
 
-            s = ask(single, loops.on(single, numbers) if loops else None)
-            if is_early and not is_single:
-                add_composites(s, ask(chain.pin_model, loops))
-            found.append(s.found)
+        single, numbers = with_single_joints(chain.pin_model)
+        probed = ask(single, [own.on(single, numbers) for own in loops], len(states))
+        if single.njoints != chain.pin_model.njoints:
+            for s, of_composites in zip(probed, ask(chain.pin_model, loops, EARLY_STATES), strict=False):
+                add_composites(s, of_composites)
+        found: list[dict[str, dict[Call, Array]]] = [s.found for s in probed]
         add_pose_answers(found, states, "pinocchio", pose_function)
         return found
 

@@ -45,15 +45,23 @@ class Probed(SurfaceRecord):
         self.motion = self.q, self.v, self.a = motion
         self.joints = [joint_of(m.frames[f]) for f in frames]
         self.places = [m.frames[f].placement.copy() for f in frames]
+        self.workspaces, self.used = list[pin.Data](), 0
 
     @property
     def has_parts(self) -> bool:
         """Whether a joint carries several bodies, or parts of one."""
         return self.rates is None or len(set(self.joints)) < len(self.joints)
 
+    def workspace(self) -> pin.Data:
+        """Data for one function after another; where a part has run at another state, those that it had."""
+        self.used += 1
+        if self.used > len(self.workspaces):
+            self.workspaces.append(self.m.createData())
+        return self.workspaces[self.used - 1]
+
     def moved(self, a: Float[Array, "nv"] | None = None) -> pin.Data:
         """Data with the motion, or one with another v̇, and the frames."""
-        data = self.m.createData()
+        data = self.workspace()
         pin.forwardKinematics(self.m, data, self.q, self.v, self.a if a is None else np.ravel(a))
         pin.updateFramePlacements(self.m, data)
         return data
@@ -83,7 +91,7 @@ class Probed(SurfaceRecord):
 
     def add_velocities(self, velocities: Mapping[Call, Any]) -> None:
         """Add the velocities of the probe frames by other v."""
-        data = self.m.createData()
+        data = self.workspace()
         for call, v in velocities.items():
             pin.forwardKinematics(self.m, data, self.q, v)
             pin.updateFramePlacements(self.m, data)

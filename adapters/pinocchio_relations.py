@@ -43,7 +43,7 @@ def relations(s: Probed) -> Sequence[Callable[[Probed], None]]:
 
 def _step(s: Probed) -> Array:
     """A step of tangent vectors: no two entries are alike."""
-    data = s.m.createData()
+    data = s.workspace()
     angular = s.square(pin.computeJointJacobians(s.m, data, s.q))[3:]
     pin.updateFramePlacements(s.m, data)
     length = np.mean([np.linalg.norm(data.oMf[f].translation) for f in s.frames])
@@ -52,7 +52,7 @@ def _step(s: Probed) -> Array:
 
 
 def _add_configurations(s: Probed) -> None:
-    m, q, step, data = s.m, s.q, _step(s), s.m.createData()
+    m, q, step, data = s.m, s.q, _step(s), s.workspace()
     before, after, length = pin.integrate(m, q, -step), pin.integrate(m, q, step), np.linalg.norm(step)
 
     def led(tangent: Array) -> Array:
@@ -121,7 +121,7 @@ def _add_tangent_maps(s: Probed) -> None:
 
 def _add_spatial(s: Probed) -> None:
     """Add what is read of single joints."""
-    m, data, derived, chain = s.m, s.m.createData(), s.m.createData(), s.m.createData()
+    m, data, derived, chain = s.m, s.workspace(), s.workspace(), s.workspace()
     pin.forwardKinematics(m, data, s.q, s.v, s.a)
     pin.computeRNEADerivatives(m, derived, s.q, s.v, s.a)
     J, dAdv = s.square(derived.J), s.square(derived.dAdv)
@@ -146,7 +146,7 @@ def _add_spatial(s: Probed) -> None:
 
 def _add_momenta(s: Probed) -> None:
     m, (q, v, a) = s.m, s.motion
-    data, derived, composite = m.createData(), m.createData(), m.createData()
+    data, derived, composite = s.workspace(), s.workspace(), s.workspace()
     pin.computeCentroidalDynamicsDerivatives(m, derived, q, v, a)
     to_centre = pin.SE3(np.eye(3), pin.centerOfMass(m, data, q))
     pin.computeCentroidalMomentum(m, data, q, v)
@@ -180,7 +180,7 @@ def _root_momentum(s: Probed, data: pin.Data, joint: int) -> pin.Force:
 
 def _add_body_forces(s: Probed) -> None:
     """Add forces on bodies by B, which the data have summed over all bodies beyond a joint."""
-    m, data, coriolis = s.m, s.m.createData(), s.m.createData()
+    m, data, coriolis = s.m, s.workspace(), s.workspace()
     pin.computeRNEADerivatives(m, data, s.q, s.v, s.a)
     pin.computeCoriolisMatrix(m, coriolis, s.q, s.v)
     own = [np.array(x) for x in coriolis.B]
@@ -238,9 +238,9 @@ def _add_mimic_momenta(s: Probed, along_axis: bool) -> None:
 
 
 def _add_forward_derivatives(s: Probed) -> None:
-    m, (q, v, a), data = s.m, s.motion, s.m.createData()
+    m, (q, v, a), data = s.m, s.motion, s.workspace()
     tau, g = pin.rnea(m, data, q, v, a).copy(), pin.computeGeneralizedGravity(m, data, q).copy()
-    M = s.square(pin.crba(m, m.createData(), q))
+    M = s.square(pin.crba(m, s.workspace(), q))
     _, by_v, by_tau = pin.computeABADerivatives(m, data, q, v, tau)
     inverse = np.triu(s.square(by_tau))
     inverse = inverse + np.triu(inverse, 1).T
@@ -252,6 +252,6 @@ def _add_forward_derivatives(s: Probed) -> None:
 
 
 def _add_batch(s: Probed) -> None:
-    tau = pin.rnea(s.m, s.m.createData(), *s.motion).copy()
+    tau = pin.rnea(s.m, s.workspace(), *s.motion).copy()
     a = pin.abaInParallel(1, pin.ModelPool(s.m, 1), *(x[:, None] for x in (s.q, s.v, tau)))
     s.add_accelerations(("abaInParallel",), a, "by_aba")

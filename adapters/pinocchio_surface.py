@@ -53,13 +53,22 @@ Reading = tuple[str, str, str, Any]  # functions, what they return, by what, and
 Reader = Callable[[Probed, str, str, int, pin.Data, pin.Data], Iterator[Reading]]
 
 
-def add_surface(s: Probed, bodies: Sequence[pin.Inertia]) -> None:
-    """Evaluate all at one state.
+def add_surface(states: Sequence[Probed], bodies: Sequence[pin.Inertia]) -> None:
+    """Evaluate all at some states, part by part: data of 50 bodies are 100 MB, made for the first state.
 
     Args:
         bodies: inertias of the bodies, in their joints' frames.
 
     """
+    for parts in zip(*(_parts(s, bodies) for s in states), strict=True):
+        workspaces = list[pin.Data]()
+        for s, part in zip(states, parts, strict=True):
+            s.workspaces, s.used = workspaces, 0
+            add_parts(s.found, partial(part, s))
+
+
+def _parts(s: Probed, bodies: Sequence[pin.Inertia]) -> list[Callable[[Probed], None]]:
+    """What adds all of one state."""
     parts: list[Callable[[Probed], None]] = [
         _add_frames,
         _add_hessians,
@@ -68,8 +77,7 @@ def add_surface(s: Probed, bodies: Sequence[pin.Inertia]) -> None:
         *relations(s),
     ]
     parts += [partial(_add_regressors, bodies=bodies)]
-    parts += [] if s.rates is None else [_add_torques, _add_batch, *mimics(s)]
-    add_parts(s.found, *(partial(part, s) for part in parts))
+    return parts + ([] if s.rates is None else [_add_torques, _add_batch, *mimics(s)])
 
 
 def add_composites(s: Probed, whole: Probed) -> None:
@@ -116,7 +124,7 @@ def _plane_function(group: Any, height: float, *given: float) -> list[Any]:
 
 
 def _add_frames(s: Probed) -> None:
-    data, derived = s.moved(), s.m.createData()
+    data, derived = s.moved(), s.workspace()
     pin.computeForwardKinematicsDerivatives(s.m, derived, s.q, s.v, s.a)
     pin.updateFramePlacements(s.m, derived)
     pin.computeJointJacobiansTimeVariation(s.m, data, s.q, s.v)
@@ -129,7 +137,7 @@ def _add_frames(s: Probed) -> None:
 
 
 def _add_hessians(s: Probed) -> None:
-    data, derived = s.moved(), s.m.createData()
+    data, derived = s.moved(), s.workspace()
     pin.computeJointJacobians(s.m, data, s.q)
     pin.computeJointKinematicHessians(s.m, derived, s.q)
     for name in FRAMES:
@@ -230,7 +238,7 @@ def _add_points(s: Probed, derived: pin.Data, name: str) -> None:
 
 def _add_data(s: Probed) -> None:
     """Add what algorithms leave in their data, joint by joint."""
-    m, data, derived = s.m, s.m.createData(), s.m.createData()
+    m, data, derived = s.m, s.workspace(), s.workspace()
     pin.rnea(m, data, s.q, s.v, s.a)
     pin.computeRNEADerivatives(m, derived, s.q, s.v, s.a)
     pin.forwardKinematics(m, data, s.q, s.v, s.a)
@@ -271,7 +279,7 @@ def _add_data(s: Probed) -> None:
 
 
 def _add_centres(s: Probed) -> None:
-    m, (q, v, a), data, derived = s.m, s.motion, s.m.createData(), s.m.createData()
+    m, (q, v, a), data, derived = s.m, s.motion, s.workspace(), s.workspace()
     s.add("total_mass", ("computeTotalMass",), pin.computeTotalMass(m))
     pin.centerOfMass(m, data, q, v, a)
     pin.forwardKinematics(m, derived, q, v, a)
@@ -311,7 +319,7 @@ def _add_centres(s: Probed) -> None:
 
 
 def _add_subtrees(s: Probed) -> None:
-    m, (q, v, a), data, other = s.m, s.motion, s.m.createData(), s.m.createData()
+    m, (q, v, a), data, other = s.m, s.motion, s.workspace(), s.workspace()
     pin.centerOfMass(m, data, q, v, a, True)
     poses = [(j, data.oMi[j].copy()) for j in s.joints]
     s.add("subtree_centre", ("centerOfMass",), [pose.act(data.com[j]) for j, pose in poses])
@@ -331,7 +339,7 @@ def _add_subtrees(s: Probed) -> None:
 
 
 def _add_regressors(s: Probed, bodies: Sequence[pin.Inertia]) -> None:
-    m, data, moved, local = s.m, s.m.createData(), s.moved(), pin.ReferenceFrame.LOCAL
+    m, data, moved, local = s.m, s.workspace(), s.moved(), pin.ReferenceFrame.LOCAL
     pin.rnea(m, data, s.q, s.v, s.a)
     pin.updateFramePlacements(m, data)
     forces, velocities = (defaultdict[str, list[Any]](list) for _ in range(2))
@@ -359,8 +367,8 @@ def _add_regressors(s: Probed, bodies: Sequence[pin.Inertia]) -> None:
 
 
 def _add_torques(s: Probed) -> None:
-    m, (q, v, a), data = s.m, s.motion, s.m.createData()
-    terms, derived, zero = m.createData(), m.createData(), np.zeros(m.nv)
+    m, (q, v, a), data = s.m, s.motion, s.workspace()
+    terms, derived, zero = s.workspace(), s.workspace(), np.zeros(m.nv)
     pin.computeAllTerms(m, terms, q, v)
     M, none = _add_products(s, terms), pin.StdVec_Force()
     none.extend([pin.Force.Zero()] * m.njoints)
@@ -402,12 +410,12 @@ def _add_batch(s: Probed) -> None:
 
 def _add_products(s: Probed, terms: pin.Data) -> Array:
     """Add products with the mass matrix, its factors and its inverse; return the matrix."""
-    m, q, v, data = s.m, s.q, s.v, s.m.createData()
+    m, q, v, data = s.m, s.q, s.v, s.workspace()
     M = s.square(pin.crba(m, data, q))
     momentum = M @ v
     pin.cholesky.decompose(m, data)
     U, D, upper = s.square(data.U), np.ravel(data.D), np.triu(s.square(terms.M))
-    world = s.square(pin.crba(m, m.createData(), q, pin.Convention.WORLD))
+    world = s.square(pin.crba(m, s.workspace(), q, pin.Convention.WORLD))
     momenta: dict[Call, Array] = {
         ("crba", "Data.M"): momentum,
         ("crba", "Convention", "Convention.WORLD"): world @ v,
@@ -426,7 +434,7 @@ def _add_products(s: Probed, terms: pin.Data) -> Array:
 
 
 def _add_energies(s: Probed, parameters: Array, g: Array, none: pin.StdVec_Force) -> None:
-    m, (q, v, a), data, zero = s.m, s.motion, s.m.createData(), np.zeros(s.m.nv)
+    m, (q, v, a), data, zero = s.m, s.motion, s.workspace(), np.zeros(s.m.nv)
     kinetic = pin.computeKineticEnergyRegressor(m, data, q, v) @ parameters + armature(m) @ v**2 / 2
     gravity = pin.computePotentialEnergyRegressor(m, data, q) @ parameters
     both = pin.computeMechanicalEnergy(m, data, q, v)
