@@ -49,7 +49,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from copy import copy
 from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 from itertools import combinations, pairwise
 from types import MappingProxyType
 from typing import Any, ClassVar, Literal
@@ -206,10 +208,10 @@ class Mujoco(MetamorphicHooks):
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
         if self.is_soft(model):
-            soft = _SoftMechanism(model, self.option, self.body_pieces(model), self._change)
+            soft = self._soft(model)
             with _raise_on_warnings(soft.tree.d):
                 return [_rigid_limit(soft, state) for state in states]
-        chain = _MujocoChain(model, self.body_pieces(model), dense=self.option == DENSE, change=self._change)
+        chain = self._chain(model)
         with _raise_on_warnings(chain.d):
             return [chain.quantities(state) for state in states]
 
@@ -248,6 +250,18 @@ class Mujoco(MetamorphicHooks):
     def _change(self) -> Change:
         return self.variant.change if self.variant else Change()
 
+    def _chain(self, model: Model) -> _MujocoChain:
+        """The mechanism as the adapter is set; what is compiled as usual is a copy."""
+        if self.has_welded_halves or not self._change.is_after_compiling:
+            return _MujocoChain(model, self.body_pieces(model), self.option == DENSE, change=self._change)
+        return _compiled_chain(model, self.option == DENSE).copied(self._change)
+
+    def _soft(self, model: Model) -> _SoftMechanism:
+        """The same where constraints hold it."""
+        if self.has_welded_halves or not self._change.is_after_compiling:
+            return _SoftMechanism(model, self.option, self.body_pieces(model), self._change)
+        return _compiled_mechanism(model, self.option).copied(self._change)
+
     def _surface(self, model: Model, states: Sequence[State]) -> Sequence[SurfaceAnswer]:
         if self.is_soft(model):
             return []
@@ -269,7 +283,7 @@ class Mujoco(MetamorphicHooks):
             raise Unsupported(TENDON_MOTIONS)
         if self.is_soft(model):
             return self._rigid_run(model, state, times, integrator, resolution)
-        return self._sampled_run(_MujocoChain(model), state, (times, integrator, resolution))
+        return self._sampled_run(self._chain(model), state, (times, integrator, resolution))
 
     def _step(self, model: Model, state: State, times: Array, integrator: Integrator, step: float) -> StepRun:
         is_soft = is_constrained(model) and not self.option
@@ -278,7 +292,7 @@ class Mujoco(MetamorphicHooks):
 
     def _softened(self, model: Model, largest: float) -> list[_SoftMechanism]:
         """The mechanism at regularisations that fall from the largest."""
-        found = [_SoftMechanism(model, self.option) for _ in range(RUN_REGULARISATIONS)]
+        found = [self._soft(model) for _ in range(RUN_REGULARISATIONS)]
         for k, soft in enumerate(found):
             soft.tree.soften(largest / RATIO**k)
             soft.tree.m.opt.iterations = RUN_ITERATIONS
@@ -340,16 +354,20 @@ class Mujoco(MetamorphicHooks):
         times, integrator, resolution = run
         chain.prepare(state, integrator, resolution)
         counts = np.round(times / resolution).astype(int)
-        t, rows = [0.0], [(*chain.sample(), *chain.joint_sample())]
+        t, rows = [0.0], [chain.sample()]
+        joint_q, joint_v = [chain.d.qpos.copy()], [chain.d.qvel.copy()]
         advance = advance or (lambda count: mujoco.mj_step(chain.m, chain.d, nstep=count))
         with _raise_on_warnings(chain.d):
             for done in np.diff(counts):
                 advance(int(done))
                 t.append(chain.d.time)  # the engine's own clock: the contract's checks notice a reset
-                rows.append((*chain.sample(), *chain.joint_sample()))
-        r, p, v, omega, joint_q, joint_v = (np.array(column) for column in zip(*rows, strict=True))
+                rows.append(chain.sample())
+                joint_q.append(chain.d.qpos.copy())
+                joint_v.append(chain.d.qvel.copy())
+        r, p, v, omega = (np.array(column) for column in zip(*rows, strict=True))
         pdot = kinematics.quaternion_rate(p, omega)
-        steps, own = int(counts[-1]), {"coordinates": joint_q, "velocities": joint_v}
+        own = dict(zip(("coordinates", "velocities"), chain.joint_samples(joint_q, joint_v), strict=True))
+        steps = int(counts[-1])
         return Trajectory(t=np.array(t), r=r, p=p, v=v, pdot=pdot, steps=steps, **own)
 
 
@@ -396,8 +414,8 @@ class _MujocoChain:
         spec, self.change = mujoco.MjSpec(), change
         compiler_of(spec).autolimits = False
         self.model, self.use_dense_solve = model, dense
-        self.last_state: State | None = None  # and its coordinates, velocities and T
-        self.last_coordinates: tuple[Array, ...] = ()
+        # coordinates, velocities and T of states that regularisations, variants and runs follow each other at
+        self.coordinates = dict[State, tuple[Array, Array, Array]]()
         self.link_ids: list[int] = []
         self.ball_ids: list[int] = []
         self.mass: list[float] = [0.0]
@@ -447,7 +465,20 @@ class _MujocoChain:
         self.softness = tuple(np.copy(getattr(m, name)) for name in SOFTNESS)
         self.applied_wrenches = np.zeros((m.nbody, 6))
         self.applied_wrenches[self.link_ids, :3] = model.force
-        self.readout_data = mujoco.MjData(m)
+
+    @cached_property
+    def readout_data(self) -> Any:
+        """Data that samples are read with."""
+        return mujoco.MjData(self.m)
+
+    def copied(self, change: Change) -> _MujocoChain:
+        """The same, compiled alike, with data and numbers of its own that are changed."""
+        other, m = copy(self), copy(self.m)
+        d = mujoco.MjData(m)
+        mujoco.mj_copyData(d, m, self.d)
+        other.change = change
+        other.m, other.d = change.remake(m, d)
+        return other
 
     def _add_link(self, parent: Any, k: int, hang: Array, pieces: tuple[RigidPart, ...]) -> Any:
         """Add a body of one part, or a massless one with its parts welded to it, on its joint."""
@@ -544,11 +575,12 @@ class _MujocoChain:
         """Write a state into the engine's data; returns T (nv, nu)."""
         m, d = self.m, self.d
         self.change.reset(m, d)
-        if state is not self.last_state:  # regularisations follow each other at one state
+        if state not in self.coordinates:
+            if self.change.ball_joints is HINGES:  # whose turn is in the model
+                self.coordinates.clear()
             T = self._set_coordinates(state)
-            self.last_state = state
-            self.last_coordinates = d.qpos.copy(), T @ kinematics.minimal_rates(self.model, state), T
-        d.qpos, d.qvel, T = self.last_coordinates
+            self.coordinates[state] = d.qpos.copy(), T @ kinematics.minimal_rates(self.model, state), T
+        d.qpos, d.qvel, T = self.coordinates[state]
         d.xfrc_applied, d.qfrc_applied = self.applied_wrenches, self.effort
         return np.asarray(T)
 
@@ -650,17 +682,17 @@ class _MujocoChain:
         omega = _to_body_frame(probe.xmat[self.link_ids], velocity[:, :3])
         return probe.xpos[self.link_ids], p, velocity[:, 3:], omega
 
-    def joint_sample(self) -> tuple[Array, Array]:
-        """Return qpos and qvel as `Trajectory` orders them: rods point along z there, along −z here."""
-        q, v, m = self.d.qpos.copy(), self.d.qvel.copy(), self.m
+    def joint_samples(self, qpos: Sequence[Array], qvel: Sequence[Array]) -> tuple[Array, Array]:
+        """Return samples as `Trajectory` orders them: rods point along z there, along −z here."""
+        q, v, m = np.array(qpos), np.array(qvel), self.m
         for kind, b in zip(self.model.kinds, self.link_ids, strict=True):
             at, dof = m.jnt_qposadr[m.body_jntadr[b]], m.body_dofadr[b]
             if kind.holds_nothing:
-                q[at : at + 7] = np.roll(q[at : at + 7], 4)
+                q[:, at : at + 7] = np.roll(q[:, at : at + 7], 4, axis=1)
             if kind.holds_distance:  # its rod is the body before
-                q[at : at + 4] = kinematics.quaternion_product(-HALF_TURN, q[at : at + 4])
-                q[at - 4 : at] = kinematics.quaternion_product(q[at - 4 : at], HALF_TURN)
-                v[dof - 2 : dof] *= -1
+                q[:, at : at + 4] = kinematics.quaternion_product(-HALF_TURN, q[:, at : at + 4])
+                q[:, at - 4 : at] = kinematics.quaternion_product(q[:, at - 4 : at], HALF_TURN)
+                v[:, dof - 2 : dof] *= -1
         return q, v
 
     def _spatial_motion(self, mujoco_function: Callable[..., None], data: Any) -> Array:
@@ -701,6 +733,12 @@ class _SoftMechanism:
         parts = None if self.cut.ends or self.rodless else parts  # whose bodies are in another order
         self.tree = _MujocoChain(held, parts, option == DENSE, constraints, change=change, has_text=has_text)
 
+    def copied(self, change: Change) -> _SoftMechanism:
+        """The same with a copy of its tree."""
+        other = copy(self)
+        other.tree = self.tree.copied(change)
+        return other
+
     def state(self, state: State) -> State:
         """The state of the tree."""
         there = self.rodless.state(state) if self.rodless else state
@@ -735,6 +773,11 @@ class _SoftMechanism:
         u = kinematics.joint_coordinates(self.source, state)[0][self.rods]
         found["joint_reaction"][self.rods] = self.tree.pushes()[:, None] * u
         return StateQuantities(**found)
+
+
+# Variants, steps and runs are of the same mechanisms in turn; these are not run themselves.
+_compiled_chain = lru_cache(maxsize=8)(lambda model, dense: _MujocoChain(model, dense=dense))
+_compiled_mechanism = lru_cache(maxsize=8)(_SoftMechanism)
 
 
 def _rigid_limit(soft: _SoftMechanism, state: State) -> StateQuantities:

@@ -40,6 +40,7 @@ for _half, _axis in zip(HINGE_ANGLES / 2, np.eye(3), strict=True):
 # ω of the body in its own axes = HINGE_RATES (rates of the three hinges)
 HINGE_RATES = rate_maps(Pose(np.zeros(3), HINGE_TURN))["xyzdot"]
 BALL = ({"type": mujoco.mjtJoint.mjJNT_BALL},)
+FREE = ({"type": mujoco.mjtJoint.mjJNT_FREE},)
 HINGES, SLIDES = (
     tuple({"type": getattr(mujoco.mjtJoint, f"mjJNT_{kind}"), "axis": axis} for axis in np.eye(3))
     for kind in ("HINGE", "SLIDE")
@@ -85,7 +86,13 @@ class Change:
     forward: Callable[[Any, Any], None] = mujoco.mj_forward
     has_own_inertia: bool = False  # whether principal inertias are those that MuJoCo computes
     ball_joints: Sequence[Mapping[str, Any]] = BALL  # of bodies and of rods
-    free_joints: Sequence[Mapping[str, Any]] = ({"type": mujoco.mjtJoint.mjJNT_FREE},)
+    free_joints: Sequence[Mapping[str, Any]] = FREE
+
+    @property
+    def is_after_compiling(self) -> bool:
+        """Whether the description is the usual one."""
+        usual = self.describe is _no_change and not self.has_own_inertia
+        return usual and self.ball_joints is BALL and self.free_joints is FREE
 
 
 def _set_options(**values: Any) -> Callable[[Any, Any], tuple[Any, Any]]:
