@@ -203,8 +203,7 @@ class Adapter(ABC):
 
         """
         self._check_mechanism(model, self.builds_elements)
-        for state in states:
-            check_state(model, state)
+        check_state(model, *states)
         with self._checked_refusals(model):
             answers = self._evaluate(model, states)
         check_evaluation(answers, model, len(states), f"{self.name}._evaluate")
@@ -361,32 +360,33 @@ def _has_elements(model: Model, is_meant: Callable[[JointKind], bool], *elements
     return any(bool(np.any(getattr(model, element)[joints])) for element in elements)
 
 
-def check_state(model: Model, state: State) -> None:
+def check_state(model: Model, *states: State) -> None:
     """Refuse input that engines accept silently.
 
     Args:
         model: the pendulum; every array must be finite.
-        state: arrays must have the model's shapes, be float64 and finite, and ``p`` of unit length.
+        *states: arrays must have the model's shapes, be float64 and finite, and ``p`` of unit length.
 
     Raises:
         BadInput: one of these does not hold; the message names the array.
 
     """
     widths = {"p": 4, "x": model.columns, "xdot": model.columns}
-    for name, array in vars(state).items():
-        shape = model.n, widths.get(name, 3)
-        if np.shape(array) != shape:
-            raise BadInput(f"state.{name} has shape {np.shape(array)}, expected {shape}")
-        if array.dtype != np.float64:
-            raise BadInput(f"state.{name} is {array.dtype}, expected float64")
-        if not np.all(np.isfinite(array)):
-            raise BadInput(f"state.{name} is not finite")
-    norms = np.linalg.norm(state.p, axis=-1)
-    if np.any(np.abs(norms - 1) > UNIT_NORM_TOLERANCE):
-        raise BadInput(f"state.p is not normalised: |p| = {norms.tolist()}")
-    for array_name, values in vars(model).items():
-        if array_name != "kind" and not np.all(np.isfinite(values)):
-            raise BadInput(f"model.{array_name} is not finite")
+    for state in states:
+        for name, array in vars(state).items():
+            shape = model.n, widths.get(name, 3)
+            if np.shape(array) != shape:
+                raise BadInput(f"state.{name} has shape {np.shape(array)}, expected {shape}")
+            if array.dtype != np.float64:
+                raise BadInput(f"state.{name} is {array.dtype}, expected float64")
+            if not np.isfinite(array).all():
+                raise BadInput(f"state.{name} is not finite")
+        norms = np.linalg.norm(state.p, axis=-1)
+        if np.any(np.abs(norms - 1) > UNIT_NORM_TOLERANCE):
+            raise BadInput(f"state.p is not normalised: |p| = {norms.tolist()}")
+    for name, values in vars(model).items():
+        if name != "kind" and not np.isfinite(values).all():
+            raise BadInput(f"model.{name} is not finite")
 
 
 def check_times(times: Float[Array, "samples"], step: float) -> None:

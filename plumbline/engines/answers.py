@@ -114,19 +114,19 @@ def check_numbers(
         kinds = (int, np.integer) if shape else (int, float, np.integer, np.floating)
         is_valid = isinstance(value, kinds) and not isinstance(value, bool)
         is_valid = is_valid and not (shape and value < 0)
-        wanted = "a whole number, 0 or more" if shape else "a real number"
     else:
         is_valid = type(value) is np.ndarray and value.dtype == np.float64
-        wanted = f"an array of float64 of shape {_words(_dimensions(shape, sizes))}"
+    expected = () if shape == COUNT else _dimensions(shape, sizes)
     if not is_valid:
+        wanted = "a whole number, 0 or more" if shape else "a real number"
+        wanted = f"an array of float64 of shape {_words(expected)}" if expected else wanted
         more = ", or None" if is_optional else ""
         raise EngineFailure(f"{label} is {describe_value(value)}, must be {wanted}{more}")
-    expected = () if shape == COUNT else _dimensions(shape, sizes)
     found = np.shape(value)
     is_fitting = all(isinstance(size, str) or size == n for n, size in zip(found, expected, strict=False))
     if len(found) != len(expected) or not is_fitting:
         raise EngineFailure(f"{label} has shape {found}, expected {_words(expected)}")
-    if must_be_finite and not np.all(np.isfinite(value)):
+    if must_be_finite and not np.isfinite(value).all():
         raise EngineFailure(f"{label} is not finite")
 
 
