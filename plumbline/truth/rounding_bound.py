@@ -36,7 +36,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -74,6 +74,8 @@ MAX_ENTRIES = 3_000_000  # of the responses of a batch of states: more do not fi
 class RoundingBound:
     """Tolerances at one state; differences of 3-vectors are compared by their Euclidean norm.
 
+    Those at many states (`bounds_at`) are arrays with a leading axis.
+
     ``scale`` holds per field what the tolerance is relative to: max(‖r̈‖, g), the largest moment in the body's
     Euler equation over |J|, max(‖F‖, m g), and the sums of magnitudes behind the scalars.
     """
@@ -82,16 +84,26 @@ class RoundingBound:
     angular_acceleration: Array  # (N,) rad/s²
     joint_reaction: Array  # (J,) N
     joint_moment: Array  # (J,) N m
-    kinetic_energy: float  # J
-    potential_energy: float  # J
-    angular_momentum: float  # kg m²/s
-    mass_matrix: float  # kg m², of each entry
+    kinetic_energy: Array | float  # J
+    potential_energy: Array | float  # J
+    angular_momentum: Array | float  # kg m²/s
+    mass_matrix: Array | float  # kg m², of each entry
     scale: dict[str, Array | float]
     kinematics: Array  # (4, N): of r [m], v [m/s], attitudes [rad] and ω [rad/s] that follow from coordinates
     of_gaps: Array  # (2, N) m/s² and rad/s², the part of both by the roundings of gaps that steps correct
     rod_torque: Array  # (N,) N m, of the torques at both ends of the rod that body k hangs by; 0 for a ball
-    joint_terms: float  # N m about the origin, of the terms of all joints
-    joint_power: float  # W, of the same with the joints' rates
+    joint_terms: Array | float  # N m about the origin, of the terms of all joints
+    joint_power: Array | float  # W, of the same with the joints' rates
+
+    def __getitem__(self, s: int) -> RoundingBound:
+        """Take those at one of many states."""
+
+        def at(x: Array | float) -> Any:
+            one = np.asarray(x)[s]
+            return one if np.ndim(one) else float(one)
+
+        own = {name: at(x) for name, x in vars(self).items() if name != "scale"}
+        return RoundingBound(**own, scale={name: at(x) for name, x in self.scale.items()})
 
     def tolerance(self, quantity: str) -> Array | float:
         """Look up a tolerance by the name of its quantity.
@@ -188,56 +200,63 @@ def rounding_bounds(
         LinAlgError: the system is singular.
 
     """
+    if not states:
+        return []
+    together = bounds_at(model, stack_states(states), parts, method)
+    return [together[s] for s in range(len(states))]
+
+
+def bounds_at(
+    model: Model, states: State, parts: BodyParts | None = None, method: JointSpaceMethod | None = None
+) -> RoundingBound:
+    """Compute the same at many states (S, ...) as arrays (S, ...)."""
     size = max(1, MAX_ENTRIES // (12 * len(model.kind)) ** 2)
     found: list[RoundingBound] = []
-    for first in range(0, len(states), size):
+    for first in range(0, len(states.p), size):
         some = states[first : first + size]
         if model.has_loops:
-            found += _of_loops(model, some, method)
+            found.append(_of_loops(model, some, method))
         else:
-            found += _of_tree(_Terms(model, some, parts, method=method))
-    return found
+            found.append(_of_tree(_Terms(model, some, parts, method=method)))
+    first_one, *_ = found
+    own = {
+        name: np.concatenate([getattr(one, name) for one in found])
+        for name in vars(first_one)
+        if name != "scale"
+    }
+    scale = {name: np.concatenate([one.scale[name] for one in found]) for name in first_one.scale}
+    return RoundingBound(**own, scale=scale)
 
 
-def _of_tree(terms: _Terms) -> list[RoundingBound]:
-    total, scale, sums, rods, joints, motion = terms.bounds()
-    return [
-        _bound(total[s], _at(scale, s), _at(sums, s), rods[s], joints[s], motion[:, s])
-        for s in range(len(total))
-    ]
+def _of_tree(terms: _Terms) -> RoundingBound:
+    return _bound(*terms.bounds())
 
 
-def _of_loops(model: Model, states: Sequence[State], method: JointSpaceMethod | None) -> list[RoundingBound]:
+def _of_loops(model: Model, states: State, method: JointSpaceMethod | None) -> RoundingBound:
     """Bounds of a mechanism with loops, cut open."""
-    cut, found = cut_open(model), list[RoundingBound]()
-    there = cut.state(stack_states(states))
+    cut = cut_open(model)
+    there = cut.state(states)
     terms = _Terms(cut.model, there, None, cut.ends, cut.row_scale, method)
     totals, scales, sums, _, joints, motion = terms.bounds(is_eliminated=method is None)
-    (of_welds, of_gaps), spreads = terms.weld_errors(), np.ones(len(states))
+    (of_welds, of_gaps), spread = terms.weld_errors(), np.ones(len(totals))
     if method is None:
-        spreads += 1 / smallest_singular_values(cut, there, regular_rank(model, states[0]))
+        spread += 1 / smallest_singular_values(cut, there, regular_rank(model, states[0]))
     else:
         totals += terms.factor_errors() + of_gaps
-    for s, spread in enumerate(spreads.tolist()):
-        # what one body or joint has is found together with what all others of the loop have
-        largest = {name: float(np.max(value)) for name, value in _at(scales, s).items()}
-        reaction = wrench_length(model) * largest["joint_reaction"]
-        largest["joint_moment"] = max(largest["joint_moment"], reaction)
-        sizes = list(largest.values())
-        total = totals[s] + of_welds[s] + sizes + (terms.of_rows[s] + of_welds[s] + sizes) * (spread - 1)
-        scale = {
-            name: np.full(len(model.kind) if name in ("joint_reaction", "joint_moment") else model.n, value)
-            for name, value in largest.items()
-        }
-        spread_sums = {name: size * spread for name, size in _at(sums, s).items()}
-        largest_motion = np.repeat(np.max(motion[:, s], axis=-1, keepdims=True), model.n, axis=-1)
-        of_joints = np.zeros(model.n), spread * joints[s], spread * largest_motion, of_gaps[s, cut.place]
-        found.append(_bound(total[cut.place], scale, spread_sums, *of_joints))
-    return found
-
-
-def _at(values: dict[str, Array], s: int) -> dict[str, Array]:
-    return {name: value[s] for name, value in values.items()}
+    # what one body or joint has is found together with what all others of the loop have
+    largest = {name: np.max(value, axis=1) for name, value in scales.items()}
+    reaction = wrench_length(model) * largest["joint_reaction"]
+    largest["joint_moment"] = np.maximum(largest["joint_moment"], reaction)
+    sizes = np.stack([*largest.values()], -1)[:, None]
+    total = totals + of_welds + sizes
+    total = total + (terms.of_rows + of_welds + sizes) * (spread - 1)[:, None, None]
+    counts = {name: len(model.kind) if name.startswith("joint") else model.n for name in largest}
+    scale = {name: np.repeat(value[:, None], counts[name], axis=1) for name, value in largest.items()}
+    spread_sums = {name: size * spread for name, size in sums.items()}
+    largest_motion = np.repeat(np.max(motion, axis=-1, keepdims=True), model.n, axis=-1)
+    rods = np.zeros((len(spread), model.n))
+    of_joints = spread[:, None] * joints, spread[:, None] * largest_motion
+    return _bound(total[:, cut.place], scale, spread_sums, rods, *of_joints, of_gaps[:, cut.place])
 
 
 def _bound(
@@ -249,21 +268,21 @@ def _bound(
     motion: Array,
     of_gaps: Array | None = None,
 ) -> RoundingBound:
-    """Tolerances by the sums of all sizes: (J, 4) of joints, of which the first hold the bodies."""
-    total, sizes = ROUNDING_FACTOR * EPS * total, {name: float(size) for name, size in sums.items()}
+    """Tolerances by the sums of all sizes: (S, J, 4) of joints, of which the first hold the bodies."""
+    total, n = ROUNDING_FACTOR * EPS * total, rods.shape[1]
     of_gaps = 0 * total if of_gaps is None else ROUNDING_FACTOR * EPS * of_gaps
     return RoundingBound(
-        acceleration=total[: len(rods), 0],
-        angular_acceleration=total[: len(rods), 1],
-        joint_reaction=total[:, 2],
-        joint_moment=total[:, 3],
-        scale=scale | sizes,
-        kinematics=ROUNDING_FACTOR * EPS * motion,
-        of_gaps=of_gaps[: len(rods), :2].T,
+        acceleration=total[:, :n, 0],
+        angular_acceleration=total[:, :n, 1],
+        joint_reaction=total[:, :, 2],
+        joint_moment=total[:, :, 3],
+        scale=scale | sums,
+        kinematics=ROUNDING_FACTOR * EPS * np.moveaxis(motion, 0, 1),
+        of_gaps=of_gaps[:, :n, :2].mT,
         rod_torque=ROUNDING_FACTOR * EPS * rods,
-        joint_terms=float(ROUNDING_FACTOR * EPS * joints[0]),
-        joint_power=float(ROUNDING_FACTOR * EPS * joints[1]),
-        **{name: SUM_ROUNDING_FACTOR * EPS * size for name, size in sizes.items()},
+        joint_terms=ROUNDING_FACTOR * EPS * joints[:, 0],
+        joint_power=ROUNDING_FACTOR * EPS * joints[:, 1],
+        **{name: SUM_ROUNDING_FACTOR * EPS * size for name, size in sums.items()},
     )
 
 

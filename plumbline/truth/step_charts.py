@@ -51,6 +51,8 @@ from plumbline.model.step_methods import JointSpaceMethod
 Array = NDArray[Any]  # in this module of extended precision, where nothing else is stated
 LongDouble: Any = np.longdouble
 Forces = Literal["all", "applied", "joint dampers"]
+# quaternions of the bodies and of the rods by joint, and those that turns of the charts lead to, as matrices
+_Attitudes = tuple[list[Array], dict[int, Array], dict[int, Array], dict[int, Array]]
 UNIT: Array = np.array([1, 0, 0, 0], LongDouble)
 PROXIMAL_DAMPING = LongDouble(1e-10)  # of rows scaled to a unit diagonal of J M⁻¹ Jᵀ
 PROXIMAL_STEPS = 10
@@ -96,6 +98,8 @@ class StepCharts:
     """Coordinates and accelerations of a mechanism; q is a list over the charts, v is (..., nv)."""
 
     is_new_step = True  # for formulas that keep accelerations from step to step
+    _tree: tuple[list[Array], Array, _MovingTree] | None = None
+    _attitudes: tuple[list[Array], _Attitudes] | None = None
 
     def __init__(
         self, model: Model, method: JointSpaceMethod, states: Sequence[State],
@@ -374,7 +378,7 @@ class StepCharts:
         self, q: list[Array], v: Array, damped: Model | None = None
     ) -> tuple[Array, Solution, _MovingTree]:
         """v̇ with all rows held; ``damped`` has further rotors."""
-        tree = _MovingTree(self, q, v, None if self.is_held else damped)
+        tree = self.tree(q, v) if damped is None or self.is_held else _MovingTree(self, q, v, damped)
         wrenches = tree.holding_wrenches()
         found = tree.solve(wrenches)
         if self.is_held:
@@ -479,6 +483,21 @@ class StepCharts:
             bodies.append(np.broadcast_to(here, (*own.shape[:-1], 4)))
         return bodies, rods
 
+    def tree(self, q: list[Array], v: Array) -> _MovingTree:
+        """The mechanism at coordinates and velocities; asked for in turn for the same arrays, it is one."""
+        if self._tree is None or self._tree[0] is not q or self._tree[1] is not v:
+            self._tree = q, v, _MovingTree(self, q, v)
+        return self._tree[2]
+
+    def attitudes(self, q: list[Array]) -> _Attitudes:
+        """The attitudes at coordinates; asked for in turn for the same list, they are found once."""
+        if self._attitudes is None or self._attitudes[0] is not q:
+            p, rod_p = self.quaternions(q)
+            turned = {k: rotation_matrix(one) for k, one in enumerate(p) if self.model.kinds[k].has_attitude}
+            rod_turned = {k: rotation_matrix(one) for k, one in rod_p.items()}
+            self._attitudes = q, (p, rod_p, turned, rod_turned)
+        return self._attitudes[1]
+
     def bodies(self, q: list[Array], v: Array) -> BodyStates:
         """Return the motion of the mechanism's bodies.
 
@@ -489,7 +508,7 @@ class StepCharts:
             Positions, attitudes, rates, and coordinates of joints.
 
         """
-        tree, n = _MovingTree(self, q, v), self.model.n
+        tree, n = self.tree(q, v), self.model.n
         lead = v.shape[:-1]
         omega = tree.in_bodies(tree.w)
         r, velocity, omega_ = (stacked(x, lead) for x in (tree.r, tree.v, omega))
@@ -529,11 +548,7 @@ class _MovingTree(Tree):
     def __init__(self, charts: StepCharts, q: list[Array], v: Array, model: Model | None = None) -> None:
         self.charts, self.q = charts, q
         self.rates = [v[..., own] for own in charts.own]
-        self.p, self.rod_p = charts.quaternions(q)
-        # the attitudes that turns of the charts lead to, as matrices
-        kinds = charts.model.kinds
-        self.turned = {k: rotation_matrix(p) for k, p in enumerate(self.p) if kinds[k].has_attitude}
-        self.rod_turned = {k: rotation_matrix(p) for k, p in self.rod_p.items()}
+        self.p, self.rod_p, self.turned, self.rod_turned = charts.attitudes(q)
         self.rod_w: dict[int, Array] = {}
         self.rods: dict[int, tuple[Array, Array]] = {}  # u and u̇
         self.axes: dict[int, tuple[list[Array], Array]] = {}  # by chart: of its angles; α at q̈ = 0 of them

@@ -47,8 +47,8 @@ from plumbline.truth.rounding_bound import (
     SUM_ROUNDING_FACTOR,
     TINY,
     RoundingBound,
+    bounds_at,
     remembered_rounding_bound,
-    rounding_bounds,
 )
 from plumbline.truth.step_charts import BodyStates, LongDouble, StepCharts
 from plumbline.truth.step_formulas import (
@@ -201,8 +201,8 @@ class FormulaSteps:
         self.starts, sizes = [states[index] for index, *_ in starts], [h for _, h, _ in starts]
         axes = [angle_axes for *_, angle_axes in starts]
         used = dict.fromkeys(index for index, *_ in starts)
-        bounds = acceleration_bounds(method, model, [states[index] for index in used])
-        self.bounds = dict(zip(used, bounds, strict=True))
+        bounds = acceleration_bounds(method, model, stack_states([states[index] for index in used]))
+        self.bounds = {index: bounds[i] for i, index in enumerate(used)}
         nearby = {index: _disturbed(model, states[index], self.bounds[index]) for index in used}
         disturbed = [nearby[index] for index, *_ in starts]
         self.counts = tuple(counts) or step_counts(method)
@@ -296,10 +296,10 @@ class FormulaSteps:
         if (i, count) not in self._end_bounds:  # of all runs that go through at once
             runs = [j for j in range(len(self.places)) if j == i or self.growth[j, count] < MAX_GROWTH]
             states = [self.true[j][count].rounded() for j in runs]
-            bounds = acceleration_bounds(self.method, self.model, states)
-            for j, end, after in zip(runs, states, bounds, strict=True):
+            bounds = acceleration_bounds(self.method, self.model, stack_states(states))
+            for at, (j, end) in enumerate(zip(runs, states, strict=True)):
                 index, h = self.places[j]
-                ends = self.bounds[index], after
+                ends = self.bounds[index], bounds[at]
                 self._end_bounds[j, count] = ends, self.step_bound((self.starts[j], end), ends, h, count)
         return self._end_bounds[i, count]
 
@@ -317,35 +317,38 @@ class FormulaSteps:
             By quantity the bounds (N,), in its unit of `STEP_QUANTITIES`.
 
         """
-        sizes = _sizes(stack_states(ends), bounds)
+        of_ends = {name: np.array([getattr(b, name) for b in bounds]) for name in ACCELERATIONS}
+        sizes = _sizes(stack_states(ends), of_ends)
         largest = {name: np.max(size, axis=0) for name, size in sizes.items()}
         return step_bound(self.method, self.model, largest, h, count)
 
 
-def acceleration_bounds(
-    method: JointSpaceMethod, model: Model, states: Sequence[State]
-) -> list[RoundingBound]:
+def acceleration_bounds(method: JointSpaceMethod, model: Model, states: State) -> RoundingBound:
     """Compute the bounds of accelerations in steps.
 
+    Args:
+        states: S of them.
+
     Returns:
-        The state level's, and what the correction of gaps adds, or on trees the formula's own errors.
+        The state level's, and what the correction of gaps adds, or on trees the formula's own errors;
+        arrays (S, ...).
 
     """
-    bounds = rounding_bounds(model, states, method=method)
+    bounds = bounds_at(model, states, method=method)
     if model.has_loops:
         return bounds
     added = _formula_errors(model, states)
-    return [
-        replace(b, acceleration=b.acceleration + a, angular_acceleration=b.angular_acceleration + alpha)
-        for b, (a, alpha) in zip(bounds, added, strict=True)
-    ]
+    return replace(
+        bounds,
+        acceleration=bounds.acceleration + added[:, 0],
+        angular_acceleration=bounds.angular_acceleration + added[:, 1],
+    )
 
 
-def _sizes(states: State, bounds: Sequence[RoundingBound]) -> dict[str, Array]:
+def _sizes(states: State, bounds: Mapping[str, Array]) -> dict[str, Array]:
     """What a step's bound depends on (S, N), at S states and in units of their bounds."""
     norm = np.linalg.norm
-    found = {name: np.array([getattr(b, name) for b in bounds]) for name in ACCELERATIONS}
-    return found | {
+    return {name: bounds[name] for name in ACCELERATIONS} | {
         "rate": np.maximum(norm(states.omega, axis=-1), norm(states.udot, axis=-1)),
         "speed": norm(states.v, axis=-1),
         "place": norm(states.r, axis=-1),
@@ -476,14 +479,15 @@ def _rod_spins(model: Model, charts: StepCharts, v: Array, states: State) -> Arr
     return np.abs(found)
 
 
-def _formula_errors(model: Model, states: Sequence[State]) -> Array:
+def _formula_errors(model: Model, states: State) -> Array:
     """(S, 2, N) errors of r̈ and ω̇′ by the formula itself, in extended precision.
 
     Its recursion loses digits where light bodies carry heavy ones, as in doubles, where the same loss shows
     and is larger by the ratio of the two precisions.  Of the samples of a run, the largest loss counts.
     """
-    some = _every_few(len(states))
-    state, found = stack_states([states[n] for n in some]), list[Any]()
+    count = len(states.p)
+    some = _every_few(count)
+    state, found = states[some], list[Any]()
     for dtype in (np.float64, LongDouble):
         tree = Tree(floats(dtype), model, state)
         solution = tree.solve()
@@ -492,7 +496,7 @@ def _formula_errors(model: Model, states: Sequence[State]) -> Array:
     size = np.linalg.norm(np.asarray(found[0] - found[1], float), axis=-1)
     share = float(np.finfo(LongDouble).eps / np.finfo(float).eps)
     lost = LOST_DIGITS * share * size
-    return lost if len(some) == len(states) else np.tile(np.max(lost, axis=0), (len(states), 1, 1))
+    return lost if len(some) == count else np.tile(np.max(lost, axis=0), (count, 1, 1))
 
 
 def _every_few(count: int) -> NDArray[np.intp]:
@@ -606,14 +610,14 @@ class StepsFromSamples:
         self.velocities = v
         self.here = charts.bodies(q, v)
         self.start = [at[:count] for at in q]
-        ends, self.declared = coordinates_after(charts, self.start, v[:count], [h])
+        ends, declared = coordinates_after(charts, q, v, [h])  # of the last sample too: it is one tree
+        ends, self.declared = [at[:count] for at in ends], declared[:count]
         self.after = charts.bodies(ends, self.declared)
-        rounded = self.here.rounded()
-        self.states = [rounded[i] for i in range(len(v))]
+        self.states = self.here.rounded()
         self.bounds = acceleration_bounds(method, model, self.states)
-        self.states_r, self.middle_cosine = rounded.r, charts.middle_cosine(q)
-        sizes = _sizes(rounded, self.bounds) | charts.coordinate_sizes(coordinates)
-        sizes["rate"] = np.maximum(sizes["rate"], _rod_spins(model, charts, v, rounded))
+        self.middle_cosine = charts.middle_cosine(q)
+        sizes = _sizes(self.states, vars(self.bounds)) | charts.coordinate_sizes(coordinates)
+        sizes["rate"] = np.maximum(sizes["rate"], _rod_spins(model, charts, v, self.states))
         # Angles whose axes meet at the cosine c have rates of W/c and accelerations of (α + W²/c²)/c; their
         # torques, too, are converted by a matrix of norm 1/c.
         converted = 1 / np.maximum(self.middle_cosine, TINY)[:, None]
@@ -638,7 +642,7 @@ class StepsFromSamples:
         those of several, or derivatives by the rates, what relative rates pass on changes both totals.
         """
         kinetic, potential, sums, joint_terms, power = (
-            np.array([getattr(b, name) for b in self.bounds])
+            np.asarray(getattr(self.bounds, name))
             for name in (
                 "kinetic_energy",
                 "potential_energy",
@@ -651,7 +655,7 @@ class StepsFromSamples:
         def of_both_ends(x: Array) -> Array:
             return np.asarray(np.maximum(x[:count], x[-count:]))
 
-        model, reach = self.model, np.linalg.norm(self.states_r, axis=-1)
+        model, reach = self.model, np.linalg.norm(self.states.r, axis=-1)
         share = ACCELERATION_FACTOR * self.h / np.maximum(self.middle_cosine, TINY) ** 4
         energy, left = of_both_ends(kinetic + potential + share * power), of_both_ends(share * joint_terms)
         reach, inertia = of_both_ends(reach), np.linalg.norm(model.inertia, axis=(1, 2))
@@ -778,7 +782,7 @@ class RunSteps(StepsFromSamples):
 
         """
         found, bounds = dict[str, StepDeviations](), self.bounds
-        scale = {name: np.array([b.scale[name] for b in bounds]) for name in ACCELERATIONS[:2]}
+        scale = {name: np.asarray(bounds.scale[name]) for name in ACCELERATIONS[:2]}
         of_ends = [{name: x[some] for name, x in scale.items()} for some in (slice(-1), slice(1, None))]
         effects = _effects(of_ends, self.h)
         off = _differences(_reported(self.motion, slice(1, None)), self.after)
@@ -788,7 +792,7 @@ class RunSteps(StepsFromSamples):
         totals = self._total_errors(self.start, self.velocities[1:], self.declared, self.here[1:], self.after)
         for name, error in totals.items():
             parts = ("kinetic_energy", "potential_energy") if name == "energy" else ("angular_momentum",)
-            scale_of = np.array([sum(getattr(b, part) for part in parts) for b in bounds])
+            scale_of = np.sum([getattr(bounds, part) for part in parts], axis=0)
             found[f"run_{name}"] = StepDeviations(
                 error[:, None],
                 self.of_totals[name][:, None],
@@ -808,7 +812,7 @@ class RunSteps(StepsFromSamples):
         below `MIN_MIDDLE_COSINE`, or that a step changes by `MAX_COSINE_CHANGE` of itself.
         The fastest rate is estimated at every `SAMPLE_STRIDE`-th sample and counts up to the next ones.
         """
-        some = _every_few(len(self.states))
+        some = _every_few(len(self.velocities))
         with np.errstate(all="ignore"):
             rates = fastest_rates(self.model, [self.states[n] for n in some])
         # implicit steps divide by 1 − step × rate, and the rates may change between these samples
@@ -816,7 +820,7 @@ class RunSteps(StepsFromSamples):
         fast = _spread(rates, some)[1:] * self.h > most
         fast |= np.maximum(self.fastest[:-1], self.fastest[1:]) * self.h > most
         size = np.sum(stretched_length(self.model)) + np.max(np.linalg.norm(self.model.point, axis=2))
-        far = np.max(np.linalg.norm(self.states_r, axis=-1), axis=-1) > MAX_DISTANCE * size
+        far = np.max(np.linalg.norm(self.states.r, axis=-1), axis=-1) > MAX_DISTANCE * size
         cosine = self.middle_cosine
         change = self.h * self.fastest / np.maximum(cosine, TINY)
         singular = (cosine < 1) & ((cosine < MIN_MIDDLE_COSINE) | (change > MAX_COSINE_CHANGE * cosine))
@@ -847,7 +851,7 @@ class RunSteps(StepsFromSamples):
             every = np.full_like(none, np.inf)
             return StepDeviations(none, every, every, np.array(["no step has a bound"]))
         often = np.log(4 / MEAN_ALARM)
-        gaps = self.h * np.stack([b.of_gaps for b in self.bounds[:-1]], axis=1)
+        gaps = self.h * np.moveaxis(self.bounds.of_gaps[:-1], 1, 0)
         of_gaps = dict(zip(("velocity", "rate"), gaps, strict=True))
         for name, field_name in (("rate", "omega"), ("velocity", "v")):
             change = np.asarray(getattr(self.after, field_name) - getattr(before, field_name)[:-1], float)

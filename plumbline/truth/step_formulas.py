@@ -182,6 +182,10 @@ def _runge_kutta(system: StepCharts, q: Coordinates, v: Array, h: Array) -> tupl
         return sum(((h * LongDouble(w)) * x for w, x in zip(weights, values, strict=True)), np.zeros_like(v))
 
     for row in method.stages:
+        if not any(row):  # at the start of the step
+            rates.append(v)
+            accelerations.append(system.acceleration(q, v))
+            continue
         theta, rate = weighted(row, rates), v + weighted(row, accelerations)
         rates.append(system.displacement_rate(theta, rate))
         accelerations.append(system.acceleration(system.move(q, theta), rate))
