@@ -250,17 +250,22 @@ class Mujoco(MetamorphicHooks):
     def _change(self) -> Change:
         return self.variant.change if self.variant else Change()
 
+    @property
+    def _is_compiled_as_usual(self) -> bool:
+        """Whether it is set to a variant of a model that other variants have as well."""
+        return self.variant is not None and self._change.is_after_compiling
+
     def _chain(self, model: Model) -> _MujocoChain:
-        """The mechanism as the adapter is set; what is compiled as usual is a copy."""
-        if self.has_welded_halves or not self._change.is_after_compiling:
-            return _MujocoChain(model, self.body_pieces(model), self.option == DENSE, change=self._change)
-        return _compiled_chain(model, self.option == DENSE).copied(self._change)
+        """The mechanism as the adapter is set."""
+        if self._is_compiled_as_usual:
+            return _compiled_chain(model).copied(self._change)
+        return _MujocoChain(model, self.body_pieces(model), self.option == DENSE, change=self._change)
 
     def _soft(self, model: Model) -> _SoftMechanism:
         """The same where constraints hold it."""
-        if self.has_welded_halves or not self._change.is_after_compiling:
-            return _SoftMechanism(model, self.option, self.body_pieces(model), self._change)
-        return _compiled_mechanism(model, self.option).copied(self._change)
+        if self._is_compiled_as_usual:
+            return _compiled_mechanism(model, self.option).copied(self._change)
+        return _SoftMechanism(model, self.option, self.body_pieces(model), self._change)
 
     def _surface(self, model: Model, states: Sequence[State]) -> Sequence[SurfaceAnswer]:
         if self.is_soft(model):
@@ -283,7 +288,8 @@ class Mujoco(MetamorphicHooks):
             raise Unsupported(TENDON_MOTIONS)
         if self.is_soft(model):
             return self._rigid_run(model, state, times, integrator, resolution)
-        return self._sampled_run(self._chain(model), state, (times, integrator, resolution))
+        chain = _compiled_chain(model).copied(Change())
+        return self._sampled_run(chain, state, (times, integrator, resolution))
 
     def _step(self, model: Model, state: State, times: Array, integrator: Integrator, step: float) -> StepRun:
         is_soft = is_constrained(model) and not self.option
@@ -292,7 +298,8 @@ class Mujoco(MetamorphicHooks):
 
     def _softened(self, model: Model, largest: float) -> list[_SoftMechanism]:
         """The mechanism at regularisations that fall from the largest."""
-        found = [self._soft(model) for _ in range(RUN_REGULARISATIONS)]
+        compiled = _compiled_mechanism(model, self.option)
+        found = [compiled.copied(Change()) for _ in range(RUN_REGULARISATIONS)]
         for k, soft in enumerate(found):
             soft.tree.soften(largest / RATIO**k)
             soft.tree.m.opt.iterations = RUN_ITERATIONS
@@ -776,7 +783,7 @@ class _SoftMechanism:
 
 
 # Variants, steps and runs are of the same mechanisms in turn; these are not run themselves.
-_compiled_chain = lru_cache(maxsize=8)(lambda model, dense: _MujocoChain(model, dense=dense))
+_compiled_chain = lru_cache(maxsize=8)(_MujocoChain)
 _compiled_mechanism = lru_cache(maxsize=8)(_SoftMechanism)
 
 

@@ -209,7 +209,7 @@ def rounding_bounds(
 def bounds_at(
     model: Model, states: State, parts: BodyParts | None = None, method: JointSpaceMethod | None = None
 ) -> RoundingBound:
-    """Compute the same at many states (S, ...) as arrays (S, ...)."""
+    """Compute the tolerances of `rounding_bounds` at many states (S, ...), as arrays (S, ...)."""
     size = max(1, MAX_ENTRIES // (12 * len(model.kind)) ** 2)
     found: list[RoundingBound] = []
     for first in range(0, len(states.p), size):
@@ -217,19 +217,17 @@ def bounds_at(
         if model.has_loops:
             found.append(_of_loops(model, some, method))
         else:
-            found.append(_of_tree(_Terms(model, some, parts, method=method)))
+            found.append(_bound(*_Terms(model, some, parts, method=method).bounds()))
     first_one, *_ = found
     own = {
         name: np.concatenate([getattr(one, name) for one in found])
         for name in vars(first_one)
         if name != "scale"
     }
-    scale = {name: np.concatenate([one.scale[name] for one in found]) for name in first_one.scale}
+    scale: dict[str, Array | float] = {
+        name: np.concatenate([one.scale[name] for one in found]) for name in first_one.scale
+    }
     return RoundingBound(**own, scale=scale)
-
-
-def _of_tree(terms: _Terms) -> RoundingBound:
-    return _bound(*terms.bounds())
 
 
 def _of_loops(model: Model, states: State, method: JointSpaceMethod | None) -> RoundingBound:
@@ -276,7 +274,7 @@ def _bound(
         angular_acceleration=total[:, :n, 1],
         joint_reaction=total[:, :, 2],
         joint_moment=total[:, :, 3],
-        scale=scale | sums,
+        scale={**scale, **sums},
         kinematics=ROUNDING_FACTOR * EPS * np.moveaxis(motion, 0, 1),
         of_gaps=of_gaps[:, :n, :2].mT,
         rod_torque=ROUNDING_FACTOR * EPS * rods,
