@@ -653,6 +653,7 @@ def determinate_projectors(model: Model, state: State) -> Float[Array, "joints 6
     return projectors[cut.place]
 
 
+@lru_cache(maxsize=64)
 def wrench_length(model: Model) -> float:
     """Return the length that makes moments comparable with forces.
 
