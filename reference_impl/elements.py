@@ -25,9 +25,10 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy import vecdot
 
 from reference_impl.arrays import Motion
-from reference_impl.euler_parameters import A, G, L, cross, dot
+from reference_impl.euler_parameters import A, G, L, cross
 from reference_impl.joints import ConstraintRows
 from reference_impl.mechanism import Array, Float, Mechanism
 
@@ -50,14 +51,20 @@ class ElementForces:
 
 
 class _Motion(NamedTuple):
-    """The coordinates that have elements, and their rates; pairs are of the near and the far body."""
+    """What elements act on, each quantity of a state once; pairs are of the near and the far end.
 
+    The K springs between points follow the e coordinates that have elements.
+    """
+
+    p: Array  # (2, e, 4)
     axes: tuple[Array, Array]  # rows: of the far and the near body
-    spin: Array  # (2, e, 3) rad/s
-    arm: Array  # (2, e, 3) m, to the points
+    spin: Array  # (2, e, 3) rad/s, ω
     turning: Array  # (2, e, 3, 4) from ṗ to ω
+    arm: Array  # (2, e + K, 3) m, b and a
+    swing: Array  # (2, e + K, 3) m/s, their rates
+    d: Array  # (e + K, 3) m
+    d_rate: Array  # (e + K, 3) m/s
     axis: Array  # (e, 3) w
-    d: Array  # (e, 3) m
     push: Array  # (e, 3) f
     n_near: Array
     n_far: Array
@@ -91,7 +98,10 @@ class Elements:
         self.effort, self.rest = m.effort[at], m.rest[at]
         self.rotors = np.flatnonzero(self.armature)  # coordinates that have a row of their own
         self.bodies = m.body[self.joint, ::-1].T  # (2, e) near, far
-        self.points = np.moveaxis(m.point[self.joint, ::-1], 1, 0)
+        # both ends of the coordinates, then of the springs between points
+        self._ends = np.concatenate([self.bodies, m.spring_body[:, ::-1].T], axis=1)
+        points = np.concatenate([m.point[self.joint, ::-1], m.spring_point[:, ::-1]])
+        self._points = np.moveaxis(points, 1, 0)
         self.turns = np.moveaxis(m.turn[self.joint, ::-1], 1, 0)
         self._axes, self._numbers = A(self.turns), np.arange(len(self.joint))
         self.has_winding_angles = bool(np.any((self.stiffness != 0) & ~self.is_slide & ~self.is_ball))
@@ -127,18 +137,14 @@ class Elements:
             x: joint coordinates near which angles are taken [rad]; absent: principal values.
 
         """
-        state = _with_world(motion)
-        at = self._motion(state)
-        (wb, wa), (b, a), w, d = at.spin, at.arm, at.axis, at.d
-        push, n_near, n_far, rate, rates = at.push, at.n_near, at.n_far, at.rate, at.turning
-        ve, carrier = state[2][self.bodies], np.where(self.is_far[:, None], wa, wb)
-        d_rate = ve[0] + cross(wb, b) - ve[1] - cross(wa, a)
-        w_rate = cross(carrier, w)
-        bend = cross(wb, cross(wb, b)) - cross(wa, cross(wa, a))
-        slide_bias = dot(w, bend) + 2 * dot(w_rate, d_rate) + dot(cross(wa, w_rate), d)
-        stretch = (
-            np.where(self.is_slide, dot(w, d), self._angles(*at.axes, state[1][self.bodies], x)) - self.rest
-        )
+        at, e = self._motion(motion), len(self.joint)
+        (wb, wa), w, d, d_rate = at.spin, at.axis, at.d[:e], at.d_rate[:e]
+        push, n_near, n_far, rate = at.push, at.n_near, at.n_far, at.rate
+        w_rate = cross(np.where(self.is_far[:, None], wa, wb), w)
+        bend_near, bend_far = cross(at.spin, at.swing[:, :e])
+        slide_bias: Array = vecdot(w, bend_near - bend_far)
+        slide_bias += 2 * vecdot(w_rate, d_rate) + vecdot(cross(wa, w_rate), d)
+        stretch = np.where(self.is_slide, vecdot(w, d), self._angles(*at.axes, at.p, x)) - self.rest
         torque = self.effort - self.stiffness * stretch - self.damping * rate
         wrench = torque[:, None] * np.stack([np.hstack([push, n_near]), -np.hstack([push, n_far])])
         potential = lost = 0.0
@@ -146,13 +152,13 @@ class Elements:
         total = np.zeros((len(motion[0]) + 1, 6))
         np.add.at(total, self.bodies, wrench)
         if len(self.mechanism.spring_body):
-            spring_wrench, potential, lost = self._point_springs(state)
-            np.add.at(total, self.mechanism.spring_body.T, spring_wrench)
+            spring_wrench, potential, lost = self._point_springs(at)
+            np.add.at(total, self._ends[:, e:], spring_wrench)
         return ElementForces(
             r_near=push,
-            p_near=np.vecmat(n_near, rates[0]),
-            p_far=-np.vecmat(n_far, rates[1]),
-            bias=np.where(self.is_slide, slide_bias, dot(w_rate, wb - wa)),
+            p_near=np.vecmat(n_near, at.turning[0]),
+            p_far=-np.vecmat(n_far, at.turning[1]),
+            bias=np.where(self.is_slide, slide_bias, vecdot(w_rate, wb - wa)),
             stretch=stretch,
             rate=rate,
             torque=torque,
@@ -168,22 +174,31 @@ class Elements:
     ) -> Float[Array, "joints coordinates"]:
         """Return the rates of `coordinates` alone."""
         found = np.zeros(self.mechanism.armature.shape)
-        found[self.joint, self.column] = self._motion(_with_world(motion)).rate
+        found[self.joint, self.column] = self._motion(motion).rate
         return found
 
-    def _motion(self, state: tuple[Array, ...]) -> _Motion:
-        """What the state says of the coordinates that have elements."""
-        re, pe, ve, pdot_e = (y[self.bodies] for y in state)  # (2, e, ·) near, far
-        turn, turning = A(pe), 2 * G(pe)
-        spin, arm = np.matvec(turning, pdot_e), np.matvec(turn, self.points)
-        (wb, wa), (b, a) = spin, arm
-        h, f = (turn @ self._axes).swapaxes(-1, -2)  # rows: the axes
+    def _motion(self, motion: Motion) -> _Motion:
+        """What the state says of the coordinates that have elements, and of the springs."""
+        bodies, e = np.empty((len(motion[0]) + 1, 14)), len(self.joint)
+        np.concatenate(motion, axis=1, out=bodies[:-1])
+        bodies[-1] = _WORLD  # where index −1 finds it
+        ends = bodies[self._ends]  # (2, e + K, 14)
+        r, p, v, pdot = ends[..., :3], ends[..., 3:7], ends[..., 7:10], ends[..., 10:]
+        turn, turning = A(p), 2 * G(p)
+        spin, arm = np.matvec(turning, pdot), np.matvec(turn, self._points)
+        swing = cross(spin, arm)
+        (near, far), (near_rate, far_rate) = r + arm, v + swing
+        d, d_rate = near - far, near_rate - far_rate
+        h, f = (turn[:, :e] @ self._axes).swapaxes(-1, -2)  # rows: the axes
         at, is_slide = (self._numbers, self.axis), self.is_slide[:, None]
         w = np.where(self.is_far[:, None], f[at], h[at])
-        d, push = re[0] + b - re[1] - a, w * is_slide
-        n_near, n_far = (np.where(is_slide, cross(lever, w), w) for lever in (b, a + d))
-        rate = dot(push, ve[0] - ve[1]) + dot(n_near, wb) - dot(n_far, wa)
-        return _Motion((f, h), spin, arm, turning, w, d, push, n_near, n_far, rate)
+        push, spin = w * is_slide, spin[:, :e]
+        levers = np.stack([arm[0, :e], arm[1, :e] + d[:e]])
+        n_near, n_far = np.where(is_slide, cross(levers, w), w)
+        rate = vecdot(push, v[0, :e] - v[1, :e]) + vecdot(n_near, spin[0]) - vecdot(n_far, spin[1])
+        return _Motion(
+            p[:, :e], (f, h), spin, turning[:, :e], arm, swing, d, d_rate, w, push, n_near, n_far, rate
+        )
 
     def with_rotors(self, rows: ConstraintRows, found: ElementForces) -> ConstraintRows:
         """Append the rows of the rotors to those of the joints: they hold nothing, C counts as 0."""
@@ -197,44 +212,29 @@ class Elements:
     def _angles(self, f: Array, h: Array, p: Array, x: Array | None) -> Array:
         """Angles (e,) of turns, and of balls the components of the rotation vector."""
         e, (i, j, k) = self._numbers, (self.axis + np.arange(3)[:, None]) % 3
-        cosine = np.where(self.is_far, dot(f[e, j], h[e, j]), dot(f[e, k], h[e, k]))
-        angle = np.arctan2(dot(f[e, k], h[e, j]), cosine)
+        cosine = np.where(self.is_far, vecdot(f[e, j], h[e, j]), vecdot(f[e, k], h[e, k]))
+        angle = np.arctan2(vecdot(f[e, k], h[e, j]), cosine)
         if x is not None:
             angle += 2 * np.pi * np.round((x[self.joint, self.column] - angle) / (2 * np.pi))
         if not self.is_ball.any():
             return angle
         near, far = self.turns[..., :1] * p + np.vecmat(self.turns[..., 1:], L(p))  # p ∘ turn
-        scalar, vector = dot(far, near), np.matvec(L(far), near)
-        size = np.sqrt(dot(vector, vector))
+        scalar, vector = vecdot(far, near), np.matvec(L(far), near)
+        size = np.sqrt(vecdot(vector, vector))
         theta = 2 * np.arctan2(size, np.abs(scalar)) * np.where(scalar < 0, -1, 1)
         ratio = np.divide(theta, size, out=np.full_like(size, 2.0), where=size > 0)
         return np.where(self.is_ball, ratio * vector[e, i], angle)
 
-    def _point_springs(self, state: tuple[Array, ...]) -> tuple[Array, float, float]:
+    def _point_springs(self, at: _Motion) -> tuple[Array, float, float]:
         """Wrenches (2, K, 6) on both bodies of each spring, its potential energy and dissipated power."""
-        m = self.mechanism
-        r, p, v, pdot = (y[m.spring_body.T] for y in state)
-        arm = np.matvec(A(p), np.moveaxis(m.spring_point, 1, 0))
-        d, d_rate = (
-            np.diff(r + arm, axis=0)[0],
-            np.diff(v + cross(np.matvec(2 * G(p), pdot), arm), axis=0)[0],
-        )
-        length = np.sqrt(dot(d, d))
-        rate, stretch = dot(d, d_rate) / length, length - m.spring_length
+        m, springs = self.mechanism, slice(len(self.joint), None)
+        arm, d, d_rate = at.arm[:, springs], at.d[springs], at.d_rate[springs]
+        length = np.sqrt(vecdot(d, d))
+        rate, stretch = vecdot(d, d_rate) / length, length - m.spring_length
         tension = m.spring_stiffness * stretch + m.spring_damping * rate
-        pull = (tension / length)[:, None] * d * np.array([1.0, -1.0])[:, None, None]
+        pull = (tension / length)[:, None] * d * np.array([-1.0, 1.0])[:, None, None]
         potential, lost = m.spring_stiffness @ stretch**2 / 2, m.spring_damping @ rate**2
         return np.concatenate([pull, cross(arm, pull)], axis=-1), float(potential), float(lost)
 
 
-def _with_world(motion: Motion) -> tuple[Array, ...]:
-    """The state with the world as the last body, where index −1 finds it."""
-    found = list[Array]()
-    for y, world in zip(motion, _WORLD, strict=True):
-        padded = np.empty((len(y) + 1, y.shape[1]), y.dtype)
-        padded[:-1], padded[-1] = y, world
-        found.append(padded)
-    return tuple(found)
-
-
-_WORLD = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3), np.zeros(4)  # r, p, ṙ and ṗ
+_WORLD = np.eye(14)[3]  # r, p = (1, 0, 0, 0), ṙ and ṗ

@@ -6,6 +6,7 @@ near body, and e = (i, j, k) the world's, every row is C = uᵀw with u and w ou
 Exact for every p,
 
     (L1)  (A s)_p = 2 H(p,s),   (A s)˙ = 2 H(p,s) ṗ,   (A s)¨ = 2 H(p,s) p̈ + 2 H(ṗ,s) ṗ               (N8)
+          A s = H(p,s) p − s,   H(p,s) = Σ pᵢ H(eᵢ,s) with the unit vectors eᵢ: all of it from one product
     (L2)  C_q = uᵀ w_q + wᵀ u_q
     (L3)  γ   = −( uᵀ w̃ + wᵀ ũ + 2 u̇ᵀẇ ),   ũ = ü at q̈ = 0
 
@@ -36,7 +37,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reference_impl.arrays import Motion
-from reference_impl.euler_parameters import I3, A, B, G, L, dot, outer
+from reference_impl.euler_parameters import I3, A, G, H, L, dot
 from reference_impl.mechanism import AnyArray, Indices, Int, Mechanism, Shaped
 
 VECTORS = "XYZxyzijkd"  # what rows are products of: axes of the near and the far body and of the world, and d
@@ -111,7 +112,11 @@ class _RowLayout:
 
     bodies: Int[Indices, "2 joints"]  # near and far body of each joint; for the world body 0, see `s`
     s: Shaped[AnyArray, "2 joints 3"]  # m, their points; 0 for the world, which takes body 0 out: H(p, 0) = 0
-    B: Shaped[AnyArray, "2 joints 4 4"]  # B(s)
+    # vectors fixed in bodies, first the points `s`, then the axes that rows are made of: their bodies; the
+    # vectors in these, 0 for the world; and their H(eᵢ, ·), see (L1)
+    vector_body: Int[Indices, "vectors"]
+    vectors: Shaped[AnyArray, "vectors 3"]
+    H_of_units: Shaped[AnyArray, "vectors 4 12"]
     world_point: Shaped[AnyArray, "joints 3"]  # m, the far point where the far body is the world, else 0
     point_squares: Shaped[AnyArray, "joints"]  # m²: sᵀs of both points less ℓ²
     rods: NDArray[np.intp] | slice  # joints that are rods; all of them as a slice, which copies nothing
@@ -122,10 +127,6 @@ class _RowLayout:
     # rows that are a component of d: their numbers, and joint and component of each
     point_rows: NDArray[np.intp]
     point_at: tuple[NDArray[np.intp], NDArray[np.intp]]
-    # axes that rows are made of, by joint: their sides, 0 near and 1 far, and joints
-    axis_at: tuple[NDArray[np.intp], NDArray[np.intp]]
-    axes: Shaped[AnyArray, "a 3"]  # in their bodies; 0 for the world
-    B_of_axes: Shaped[AnyArray, "a 4 4"]
     world_axes: Shaped[AnyArray, "a 3"]  # axes where the far body is the world, else 0
     # rows that are products of two axes, or of an axis and d: their numbers, joints and places in the axes
     axis_rows: NDArray[np.intp]
@@ -163,11 +164,14 @@ def _row_layout(mechanism: Mechanism) -> _RowLayout:
     side, number = np.divmod(code, 3)
     turned = A(mechanism.turn[k, 1 - side])[np.arange(len(k)), :, number]
     is_world = ((side == 1) & world[k])[:, None]
-    axes, rods = np.where(is_world, 0, turned), joint[rod_rows]
+    vectors, rods = np.concatenate([*s, np.where(is_world, 0, turned)]), joint[rod_rows]
+    bodies = np.stack([near, np.maximum(far, 0)])
     return _RowLayout(
-        bodies=np.stack([near, np.maximum(far, 0)]),
+        bodies=bodies,
         s=s,
-        B=B(s),
+        vector_body=np.concatenate([*bodies, bodies[side, k]]),
+        vectors=vectors,
+        H_of_units=H(np.eye(4, dtype=int), vectors[:, None]).reshape(-1, 4, 12),
         world_point=np.where(world[:, None], mechanism.point[:, 0], 0),
         point_squares=dot(s, s).sum(0) - mechanism.length**2,
         rods=slice(None) if len(rods) == len(mechanism.kind) else rods,
@@ -177,9 +181,6 @@ def _row_layout(mechanism: Mechanism) -> _RowLayout:
         far=far[joint],
         point_rows=points,
         point_at=(joint[points], u[points] - Z_FAR - 1),
-        axis_at=(side, k),
-        axes=axes,
-        B_of_axes=B(axes),
         world_axes=np.where(is_world, turned, 0),
         axis_rows=turns,
         axis_pairs=of_turns.reshape(2, -1),
@@ -208,14 +209,10 @@ def constraint_rows(
     r, p, v, pdot = motion
     fixed = _row_layout(mechanism)
     s, (far, near) = fixed.s, mechanism.body.T
-    q, qdot = p[fixed.bodies], pdot[fixed.bodies]  # (2, J, 4): near and far body of each joint
     x = r[near] - of_far_body(r, far) - fixed.world_point  # from the far body (the far point) to the near one
     xdot = v[near] - of_far_body(v, far)
-    both = np.stack([q, qdot])
-    turn = G(both)
-    H = turn @ fixed.B + outer(s, both)
-    (H_near, H_far), (H_near_rate, H_far_rate) = H  # H, Ḣ (D4)
-    b, a = _matrix_vector(A(q), s)
+    points, axes = _turning_vectors(fixed, p, pdot)
+    ((H_near, H_far), (H_near_rate, H_far_rate)), (b, a), swing, bend = points  # H, Ḣ (D4), (L1)
     d = x + b - a
 
     c = len(fixed.joint)
@@ -224,26 +221,22 @@ def constraint_rows(
     )
     if len(fixed.rod_rows):
         k, row = fixed.rods, fixed.rod_rows
+        q, qdot = p[fixed.bodies[:, k]], pdot[fixed.bodies[:, k]]  # near and far
         # Ȧ s, Ȧ = 2 G L̇ᵀ (N10)
-        bdot, adot = 2 * _matrix_vector(turn[0][:, k], _vector_matrix(s[:, k], L(qdot[:, k])))
+        bdot, adot = 2 * _matrix_vector(G(q), _vector_matrix(s[:, k], L(qdot)))
         y, ydot, z, zdot = x[k] - a[k], xdot[k] - adot, x[k] + b[k], xdot[k] + bdot
         C[row] = dot(x[k], x[k]) + 2 * dot(x[k], b[k] - a[k]) - 2 * dot(a[k], b[k]) + fixed.point_squares[k]
         near_rate = _vector_matrix(ydot, H_near[k]) + _vector_matrix(y, H_near_rate[k])
         far_rate = _vector_matrix(zdot, H_far[k]) + _vector_matrix(z, H_far_rate[k])
-        gamma[row] = (
-            -2 * dot(zdot - adot, xdot[k]) - 4 * dot(near_rate, qdot[0, k]) + 4 * dot(far_rate, qdot[1, k])
-        )
+        gamma[row] = -2 * dot(zdot - adot, xdot[k]) - 4 * dot(near_rate, qdot[0]) + 4 * dot(far_rate, qdot[1])
         r_near[row] = 2 * d[k]
         p_near[row], p_far[row] = 4 * _vector_matrix(y, H_near[k]), -4 * _vector_matrix(z, H_far[k])
-    if len(fixed.point_rows) or len(fixed.slide_rows):
-        swing, bend = 2 * _matrix_vector(H, qdot)
-        d_bias = bend[0] - bend[1]
+    d_bias = bend[0] - bend[1]
     if len(fixed.point_rows):
         row, at = fixed.point_rows, fixed.point_at
         C[row], gamma[row], r_near[row] = d[at], -d_bias[at], I3[at[1]]
         p_near[row], p_far[row] = 2 * H_near[at], -2 * H_far[at]
-    if len(fixed.axes):
-        axes = _axis_vectors(fixed, q, qdot)
+    if len(fixed.axis_rows):
         row = fixed.axis_rows
         C[row], gamma[row], p_near[row], p_far[row] = _axis_products(axes, *fixed.axis_pairs)
     if len(fixed.slide_rows):
@@ -263,13 +256,25 @@ def constraint_rows(
     return ConstraintRows(fixed.joint, fixed.near, fixed.far, C, r_near, p_near, p_far, gamma, d)
 
 
-def _axis_vectors(fixed: _RowLayout, q: AnyArray, qdot: AnyArray) -> tuple[AnyArray, ...]:
-    """The axes that rows are made of (a, 3), ∂/∂p of their bodies, rates and ũ (L1)."""
-    at, t = fixed.axis_at, fixed.axes
-    p, pdot = q[at], qdot[at]
-    H, H_rate = (G(x) @ fixed.B_of_axes + outer(t, x) for x in (p, pdot))
-    rate, bias = (2 * _matrix_vector(h, pdot) for h in (H, H_rate))
-    return _matrix_vector(A(p), t) + fixed.world_axes, 2 * H, rate, bias
+def _turning_vectors(
+    fixed: _RowLayout, p: AnyArray, pdot: AnyArray
+) -> tuple[tuple[AnyArray, ...], tuple[AnyArray, ...]]:
+    """The vectors that rows are made of (L1), and what follows of them.
+
+    Returns:
+        H(p, s) and H(ṗ, s) of the points, A s, their rates and (A s)¨ at p̈ = 0, shaped as `_RowLayout.s`;
+        and of the axes their values (a, 3), ∂/∂p of their bodies, rates and ũ.
+
+    """
+    p, pdot = both = np.stack([p, pdot])[:, fixed.vector_body]
+    H = (both[..., None, :] @ fixed.H_of_units).reshape(*both.shape[:-1], 3, 4)  # H(p, ·), H(ṗ, ·)
+    value = _matrix_vector(H[0], p) - fixed.vectors
+    rate, bias = 2 * _matrix_vector(H, pdot)
+    shape, count = fixed.s.shape, fixed.bodies.size
+    of_points = (y[:count].reshape(shape) for y in (value, rate, bias))
+    points = H[:, :count].reshape(2, *shape, 4), *of_points
+    axes = value[count:] + fixed.world_axes, 2 * H[0, count:], rate[count:], bias[count:]
+    return points, axes
 
 
 def _turns_about_z(
