@@ -62,7 +62,8 @@ class DirectSystem:
         rotors = self.elements.joint[self.elements.rotors] if self.elements else np.zeros(0, np.intp)
         self.rotor_count = len(rotors)
         self._run_rows: NDArray[np.intp] | None = None
-        self._run_independence = 0.0
+        self._run_independence = 0.0  # the least that the rows of a run may have
+        self._checked: tuple[Array, float] = np.zeros(0), 0.0  # rows of a run, and their independence
         n, joint = chain.n, np.concatenate([joint_of_rows(chain), rotors])
         c = len(joint)
         r, p = np.arange(3 * n).reshape(n, 3), 3 * n + np.arange(4 * n).reshape(n, 4)
@@ -270,11 +271,21 @@ class DirectSystem:
         rows give other accelerations: they stay the same until they are ten times as near to dependence.
         """
         kept = self._run_rows
-        if kept is None or _independence(rows[kept]) < 0.1 * self._run_independence:
+        if kept is None or not self._are_independent(rows[kept]):
             chosen = (RUN_RANK_TOLERANCE, None) if kept is None else (0.0, len(kept))
-            kept = independent_rows(rows, *chosen)
-            self._run_rows, self._run_independence = kept, _independence(rows[kept])
+            self._run_rows = kept = independent_rows(rows, *chosen)
+            self._checked = rows[kept], _independence(rows[kept])
+            self._run_independence = 0.1 * self._checked[1]
         return kept
+
+    def _are_independent(self, rows: Array) -> bool:
+        """Whether rows are as independent as those of the run must be."""
+        checked, value = self._checked
+        # A singular value changes by no more than the norm of the change of the rows (Weyl).
+        if value - np.linalg.norm(rows - checked) < self._run_independence:
+            value = _independence(rows)
+            self._checked = rows, value
+        return value >= self._run_independence
 
     def _dense(self, values: Array) -> Array:
         S = np.zeros((self.size, self.size), values.dtype)
