@@ -168,6 +168,8 @@ class FileRun:
             return make(*arguments)
         except ModelFileError as error:
             self.problems += error.problems
+        except OSError:  # the machine's, as a full disk
+            raise
         except Exception as error:
             text = " ".join(f"{type(error).__name__}: {error}".split())
             words = f"internal error: {shorten(text, 400)}"

@@ -16,6 +16,7 @@ from plumbline.importers.mjcf_rewriting import rewritings
 from plumbline.importers.neutral_model import NeutralModel, Source, extreme_numbers, zero_directions
 from plumbline.importers.urdf import read_urdf
 from plumbline.importers.xml_tree import Element, ModelFileError, read_xml, write_xml, write_xml_in_place
+from plumbline.processes.user_cache import naming_file
 from plumbline.scenario.line_and_column_errors import shorten
 from plumbline.scenario.yaml_reader import is_file
 
@@ -118,7 +119,8 @@ class PreparedFile:
         found = {}
         for name, rewritten in rewritings(tree).items():
             path = folder / f"{len(list(folder.iterdir()))}.xml"
-            path.write_text(write_xml(rewritten), encoding="utf-8")
+            with naming_file(path):
+                path.write_text(write_xml(rewritten), encoding="utf-8")
             found[name] = replace(self.file, path=str(path))
         return found
 
@@ -168,7 +170,8 @@ def prepare_file(
             mjcf.make_paths_absolute(tree, path.parent.resolve())
         opened = scratch / path.name
         text, lines = write_xml_in_place(tree)
-        opened.write_text(text, encoding="utf-8")
+        with naming_file(opened):
+            opened.write_text(text, encoding="utf-8")
     else:
         for element in tree.walk():
             lines.setdefault(element.source.line, []).append(element)

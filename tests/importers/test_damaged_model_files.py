@@ -110,6 +110,18 @@ def test_accelerations_that_rounding_does_not_determine_are_not_judged(tmp_path)
     assert row.verdict == Verdict.INFORMATION and "singular in double precision" in row.reason
 
 
+def test_a_full_disk_is_the_machines_failure_and_names_the_file(tmp_path, monkeypatch):
+    path = tmp_path / "robot.xml"
+    path.write_text(MJCF.replace(' name="b"', ""), encoding="utf-8")  # a copy gets the name
+
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(OSError, match=r"No space left on device: '.*/robot\.xml'"):
+        compare(path)
+
+
 def mesh(name):
     visual = f'<visual><geometry><mesh filename="{name}"/></geometry></visual>'
     return PENDULUM.replace('<link name="base"/>', f'<link name="base">{visual}</link>')
