@@ -47,17 +47,25 @@ def describe_run(
 
 
 def finding_lines(finding: Finding, width: int) -> list[str]:
-    """Describe a finding that nothing expects in three lines; of what failed the whole reason."""
+    """Describe a finding that nothing expects in three lines; of what failed the whole reason.
+
+    The versions are beside the name, or on the last line where that has no room for them.
+    """
     style, colour = SHOWN_STYLES[finding.verdict], VERDICT_COLOURS[finding.verdict]
-    size = "" if finding.largest_ratio is None else f", up to {finding.largest_ratio:.2g} times the tolerance"
-    head = "  ".join(filter(None, (finding.name, finding.version_range)))
+    ratio, versions, head = finding.largest_ratio, finding.version_range, finding.name
+    sizes = ("",) if ratio is None else (f", up to {ratio:.2g} times the tolerance", f", {ratio:.0e} × tol.")
+    last = [coverage(finding) + size for size in sizes]
+    if versions and len(f"{head}  {versions}") <= width - 2:
+        head = f"{head}  {versions}"
+    elif versions:
+        last = [f"{versions}: {text}" for text in last]
     sentence = [shorten(f"  {finding.sentence}", width)]
     if finding.verdict == Verdict.FAILED:
         sentence = wrap(shorten(finding.sentence, MAX_REASON), width, "  ")
     return [
         f"[{colour}]{style.glyph} {escape(shorten(head, width - 2))}[/]",
         *map(escape, sentence),
-        escape(shorten(f"  {coverage(finding)}{size}", width)),
+        escape(_fitting([f"  {text}" for text in last], width)),
     ]
 
 
@@ -67,8 +75,12 @@ def recorded_line(finding: Finding, width: int) -> str:
     size, short = ("", "") if ratio is None else (f", up to {ratio:.2g} × tolerance", f", {ratio:.0e} × tol.")
     rows = _count_rows(finding)
     texts = [f"{finding.name}: {x}" for x in (coverage(finding) + size, rows + size, rows + short)]
-    text = next((text for text in texts if len(text) <= width - 2), texts[-1])
-    return f"[dim]{SHOWN_STYLES[shown].glyph} {escape(shorten(text, width - 2))}[/]"
+    return f"[dim]{SHOWN_STYLES[shown].glyph} {escape(_fitting(texts, width - 2))}[/]"
+
+
+def _fitting(texts: Sequence[str], width: int) -> str:
+    """The first text that fits, else the last one, cut."""
+    return next((text for text in texts if len(text) <= width), shorten(texts[-1], width))
 
 
 def coverage(finding: Finding) -> str:

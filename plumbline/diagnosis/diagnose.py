@@ -8,7 +8,7 @@ scatters where little more than the last bits of the problem change has no such 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -98,6 +98,11 @@ def state_count(model: Model) -> int:
     return 6 if model.n <= 6 else 4 if model.n <= 12 else 2
 
 
+def _distinct(named: Mapping[str, tuple[Cause, ...]]) -> tuple[Cause, ...]:
+    """The causes in quantities, each once."""
+    return tuple(dict.fromkeys(cause for some in named.values() for cause in some))
+
+
 class _Diagnosing:
     """One diagnosis: the difference at states that show it, and what was tried."""
 
@@ -117,7 +122,7 @@ class _Diagnosing:
         self.differences: dict[View, Difference] = {}
         self.searches: dict[View, Search] = {}
         self.loss: Cause | None = None
-        self.named: dict[str, Cause] = {}
+        self.named: dict[str, tuple[Cause, ...]] = {}
 
     def wrong(self, ratio: float = 1.0) -> list[str]:
         """List the quantities whose error exceeds a number of bounds."""
@@ -153,7 +158,7 @@ class _Diagnosing:
         self.loss = self._digit_loss(wrong)
         found = self._in_words(wrong) or self._single(View()) or self._outputs_alone(wrong)
         if not found and self.loss:
-            return (*dict.fromkeys(self.named.values()), self.loss)
+            return (*_distinct(self.named), self.loss)
         found = found or self._single(View(), are_sums_apart=True)
         beside = () if found else self._with_outputs(wrong, self.search(View()))
         if beside and all(cause.is_in_words for cause in beside):
@@ -270,19 +275,19 @@ class _Diagnosing:
         previous = {q: values_of(before, q) for q in here.names}
         return Outputs(case, here.true | {q: right[q] for q in here.names}, previous, here.bounds)
 
-    def _name_outputs(self, quantities: Sequence[str], outputs: Outputs) -> dict[str, Cause]:
-        named = {}
+    def _name_outputs(self, quantities: Sequence[str], outputs: Outputs) -> dict[str, tuple[Cause, ...]]:
+        named = dict[str, tuple[Cause, ...]]()
         for quantity in quantities:
             found = outputs.name(quantity, self.difference(View()).given[quantity])
-            if found is not None:
-                named[quantity] = replace(found, states=len(self.places), quantities=(quantity,))
+            about = [replace(one, states=len(self.places), quantities=(quantity,)) for one in found]
+            named |= {quantity: tuple(about)} if about else {}
         return named
 
     def _outputs_alone(self, wrong: Sequence[str]) -> tuple[Cause, ...]:
         """One cause in each wrong quantity; none where a quantity has no name."""
         here = self.difference(View())
         self.named = self._name_outputs(wrong, self.outputs(here.predictor.case, here.true))
-        return tuple(dict.fromkeys(self.named.values())) if len(self.named) == len(wrong) else ()
+        return _distinct(self.named) if len(self.named) == len(wrong) else ()
 
     def _with_outputs(
         self, wrong: Sequence[str], search: Search, classes: Sequence[tuple[str, ...]] = ()
@@ -305,7 +310,7 @@ class _Diagnosing:
                 outputs = self._name_outputs(remaining, self.outputs(case, right))
                 if len(outputs) == len(remaining):
                     causes = self._named(found if not remaining else [one])
-                    return (*causes, *dict.fromkeys(outputs.values()))
+                    return (*causes, *_distinct(outputs))
         return ()
 
     def _explains(self, quantity: str, right: Array) -> bool:
@@ -370,14 +375,13 @@ class _Diagnosing:
     def _partly(self, wrong: Sequence[str]) -> tuple[Cause, ...]:
         """The quantities that have a name, and the rest without one."""
         # a fitted share of a part may be what follows of a wrong number
-        known = {q: cause for q, cause in self.named.items() if cause.nominal or not cause.amount}
+        known = {q: some for q, some in self.named.items() if all(c.nominal or not c.amount for c in some)}
         if not known:
             return ()
         rest = [q for q in wrong if q not in known]
         close = [q for q in self.wrong() if q not in known and q not in rest]
-        named = tuple(dict.fromkeys(known.values()))
         return (
-            *named,
+            *_distinct(known),
             *([self._unexplained(rest)] if rest else []),
             *([self._unexplained(close, "close")] if close else []),
         )

@@ -25,7 +25,9 @@ from plumbline.diagnosis.prediction import (
     projectors_at,
     single_states,
 )
+from plumbline.diagnosis.terms import is_spanned, open_end_rows
 from plumbline.equations.arithmetic import floats, stacked
+from plumbline.equations.responses import EndRows, Responses
 from plumbline.equations.tree import Tree
 from plumbline.model.datatypes import Array
 from plumbline.model.kinematics import JointFrame, cross, rotate_vectors, rotation_matrix
@@ -33,6 +35,7 @@ from plumbline.model.loops import CutMechanism, cut_open
 from plumbline.truth.rounding_bound import TINY
 
 Choose = Callable[[Array], Array]  # of the rows of some bodies or joints
+Causes = tuple[Cause, ...]  # that act together; none where nothing explains
 MakeCause = Callable[..., Cause]  # of words and amounts
 SINGLE_ROUNDING = 1e-5  # of the largest value: what computing in single precision may cost
 MAX_RATIO = 2.0  # in bounds: of what is returned and of the right quantity
@@ -51,6 +54,7 @@ class Part:
     value: Array
     about: str = ""  # of the moment that a joint's force has about another point: the point
     every: str = ""  # the same of all bodies, joints or springs, where it is of one of them
+    free: Array | None = None  # (…, m) what besides may be in it, by unknown amounts at each state
 
     @property
     def sort(self) -> str:
@@ -67,37 +71,38 @@ class Outputs:
     previous: Answers  # those of the state before each
     bounds: Answers  # (S,) or (S, N)
 
-    def name(self, quantity: str, reported: Array) -> Cause | None:
-        """Find what was returned in place of one quantity; None where nothing known explains it."""
+    def name(self, quantity: str, reported: Array) -> Causes:
+        """Find what was returned in place of one quantity; nothing where nothing known explains it."""
         whole = self._of_places(quantity, reported, None)
         bound, off = self.bounds[quantity], reported - self.right[quantity]
         if whole or bound.ndim == 1:
             return whole
         wrong = [k for k in range(bound.shape[1]) if not error_ratio(off[:, k], bound[:, k]) <= 1]
-        some = self._of_places(quantity, reported, wrong) if 0 < len(wrong) < bound.shape[1] else None
+        some = self._of_places(quantity, reported, wrong) if 0 < len(wrong) < bound.shape[1] else ()
         return some or self._exchanged(quantity, reported, wrong)
 
-    def _exchanged(self, quantity: str, reported: Array, wrong: list[int]) -> Cause | None:
+    def _exchanged(self, quantity: str, reported: Array, wrong: list[int]) -> Causes:
         """Rows that are those of other bodies."""
         source, count = {}, reported.shape[1]
         for k in wrong:
             others = (j for j in range(count) if j != k and self._is_that_of(quantity, reported, k, j))
             source[k] = next(others, -1)
         if not source or -1 in source.values():
-            return None
+            return ()
         thing = _thing(quantity)
         of = " and ".join(f"{thing} {k + 1}" for k in wrong)
         as_that = " and ".join(f"{thing} {source[k] + 1}" for k in wrong)
         is_swap = len(wrong) == 2 and source == {wrong[0]: wrong[1], wrong[1]: wrong[0]}
         place, change = (of, "exchanged") if is_swap else (as_that, f"as that of {of}")
-        return Cause("output", quantity_words([quantity]), place, change, general=f"of another {thing}")
+        words = quantity_words([quantity])
+        return (Cause("output", words, place, change, general=f"of another {thing}"),)
 
     def _is_that_of(self, quantity: str, reported: Array, k: int, j: int) -> bool:
         """Whether row k is what row j should be."""
         bound, right = self.bounds[quantity], self.right[quantity]
         return error_ratio(reported[:, k] - right[:, j], MAX_RATIO * (bound[:, k] + bound[:, j])) <= 1
 
-    def _of_places(self, quantity: str, reported: Array, places: list[int] | None) -> Cause | None:
+    def _of_places(self, quantity: str, reported: Array, places: list[int] | None) -> Causes:
         """What was returned in place of a quantity of all bodies or joints, or of some."""
 
         def chosen(x: Array) -> Array:
@@ -117,32 +122,32 @@ class Outputs:
             return error_ratio((x - right)[rows], (MAX_RATIO * bound)[rows]) > MAX_RATIO
 
         if len(given) > 2 and matches(chosen(self.previous[quantity]), slice(1, None)):
-            return cause("of the previous state (a stale field)")
+            return (cause("of the previous state (a stale field)"),)
         for change, value in self._whole(quantity):
             if matches(chosen(value)):
-                return cause(change)
+                return (cause(change),)
         weight = 1 / per_entry(bound, given)
         square = max(float(np.sum((right * weight) ** 2)), TINY)
         factor = float(np.sum(given * right * weight**2) / square)
         uncertainty = 1 / np.sqrt(square)
         if matches(factor * right):
             if abs(factor + 1) <= max(1e-9, 10 * uncertainty):
-                return cause("with the opposite sign")
-            return replace(
-                cause("multiplied by"), nominal=(1.0,), amount=(significant(factor, 1.0, uncertainty),)
-            )
+                return (cause("with the opposite sign"),)
+            amount = (significant(factor, 1.0, uncertainty),)
+            return (replace(cause("multiplied by"), nominal=(1.0,), amount=amount),)
         found = self._lacking(quantity, given, chosen, cause)
         if found:
             return found
         is_near = np.max(np.abs(given - right)) <= SINGLE_ROUNDING * np.max(np.abs(right))
         if is_near and np.any(given) and np.all(given == np.asarray(given, np.float32)):
-            return cause("rounded to single precision")
+            return (cause("rounded to single precision"),)
         offset = np.mean(given - right, axis=0)
         if len(given) > 2 and matches(right + offset):
             if quantity == "potential_energy":
-                return cause("with another origin, at every state larger by", float(f"{offset:.6g}"))
-            return cause("with a constant added at every state")
-        return None
+                words = "with another origin, at every state larger by"
+                return (cause(words, float(f"{offset:.6g}")),)
+            return (cause("with a constant added at every state"),)
+        return ()
 
     # -- whole quantities --------------------------------------------------------------------------
 
@@ -191,18 +196,18 @@ class Outputs:
 
     # -- parts -------------------------------------------------------------------------------------
 
-    def _lacking(self, quantity: str, given: Array, chosen: Choose, cause: MakeCause) -> Cause | None:
+    def _lacking(self, quantity: str, given: Array, chosen: Choose, cause: MakeCause) -> Causes:
         """One part that has another share in a quantity, or two."""
         bound, right = chosen(self.bounds[quantity]), chosen(self.right[quantity])
         weight = 1 / per_entry(bound, given)
         off = ((given - right) * weight).ravel()
         if not np.all(np.isfinite(off)):
-            return None
+            return ()
         parts = self._parts(quantity)
         columns = [(chosen(part.value) * weight).ravel() for part in parts]
         visible = [i for i, x in enumerate(columns) if np.max(np.abs(x), initial=0.0) > MAX_RATIO]
         if not visible:
-            return None
+            return ()
         A = np.array([columns[i] for i in visible])
         square = np.sum(A * A, axis=1)
         shares = A @ off / square
@@ -215,34 +220,55 @@ class Outputs:
                 words, amount = _share_words(float(shares[i]), part)
                 general, _ = _share_words(float(shares[i]), replace(part, what=part.sort))
                 named.append(replace(cause(words, *amount), general=general))
+        states = np.repeat(range(len(given)), off.size // len(given))
+        for k, x in zip(visible, A, strict=True):
+            free = parts[k].free
+            if free is not None and not named:
+                basis = (chosen(free) * weight[..., None]).reshape(off.size, -1)
+                if is_spanned(basis, off - x, states, limit):
+                    named.append(cause(parts[k].about))
         if named:
             exact = [one for one in named if not one.amount] or named
-            return replace(exact[0], equal=tuple(exact[1:]))
+            return (replace(exact[0], equal=tuple(exact[1:])),)
         return self._two_parts(off, A, [parts[i] for i in visible], cause, limit)
 
     @staticmethod
-    def _two_parts(off: Array, A: Array, parts: list[Part], cause: MakeCause, limit: float) -> Cause | None:
+    def _two_parts(off: Array, A: Array, parts: list[Part], cause: MakeCause, limit: float) -> Causes:
         """Two parts of shares in words: each lacks, counts twice or has the opposite sign."""
         if len(A) > MAX_PARTS:
-            return None
+            return ()
+
+        def stated(share: float, part: Part) -> Cause:
+            words = [part.about if part.about and share == 1 else SHARES[share].format(of)
+                     for of in (part.what, part.sort)]  # fmt: skip
+            return replace(cause(words[0]), general=words[1])
+
         gram, along, square = A @ A.T, A @ off, float(off @ off)
         size = np.diag(gram)
-        found = []
+        found = list[Causes]()
         for a in SHARES:
             for b in SHARES:
                 norm = square - 2 * (a * along[:, None] + b * along)
                 norm = norm + a * a * size[:, None] + b * b * size + 2 * a * b * gram
                 for i, j in zip(*np.nonzero(norm <= len(off) * limit**2 + 1e-9 * square), strict=True):
                     if i < j and np.max(np.abs(off - a * A[i] - b * A[j])) <= limit:
-                        both = (SHARES[a], parts[i]), (SHARES[b], parts[j])
-                        words = " and ".join(share.format(part.what) for share, part in both)
-                        general = " and ".join(share.format(part.sort) for share, part in both)
-                        found.append(replace(cause(words), general=general))
-        return replace(found[0], equal=tuple(found[1:3])) if found else None
+                        found.append((stated(a, parts[i]), stated(b, parts[j])))
+        if not found:
+            return ()
+        first, *others = found
+        equal: dict[Cause, list[Cause]] = {one: [] for one in first}
+        for other in others[:2]:
+            replaced, new = ([c for c in x if c not in y] for x, y in ((first, other), (other, first)))
+            for one, instead in zip(replaced, new, strict=True):
+                equal[one].append(instead)
+        return tuple(replace(one, equal=tuple(own)) for one, own in equal.items())
 
     def _parts(self, quantity: str) -> list[Part]:
         if quantity in WRENCHES:
-            own = [replace(part, value=part.value[WRENCHES.index(quantity)]) for part in self._wrench_parts]
+            own, i = list[Part](), WRENCHES.index(quantity)
+            for part in self._wrench_parts:
+                free = None if part.free is None else part.free[i]
+                own.append(replace(part, value=part.value[i], free=free))
             return own + (self._levers if quantity == "joint_moment" else [])
         names = dict(zip(SUMS, ("_kinetic", "_potential", "_momentum"), strict=True))
         return getattr(self, names[quantity]) if quantity in names else []
@@ -421,32 +447,54 @@ class Outputs:
             parts.append(Part("what the bodies beyond apply", self._determinate(carried)))
         return parts
 
+    @cached_property
+    def _motion_of_cuts(self) -> Responses:
+        """The tree of the loops cut open, by the rows of its ends that give the accelerations, if any do."""
+        cut, state = self._cut, self._cut.state(self.case.state)
+        ways: list[EndRows] = [*open_end_rows(cut.model), "accelerations"]
+        bound, bodies = MAX_RATIO * self.bounds["angular_acceleration"], cut.place[: self.case.model.n]
+        for way in ways:
+            found = Responses(cut.model, state, cut.ends, cut.row_scale, way)
+            turning = np.matvec(self._turns.mT, found.solution[:, bodies, 1])
+            if error_ratio(turning - self.right["angular_acceleration"], bound) <= 1:
+                break
+        return found
+
     def _welds_of_cuts(self) -> list[Part]:
         """Moments of the welds that hold the parts of bodies that are cut so that loops are open.
 
-        A part has the pose of its body and a share of mass and inertia; on it act the closing joint, gravity
-        and the weld.
+        A part has a share of its body's mass and inertia, and its own acceleration where the weld's rows are
+        wrong; on it act the closing joint, gravity and the weld.  What loops leave indeterminate of the
+        closing joint's wrench is in the weld's moment, by an unknown amount.
         """
         model, state = self.case.model, self.case.state
         if not model.has_loops or not self.right.keys() >= {"acceleration", *WRENCHES}:
             return []
-        cut, number = self._cut, np.arange(len(model.kind))[:, None]
-        inertial = np.matvec(model.inertia, self.right["angular_acceleration"]) + gyroscopic_moment(self.case)
-        inertial, each, total = np.matvec(self._turns, inertial), list[tuple[str, Array]](), 0.0 * self._near
+        motion, cut, number = self._motion_of_cuts, self._cut, np.arange(len(model.kind))[:, None]
+        gyroscopic, each = gyroscopic_moment(self.case), list[tuple[str, Array]]()
+        total, free = 0.0 * self._near, list[Array]()
 
         def carried(k: int, weld: Array) -> Array:
             own = np.array([0.0, 1.0])[:, None, None, None] * weld[:, None] * (number == k)
             return -self._carried(self._applied(k, 0 * weld, weld), own)
 
+        def of_multipliers(k: int, weld: Array) -> Array:  # a quaternion's rows have 2 Aᵀ N
+            return carried(k, 2 * np.matvec(self._turns[:, int(model.body[k, 1])].mT, weld) - weld)
+
         for k in range(model.n, len(model.kind)):
-            body, share = int(model.body[k, 1]), float(cut.share[cut.place[k]])
+            body, place = int(model.body[k, 1]), int(cut.place[k])
+            turn, arm = self._turns[:, body], self._near[:, k] - state.r[:, body]
+            turning = np.matvec(turn.mT, motion.solution[:, place, 1])
+            inertial = np.matvec(model.inertia[..., body, :, :], turning) + gyroscopic[:, body]
             force, moment = (self.right[name][:, k] for name in WRENCHES)
-            weld = share * inertial[:, body] - moment - cross(self._near[:, k] - state.r[:, body], force)
+            weld = float(cut.share[place]) * np.matvec(turn, inertial) - moment - cross(arm, force)
             each.append((f"the moment of the weld in body {body + 1}", carried(k, weld)))
-            # a quaternion's rows have the multipliers 2 Aᵀ N
-            total = total + carried(k, 2 * np.matvec(self._turns[:, body].mT, weld) - weld)
+            total = total + of_multipliers(k, weld)
+            for force, moment in motion.indeterminate_wrenches(place):
+                free.append(of_multipliers(k, -moment - cross(arm, force)))
         what = "the moments of the welds in cut bodies"
-        multipliers = Part(f"the multipliers of {what}", total, f"with {what} doubled and in body axes")
+        multipliers = Part(f"the multipliers of {what}", total, f"with {what} doubled and in body axes",
+                           free=np.stack(free, -1) if free else None)  # fmt: skip
         return [multipliers, *_each_and_all(what, each)]
 
     @cached_property

@@ -110,8 +110,8 @@ class Terms:
             change = self._solved(ends, "accelerations").solution - self.found.solution
             place = f"joint {self.model.n + loop + 1}"
             yield Cause("term", "loop", place, "left open"), self.answers(change)
-        if self.ends:
-            change = self._solved(self.ends, "without velocity terms").solution - self.found.solution
+        for way in open_end_rows(self.tree) if self.ends else ():
+            change = self._solved(self.ends, way).solution - self.found.solution
             place = "the rows that close loops"
             cause = Cause("term", "velocity terms", place, "missing", general=f"velocity terms of {place}")
             yield cause, self.answers(change)
@@ -189,6 +189,12 @@ class Terms:
         """Return the effects of unit accelerations that velocities might cause at a joint."""
         at = self._columns[self.joints[k]]
         return [self.answers(self._responses[..., i]) for i in range(at.start, at.stop)]
+
+
+def open_end_rows(tree: Model) -> list[EndRows]:
+    """Return how rows that close loops may lack their velocity terms, which depend on the coordinates."""
+    has_rods = any(kind.holds_distance for kind in tree.kinds)
+    return ["without velocity terms", *(("without those of rods as bodies",) if has_rods else ())]
 
 
 def missing_gammas(predictor: Predictor) -> Iterator[tuple[Cause, Answers]]:

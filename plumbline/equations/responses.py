@@ -25,7 +25,7 @@ from plumbline.model.datatypes import Array, Model, State
 from plumbline.model.kinematics import cross, cross_matrix, rotate_vectors, rotation_matrix, stack_states
 
 DEPENDENT = 3e-7  # singular values of scaled rows, relative: below it a row depends on the others
-EndRows = Literal["accelerations", "twists", "without velocity terms"]
+EndRows = Literal["accelerations", "twists", "without velocity terms", "without those of rods as bodies"]
 
 
 class Responses:
@@ -59,7 +59,8 @@ class Responses:
             ends: L pairs of bodies that are joined besides, parts of one body.
             row_scale: (6 L,) factors that make their rows comparable.
             end_rows: what these rows make equal: accelerations of the bodies, or rates of their twists, which
-                is another law where the ends are apart; or accelerations, without what velocities cause.
+                is another law where the ends are apart; or accelerations, without what velocities cause in
+                these coordinates, or in those of rods that are bodies on ball joints.
 
         """
         state = states if isinstance(states, State) else stack_states(states)
@@ -83,7 +84,10 @@ class Responses:
         self._pushed = pushed = np.concatenate([forces, moments], -1)[..., None]
         self._coasting = np.concatenate([self._vectors(some) for some in tree.coasting()], -1)[..., None]
         gaps = self._velocity_terms_of_ends() - self._rows_of_ends(self._coasting)
-        gaps = np.zeros_like(gaps) if end_rows == "without velocity terms" else gaps
+        if end_rows == "without velocity terms":
+            gaps = np.zeros_like(gaps)
+        if end_rows == "without those of rods as bodies":
+            gaps = self._rows_of_ends(self._coasting_of_rods())
         found = self._respond(self._coasting, pushed, gaps, self._effort[..., None])
         self.solution: Array = found[..., 0]
 
@@ -128,6 +132,13 @@ class Responses:
         found = self._respond(effort=units), self.to_gaps() * unit[:, None, None, None]
         return np.concatenate(found, -1), np.concatenate([rate[..., 0], multipliers], -1)
 
+    def indeterminate_wrenches(self, k: int) -> list[tuple[Array, Array]]:
+        """Return forces and moments (S, 3) of a joint that span what is indeterminate of its wrench."""
+        own = self.indeterminate[:, 6 * k : 6 * k + 6]
+        directions, sizes, _ = np.linalg.svd(own, full_matrices=False)
+        count = int(np.max(np.sum(sizes > DEPENDENT * np.max(sizes, initial=0.0), axis=1), initial=0))
+        return [(directions[:, :3, i], directions[:, 3:, i]) for i in range(count)]
+
     def velocity_terms(self) -> Array:
         """Return the relative accelerations (S, N, 6) of the joints by velocities alone."""
         x = self._coasting[..., 0]
@@ -135,6 +146,22 @@ class Responses:
         found = x - far
         found[..., :3] += cross(x[..., 3:], self.arm) - cross(far[..., 3:], self.far_arm)
         return found
+
+    def _coasting_of_rods(self) -> Array:
+        """What velocities cause besides (S, N, 6, 1) where rods are bodies that turn as those on balls."""
+        relative = np.zeros_like(self._coasting)
+        for k, blocks in enumerate(self.tree.blocks):
+            if not self.tree.model.kinds[k].holds_distance:
+                continue
+            far, own = self.far[k], self.omega[:, k]
+            above = self.omega[:, far] if far >= 0 else 0 * own
+            along = np.broadcast_to(blocks[0].u, (self._count, 3, 1))[..., 0]
+            swing = cross(along, self.state.udot[:, k])
+            turning = (self._coasting + self._beyond(relative))[:, far, 3:, 0] if far >= 0 else 0 * own
+            turning = turning + cross(above, swing)
+            relative[:, k, :3, 0] = self.tree.model.length[..., k, None] * cross(turning, along)
+            relative[:, k, 3:, 0] = cross(above, swing) + cross(swing, own) - cross(above, own)
+        return self._beyond(relative)
 
     def _vectors(self, vectors: Sequence[Any]) -> Array:
         """(S, N, 3) of a list of vectors."""

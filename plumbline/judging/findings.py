@@ -29,6 +29,7 @@ CLASSES = {  # of quantities, in the order in which one follows from another
     "momentum": ("angular_momentum",),
     "mass matrix": ("mass_matrix",),
 }
+MAX_NAME = 76  # characters of a name: a line of the terminal
 SAME = 1e-6  # relative: amounts of one cause in two scenarios
 TRANSLITERATED = str.maketrans({"ω": "omega", "γ": "gamma", "×": " x "})
 Identity = tuple[str, ...]
@@ -355,9 +356,10 @@ def _with_names(found: Sequence[Finding]) -> list[Finding]:
     wanted = [f.known_issue or _slug(f"{f.engine} {f.title}") for f in found]
     names = []
     for finding, name in zip(found, wanted, strict=True):
-        if wanted.count(name) > 1 and finding.known_issue is None:
-            digest = repr((finding.identity, finding.cause and finding.cause.amount))
-            name += f"-{hashlib.sha256(digest.encode()).hexdigest()[:4]}"
+        is_shared, amount = wanted.count(name) > 1, finding.cause and finding.cause.amount
+        if finding.known_issue is None and (is_shared or len(name) > MAX_NAME):
+            digest = repr((finding.identity, amount if is_shared else None))
+            name = f"{name[: MAX_NAME - 5]}-{hashlib.sha256(digest.encode()).hexdigest()[:4]}"
         names.append(name)
     return [replace(finding, name=name) for finding, name in zip(found, names, strict=True)]
 

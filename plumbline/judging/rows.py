@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Any, Literal, NamedTuple, Protocol, TypeVar
@@ -46,6 +46,12 @@ class Verdict(StrEnum):
         return VERDICT_STYLES[self]
 
 
+def most_wrong_call(ratios: Mapping[str, float]) -> str:
+    """Return the first by name of the calls that are off by about as much as the worst: of one cause."""
+    worst = max(ratios.values())
+    return min(call for call, ratio in ratios.items() if ratio >= SAME_SIZE * worst)
+
+
 def with_unit(size: float, unit: str, digits: int = 2) -> str:
     """Return a size in its unit, in words; a number without a dimension has none."""
     return f"{size:.{digits}g}" if unit == "1" else f"{size:.{digits}g} {unit}"
@@ -84,7 +90,8 @@ VERDICT_STYLES = {
         "i", "are information", "implied by other rows, or not compared: not a check", 0, 0, "is information"
     ),
 }
-WRONG_CALL = "wrong_call"  # in ``extra`` of a row: of the engine's calls that are off the first by name
+SAME_SIZE = 0.1  # of the worst call's error: within a decade
+WRONG_CALL = "wrong_call"  # in ``extra`` of a row: of the engine's calls, that of `most_wrong_call`
 FAILED_CALLS = "failed_calls"  # the same: all that failed or are off, one per line
 CHECKED = "checked"  # the same: what was checked of it where its diagnosis is a record's; may be empty
 RUN_FAMILY = "run"  # of a row that is about the whole run, in place of a scenario's family

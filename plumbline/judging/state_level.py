@@ -22,6 +22,7 @@ from plumbline.judging.rows import (
     Row,
     RowContext,
     Verdict,
+    most_wrong_call,
     with_unit,
 )
 from plumbline.judging.surface_rows import judge_surface
@@ -116,10 +117,11 @@ def judge_variants(context: RowContext, truth: StateTruth, evaluation: Evaluatio
         for quantity, judged in found.items():
             judged.sort(key=lambda one: (one[0].verdict == Verdict.DISAGREES, one[0].ratio or 0.0))
             row, names = judged[-1]
-            wrong = [by for one, by in judged[:-1] if one.verdict == Verdict.DISAGREES]
-            reason = f"by {names}: {row.reason}" + (f"; by {' and by '.join(wrong)} too" if wrong else "")
+            ratios = {by: one.ratio or 0.0 for one, by in judged if one.verdict == Verdict.DISAGREES}
+            others = " and by ".join(by for by in ratios if by != names)
+            reason = f"by {names}: {row.reason}" + (f"; by {others} too" if others else "")
             extra = row.extra | {"calls": float(len(judged))}
-            extra |= {WRONG_CALL: min([names, *wrong])} if row.verdict == Verdict.DISAGREES else {}
+            extra |= {WRONG_CALL: most_wrong_call(ratios)} if ratios else {}
             name = f"{quantity}_by_{kind}"
             rows.append(replace(row, level="surface", quantity=name, reason=reason, extra=extra))
         if missing:  # refusals are shown too: what was not compared is no agreement

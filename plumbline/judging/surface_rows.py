@@ -9,7 +9,15 @@ import numpy as np
 
 from plumbline.engines.engine_calls import Evaluation
 from plumbline.engines.missing_names import FAILED_PARTS, MISSING_NAMES
-from plumbline.judging.rows import FAILED_CALLS, WRONG_CALL, Row, RowContext, Verdict, with_unit
+from plumbline.judging.rows import (
+    FAILED_CALLS,
+    WRONG_CALL,
+    Row,
+    RowContext,
+    Verdict,
+    most_wrong_call,
+    with_unit,
+)
 from plumbline.model.datatypes import Array
 from plumbline.truth.ground_truth import StateTruth
 from plumbline.truth.rounding_bound import MAX_RELATIVE_BOUND, TINY
@@ -48,8 +56,8 @@ def _row(context: RowContext, quantity: str, true: SurfaceTruth, evaluation: Eva
     unit, name = SURFACE_QUANTITIES[quantity][0], quantity.replace("_", " ")
     found = [(*_worst(value, true), ", ".join(call)) for call, value in evaluation.surface[quantity].items()]
     ratio, error, tolerance, state, call = max(found)
-    wrong = sorted(one[-1] for one in found if one[0] > 1)
-    others = [one for one in wrong if one != call]
+    wrong = {one[-1]: one[0] for one in found if one[0] > 1}
+    others = sorted(wrong.keys() - {call})
     # single entries may have no scale
     scale, loose = np.max(true.scale, axis=1), np.max(true.tolerance, axis=1)
     looseness = np.where(scale > 0, loose / np.where(scale > 0, scale, 1.0), 0.0)
@@ -76,7 +84,7 @@ def _row(context: RowContext, quantity: str, true: SurfaceTruth, evaluation: Eva
         f"its terms are rounded once each; at most {loosest:.1g} of the scale at {count} states",
         cpu_time=evaluation.cpu_time,
         extra={"states": float(count), "state": float(state), "calls": float(len(found))}
-        | ({WRONG_CALL: wrong[0], FAILED_CALLS: "\n".join(wrong)} if wrong else {}),
+        | ({WRONG_CALL: most_wrong_call(wrong), FAILED_CALLS: "\n".join(sorted(wrong))} if wrong else {}),
     )  # fmt: skip
 
 

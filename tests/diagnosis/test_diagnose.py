@@ -183,9 +183,10 @@ def test_a_joint_force_that_counts_a_part_otherwise_is_named(name, change, parts
     for state, a in zip(truth.states, truth.quantities, strict=True):
         more = sum(share * carried(model, of(model, state, a)) for of, share in parts)
         reported.append(determinate(model, state, replace(a, joint_reaction=a.joint_reaction + more)))
-    (cause,) = diagnose(model, reported, truth).causes
-    assert (cause.kind, cause.term, cause.change) == ("output", "joint reaction", change), cause
-    assert cause.amount == ((1.25,) if "multiplied" in change else ())
+    causes = diagnose(model, reported, truth).causes
+    assert {(cause.kind, cause.term) for cause in causes} == {("output", "joint reaction")}, causes
+    assert sorted(cause.change for cause in causes) == sorted(change.split(" and "))
+    assert all(cause.amount == ((1.25,) if "multiplied" in change else ()) for cause in causes)
 
 
 def test_multipliers_of_welds_that_are_taken_for_their_moments_are_named():

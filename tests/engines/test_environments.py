@@ -241,6 +241,23 @@ def test_defects_of_older_versions_are_reported_by_quantity_and_call():
 
 @pytest.mark.full
 @pytest.mark.timeout(900)
+def test_each_cause_in_loops_of_older_versions_is_one_finding_with_its_versions():
+    """On rods, in whose coordinates the velocity terms are missing, and in a loop with redundant rows."""
+    chosen = loader.load_scenarios(["bricard", "flyball-governor"])
+    result = run_plan(Plan(chosen, ["mujoco@3.6.0", "mujoco@3.13.0"], "state", limits=Limits(600)), quiet)
+    found = {f.title: (f.version_range, f.scenarios) for f in result.findings if f.verdict == "disagrees"}
+    assert found == {
+        "joint forces with the moments of the welds in cut bodies doubled and in body axes": (
+            "3.6.0 to 3.13.0", ["flyball-governor", "bricard"],
+        ),
+        "velocity terms of the rows that close loops missing": (
+            "3.6.0 (not 3.13.0)", ["flyball-governor", "bricard"],
+        ),
+    }  # fmt: skip
+
+
+@pytest.mark.full
+@pytest.mark.timeout(900)
 @pytest.mark.parametrize(("version", "sound"), [("1.9.0", False), ("1.10.0", False), ("1.11.0", True)])
 def test_exudyn_started_from_wrong_accelerations_with_its_sparse_solver(version, sound):
     """The relation says that two solvers of one engine differ; this shows which is wrong, and where."""

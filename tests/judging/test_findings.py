@@ -5,7 +5,7 @@ from dataclasses import asdict, replace
 import pytest
 
 from plumbline.diagnosis.cause import Cause
-from plumbline.judging.findings import find_findings
+from plumbline.judging.findings import MAX_NAME, find_findings
 from plumbline.judging.rows import Row, Verdict
 
 SPRINGS = "without the springs between points"
@@ -144,6 +144,19 @@ def test_a_cause_is_about_its_own_quantities():
         f"mujoco-joint-forces-{SPRINGS.replace('the ', '').replace(' ', '-')}": ["joint_reaction"],
         "mujoco-wrong-energies-with-motion": ["kinetic_energy"],
     }
+
+
+def test_a_row_with_two_causes_belongs_to_two_findings():
+    both = output("without spring 1", SPRINGS), output("with twice the weights")
+    rows = [row("small", output(SPRINGS, SPRINGS)), row("large", *both)]
+    found = find_findings(rows, BODIES)
+    assert sorted(f.scenarios for f in found) == [["large"], ["small", "large"]]
+
+
+def test_a_long_name_is_cut_and_has_the_same_digits_whatever_else_is_found():
+    long = row("small", quantity="q", extra={"wrong_call": "call, " * 40})
+    (alone,) = names(long)
+    assert len(alone) == MAX_NAME and alone in names(long, row("large", output(SPRINGS)))
 
 
 def test_recorded_rows_are_one_finding_by_entry_and_declared_gaps_are_none():

@@ -15,7 +15,7 @@ from plumbline.engines.registry import load_adapter
 from plumbline.engines.surface import SURFACES
 from plumbline.engines.variants import NoAnswer
 from plumbline.judging.findings import find_findings
-from plumbline.judging.rows import RowContext, Verdict
+from plumbline.judging.rows import RowContext, Verdict, most_wrong_call
 from plumbline.judging.state_level import judge_variants
 from plumbline.judging.surface_rows import judge_surface
 from plumbline.model.kinematics import complete_state, quaternion_product, rotation_matrix
@@ -228,6 +228,11 @@ def test_a_wrong_call_is_named(tree):
     assert row.verdict == Verdict.DISAGREES
     assert "by mjtSensor.mjSENS_GYRO, mj_sensorVel is off by" in row.reason and "too" not in row.reason
     assert row.extra["failed_calls"] == "mjtSensor.mjSENS_GYRO, mj_sensorVel"
+
+
+def test_of_calls_that_are_off_by_about_as_much_the_first_names_the_finding():
+    assert most_wrong_call({"a": 2.0, "c": 1e6, "b": 5e5}) == "b"
+    assert most_wrong_call({"a": 2.0, "c": np.inf}) == "c"
 
 
 def test_calls_are_what_findings_are_about_whatever_quantities_they_get_wrong(tree):
