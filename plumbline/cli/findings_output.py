@@ -54,7 +54,7 @@ def finding_lines(finding: Finding, width: int) -> list[str]:
     style, colour = SHOWN_STYLES[finding.verdict], VERDICT_COLOURS[finding.verdict]
     ratio, versions, head = finding.largest_ratio, finding.version_range, finding.name
     sizes = ("",) if ratio is None else (f", up to {ratio:.2g} times the tolerance", f", {ratio:.0e} × tol.")
-    last = [coverage(finding) + size for size in sizes]
+    last = [coverage(finding) + size for size in sizes] + [_count_rows(finding) + sizes[-1]]
     if versions and len(f"{head}  {versions}") <= width - 2:
         head = f"{head}  {versions}"
     elif versions:

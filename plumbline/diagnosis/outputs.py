@@ -42,6 +42,7 @@ MAX_RATIO = 2.0  # in bounds: of what is returned and of the right quantity
 FACTOR_ROUNDING = 1e-6  # of a fitted share of a part: a word for 0, 1, 2 or −1 times
 LOADS = ("force", "moment", "drag_force", "drag_moment")
 SPRINGS, CLOSING_JOINTS = "the springs between points", "those of the closing joints"
+VANISHING = 1e-9  # of a unit wrench: what rounding leaves of one
 MAX_PARTS = 1000  # of which every two are tried
 SHARES = {-1.0: "without {}", 1.0: "with twice {}", -2.0: "with {} of the opposite sign"}
 
@@ -223,9 +224,12 @@ class Outputs:
         states = np.repeat(range(len(given)), off.size // len(given))
         for k, x in zip(visible, A, strict=True):
             free = parts[k].free
-            if free is not None and not named:
-                basis = (chosen(free) * weight[..., None]).reshape(off.size, -1)
-                if is_spanned(basis, off - x, states, limit):
+            # at some joints alone any moment has the direction of what is indeterminate there
+            if free is not None and not named and given.shape == self.right[quantity].shape:
+                basis = (free * weight[..., None]).reshape(off.size, -1)
+                unknowns = basis.shape[1] * len(given)
+                is_telling = np.count_nonzero(np.abs(off) > limit) > 2 * unknowns
+                if is_telling and is_spanned(basis, off - x, states, limit):
                     named.append(cause(parts[k].about))
         if named:
             exact = [one for one in named if not one.amount] or named
@@ -491,7 +495,9 @@ class Outputs:
             each.append((f"the moment of the weld in body {body + 1}", carried(k, weld)))
             total = total + of_multipliers(k, weld)
             for force, moment in motion.indeterminate_wrenches(place):
-                free.append(of_multipliers(k, -moment - cross(arm, force)))
+                value = of_multipliers(k, -moment - cross(arm, force))
+                if np.max(np.abs(value)) > VANISHING:
+                    free.append(np.where(np.abs(value) > VANISHING, value, 0.0))
         what = "the moments of the welds in cut bodies"
         multipliers = Part(f"the multipliers of {what}", total, f"with {what} doubled and in body axes",
                            free=np.stack(free, -1) if free else None)  # fmt: skip

@@ -357,6 +357,9 @@ def save(result: RunResult, folder: Path, command: str) -> None:
         results_store.write_results(folder, run, result.scenarios, engines, result.rows, result.tables)
 
 
+MAX_NAMED = 3  # findings that the sentence of a run names
+
+
 def summarize_verdicts(result: RunResult) -> str:
     """Return the verdicts of a run in one sentence: independent checks, verdicts, findings by name."""
     parts, checks = [], 0
@@ -370,8 +373,7 @@ def summarize_verdicts(result: RunResult) -> str:
         new = [row for row in rows if row.known_issue is None]
         if verdict in (Verdict.DISAGREES, Verdict.FAILED, Verdict.HARNESS_FAILED) and new:
             named = [f.name for f in result.findings if f.needs_attention and f.verdict == verdict]
-            more = f" and {len(named) - 3} more" if len(named) > 3 else ""
-            part += f" ({', '.join(named[:3])}{more})"
+            part += f" ({', '.join(named) if len(named) <= MAX_NAMED else f'{len(named)} findings'})"
         # rows of random scenarios that are only counted are expected, except where there is nothing to expect
         if verdict.needs_attention and count > len(new):
             declared = sum(row.is_declared for row in rows)

@@ -359,7 +359,7 @@ def _with_names(found: Sequence[Finding]) -> list[Finding]:
         is_shared, amount = wanted.count(name) > 1, finding.cause and finding.cause.amount
         if finding.known_issue is None and (is_shared or len(name) > MAX_NAME):
             digest = repr((finding.identity, amount if is_shared else None))
-            name = f"{name[: MAX_NAME - 5]}-{hashlib.sha256(digest.encode()).hexdigest()[:4]}"
+            name = f"{name[: MAX_NAME - 5].rstrip('-')}-{hashlib.sha256(digest.encode()).hexdigest()[:4]}"
         names.append(name)
     return [replace(finding, name=name) for finding, name in zip(found, names, strict=True)]
 
