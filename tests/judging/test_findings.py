@@ -156,7 +156,7 @@ def test_a_row_with_two_causes_belongs_to_two_findings():
 def test_a_long_name_is_cut_and_has_the_same_digits_whatever_else_is_found():
     long = row("small", quantity="q", extra={"wrong_call": "call, " * 40})
     (alone,) = names(long)
-    assert len(alone) == MAX_NAME and alone in names(long, row("large", output(SPRINGS)))
+    assert len(alone) <= MAX_NAME and alone in names(long, row("large", output(SPRINGS)))
 
 
 def test_recorded_rows_are_one_finding_by_entry_and_declared_gaps_are_none():
