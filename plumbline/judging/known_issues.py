@@ -673,14 +673,10 @@ class KnownIssues:
         self.matched_ids.update(e.id for e in entries)
         expecting = [e for e in entries if e.verdict == row.verdict]
         self.used_ids.update(e.id for e in expecting[:1])
-        objections = [
-            f"the entry {e.name} records what states show, and none of this mechanism does"
-            if e.id in unshown
-            else e.objection(row, e.covered_ratio(*chain), scatter)
-            for e in expecting
-        ]
+        applicable = [e for e in expecting if e.id not in unshown]
+        objections = [e.objection(row, e.covered_ratio(*chain), scatter) for e in applicable]
         if "" in objections:
-            match = expecting[objections.index("")]
+            match = applicable[objections.index("")]
             self.used_ids.add(match.id)
             covered = match.covered_ratio(*chain)
             if row.ratio is not None and covered < math.inf:
