@@ -26,7 +26,7 @@ from adapters import mujoco_shapes as shapes
 from adapters.mujoco_common import bodies_of, compiler_of, dense_rows, member, through_inverse
 from adapters.pose_functions import FIXED_PLACE, Pose, rate_maps
 from plumbline.engines.variants import Variant, both, every, has, names_of_column, variants_of
-from plumbline.model.datatypes import Array, Model
+from plumbline.model.datatypes import Array, Model, Unsupported
 from plumbline.model.kinematics import quaternion_conjugate, quaternion_product, rotation_matrix
 from plumbline.model.probe_frames import PROBE_ATTITUDE
 
@@ -48,6 +48,7 @@ HINGES, SLIDES = (
 
 
 FEW_JOINTS = 4
+MAX_LEFT = 1e-12  # of what rows of constraints demand, after an iteration that has converged: 1e-15
 
 
 def _no_change(*given: Any) -> Any:
@@ -410,11 +411,27 @@ _of_constraints = variants_of("option", Change, is_constrained)
 _of_loops = variants_of("option", Change, _has_loops)
 
 
-def _options(suits: Callable[[Model], bool] = every, **values: Any) -> Variant:
+def _forward_to_convergence(m: Any, d: Any) -> None:
+    """Refuse accelerations and forces that do not fulfil J q̈ + R f = a, as after too few iterations."""
+    mujoco.mj_forward(m, d)
+    free, left = np.zeros((2, d.nefc))
+    for given, rows in ((d.qacc_smooth, free), (d.qacc, left)):
+        mujoco.mj_mulJacVec(m, d, rows, given)
+        rows -= d.efc_aref
+    left += d.efc_R * d.efc_force
+    if np.max(np.abs(left), initial=0.0) > MAX_LEFT * np.max(np.abs(free), initial=0.0):
+        raise Unsupported(f"the solver has not converged after {m.opt.iterations} iterations")
+
+
+def _options(
+    suits: Callable[[Model], bool] = every,
+    forward: Callable[[Any, Any], None] = mujoco.mj_forward,
+    **values: Any,
+) -> Variant:
     """Set options that concern constraints; the texts among them are its names."""
     names = " ".join(value for value in values.values() if isinstance(value, str))
     set_options = _set_options(**{"iterations": 100, "tolerance": 0.0} | values)
-    return _of_constraints(names, suits, remake=set_options)
+    return _of_constraints(names, suits, remake=set_options, forward=forward)
 
 
 def _of_shapes(by: str, describe: Callable[[Any], Any], suits: Callable[[Model], bool]) -> Variant:
@@ -504,7 +521,13 @@ VARIANTS = (
     _options(**SPARSE, solver="mjtSolver.mjSOL_CG", disableflags="mjtDisableBit.mjDSBL_WARMSTART"),
     # Its error falls as that of Gauss and Seidel's method, by 1 − 3e-4 an iteration at a state of
     # flyball-governor; it stops where an iteration changes little.
-    _options(_has_few_constraints, iterations=400_000, tolerance=1e-34, solver="mjtSolver.mjSOL_PGS"),
+    _options(
+        _has_few_constraints,
+        _forward_to_convergence,
+        iterations=400_000,
+        tolerance=1e-34,
+        solver="mjtSolver.mjSOL_PGS",
+    ),
     _options(jacobian="mjtJacobian.mjJAC_DENSE", disableflags="mjtDisableBit.mjDSBL_ISLAND"),
     _actuated(actuation.STATELESS, "ACTUATORFRC"),
     _actuated(actuation.WITH_STATE),

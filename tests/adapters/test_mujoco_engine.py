@@ -10,7 +10,8 @@ import pytest
 
 from plumbline.measurements.state_relations import QUANTITIES
 from plumbline.model import kinematics
-from plumbline.model.datatypes import EngineFailure, State
+from plumbline.model.datatypes import EngineFailure, State, Unsupported
+from plumbline.model.equivalent import rotate_body_frames
 from plumbline.model.kinematics import complete_state, rotation_matrix
 from plumbline.model.random_mechanisms import ELEMENTS, random_loop_mechanism, random_tree
 from plumbline.model.sampling import random_states
@@ -54,6 +55,22 @@ def test_a_step_too_coarse_is_a_failure_with_a_sentence(tmp_path):
     with pytest.raises(EngineFailure, match=r"MuJoCo warned by t = .* huge value"):
         simulate(subject, at, "Euler", 0.5, np.arange(41) * 0.5)
     assert not (before / "MUJOCO_LOG.TXT").exists()
+
+
+def evaluate_by(name, model, state):
+    variant = next(one for one in Mujoco.variants if one.names == (name,))
+    return Mujoco().with_variant(variant).evaluate(model, [state])
+
+
+def test_an_iteration_that_has_not_converged_is_refused():
+    """Turned, the planar four-bar's redundant rows agree to rounding only, by which PGS converges slowly."""
+    scenario = catalogue_scenarios()["four-bar"]
+    asked = "mujoco", evaluate_by, "mjtSolver.mjSOL_PGS"
+    (found,) = worker.run_in_engine_process(*asked, scenario.model, scenario.state)
+    assert found.limit_error["acceleration"] < 1e-12 * np.max(np.abs(found.acceleration))
+    turned = rotate_body_frames(scenario.model, scenario.state, np.array([0.1, 0.5, -0.7, 0.5]))
+    with pytest.raises(Unsupported, match="has not converged after 400000 iterations"):
+        worker.run_in_engine_process(*asked, *turned)
 
 
 def at_rest(model, state):
