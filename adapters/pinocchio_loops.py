@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
-from scipy.linalg import lu_factor, lu_solve
 
 from adapters.pinocchio_common import init_constraint_dynamics, translation
 from plumbline.model.datatypes import Array, Call, Float
@@ -23,11 +22,8 @@ from plumbline.model.datatypes import Array, Call, Float
 # μ over the largest entry of J M⁻¹ Jᵀ, and how often the step is taken.  Measured on squeezer: with 1e-5 the
 # twelve steps do not converge (771 rad/s² off), with 1e-7 they end 5e-7 off, with 1e-8 within the bound.
 DAMPING, STEPS = 1e-8, 12
+DEPENDENT = 1e-10  # singular values of rows, over the largest: below it a row depends on others
 CORNERS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # m, points that hold a frame
-
-
-def _fine() -> Any:
-    return pin.ProximalSettings(1e-15, 1e-14, 50)
 
 
 def welded(m: pin.Model, pairs: Iterable[tuple[tuple[int, pin.SE3], tuple[int, pin.SE3]]]) -> tuple[Any, Any]:
@@ -62,19 +58,29 @@ class _Rows:
         self.loops, self.m, self.q, self.v = loops, m, q, v
         self.still, self.solved = _still(m, q, v), m.createData()
         init_constraint_dynamics(m, self.solved, loops.welds, loops.data)
-        pin.constraintDynamics(m, self.solved, q, v, loops.push, loops.welds, loops.data, _fine())
+        # the larger one for rows that depend on others but for rounding
+        for mu in (1e-14, 1e-8):
+            self.settings = pin.ProximalSettings(1e-15, mu, 50)
+            pin.constraintDynamics(m, self.solved, q, v, loops.push, loops.welds, loops.data, self.settings)
+            self.J = np.array(pin.getConstraintsJacobian(m, self.still, loops.welds, loops.data))
+            self.are_independent = np.linalg.matrix_rank(self.J) == np.sum(np.any(self.J != 0, axis=1))
+            if self.are_independent:
+                break
         self.mass = np.reshape(pin.crba(m, m.createData(), q), (m.nv, m.nv))
         self.force = loops.push - pin.nonLinearEffects(m, m.createData(), q, v)
-        self.J = np.array(pin.getConstraintsJacobian(m, self.still, loops.welds, loops.data))
         self.bias = _bias(self.still, loops.welds)
         inverse = np.linalg.solve(self.mass, self.J.T)
         self.damping = DAMPING * float(np.max(np.sum(self.J.T * inverse, axis=0)))
 
     def by_rows(self, rows: Array, bias: Array) -> Array:
-        """Return v̇ by other rows."""
-        corner = -self.damping * np.eye(len(rows))
-        factored = lu_factor(np.block([[corner, rows], [rows.T, self.mass]]))
-        return self.by(lambda b: np.asarray(lu_solve(factored, b)), bias, self.damping)
+        """Return v̇ by other rows; those that depend on others, but for rounding, are left out."""
+        U, sizes, V = np.linalg.svd(rows, full_matrices=False)
+        kept = sizes > DEPENDENT * sizes[0]
+        independent = sizes[kept, None] * V[kept]
+        count = len(independent)
+        system = np.block([[np.zeros((count, count)), independent], [independent.T, self.mass]])
+        given = np.concatenate([-U.T[kept] @ bias, self.force])
+        return np.asarray(np.linalg.solve(system, given)[count:])
 
     def by_force(self, multipliers: Array) -> Array:
         """Return v̇ by the forces of the rows."""
@@ -108,18 +114,18 @@ def closed_accelerations(
     yield from _by_derivatives(rows)
     # of version 3, with another name
     factors = solved.constraint_chol if hasattr(solved, "constraint_chol") else solved.contact_chol
-    a = rows.by(lambda b: np.ravel(factors.solve(b[:, None])), rows.bias, _fine().mu)
+    a = rows.by(lambda b: np.ravel(factors.solve(b[:, None])), rows.bias, rows.settings.mu)
     yield False, (by, "Data.constraint_chol"), a
     yield from _by_anchors(rows)
 
 
 def _by_derivatives(rows: _Rows) -> Iterator[tuple[bool, Call, Any]]:
     loops, m, v, J, solved = rows.loops, rows.m, rows.v, rows.J, rows.solved
-    derivatives = pin.computeConstraintDynamicsDerivatives(m, solved, loops.welds, loops.data, _fine())
+    derivatives = pin.computeConstraintDynamicsDerivatives(m, solved, loops.welds, loops.data, rows.settings)
     _, a_v, a_tau, _, f_v, f_tau = (np.array(x) for x in derivatives)
     pushed = loops.push - pin.computeGeneralizedGravity(m, m.createData(), rows.q)
     by = "computeConstraintDynamicsDerivatives"
-    if np.linalg.matrix_rank(J) == np.sum(np.any(J != 0, axis=1)):  # they have no proximal iterations
+    if rows.are_independent:  # they have no proximal iterations
         yield True, (by, "Data.ddq_dv", "Data.ddq_dtau"), a_v @ v / 2 + a_tau @ pushed
         force = f_v @ v / 2 + f_tau @ pushed
         yield True, (by, "Data.dlambda_dv", "Data.dlambda_dtau"), rows.by_force(force)
@@ -191,7 +197,7 @@ def _by_anchors(rows: _Rows) -> Iterator[tuple[bool, Call, Any]]:
     yield False, by, rows.by_rows(np.vstack(points), np.concatenate(of_points))
     solved = m.createData()
     init_constraint_dynamics(m, solved, rigid, rigid_data)
-    a = pin.constraintDynamics(m, solved, rows.q, rows.v, loops.push, rigid, rigid_data, _fine()).copy()
+    a = pin.constraintDynamics(m, solved, rows.q, rows.v, loops.push, rigid, rigid_data, rows.settings).copy()
     yield False, ("convertToRigidConstraintModel",), a
     yield from _by_factors(rows, still, frames, data)
 
