@@ -73,8 +73,8 @@ class _Check:
         self.mat, self.arb, self.model, self.state, self.balls = flint.arb_mat, flint.arb, model, state, balls
         self.is_sharp, self.scale = True, balls["scale"]
         # relative gaps of rounded geometry are from 1e-20 to 1e-16; below, the balls of exact one are to hold
-        gap = self.scale.get("gap", 0.0) / (MAX_DIFFERENCE * max(self.scale["r"], self.scale["v"]))
-        self.slack = MAX_OPEN_DEVIATION * min(1.0, gap)
+        size, gap = max(self.scale["r"], self.scale["v"]), self.scale.get("gap", 0.0)
+        self.slack = MAX_OPEN_DEVIATION * min(1.0, gap / (MAX_DIFFERENCE * size)) if gap else 0.0
         self.zero, self.one = self.mat(3, 1, [0] * 3), self.mat(3, 3, [1, 0, 0, 0, 1, 0, 0, 0, 1])
         self.world = _Series([self.one, self.mat(3, 3), self.mat(3, 3)], [self.zero] * 3)
         self.A = [self.mat(3, 3, own) for own in balls["attitude"]]
