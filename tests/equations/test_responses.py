@@ -13,7 +13,7 @@ from tests.helpers.catalogue import catalogue_scenarios
 
 NAMES = (
     "chain-5-mixed", "tree-of-seven-sprung", "free-body-with-rotors", "point-mass-arm", "flyball-governor",
-    "crowded-loops-1",
+    "crowded-loops-1", "helical-screw",
 )  # fmt: skip
 
 
@@ -178,6 +178,8 @@ def test_velocities_alone_accelerate_a_joint_along_what_it_holds(name):
     apart = expected - found.velocity_terms()
     terms = np.max(np.abs(expected)) * 10 * 6 * model.n * np.finfo(float).eps
     for k, held in enumerate(found.held):
+        one = np.broadcast_to(np.eye(held.shape[-1]), (len(states), *held.shape[-1:] * 2))
+        np.testing.assert_allclose(held.mT @ held, one, rtol=0, atol=36 * np.finfo(float).eps)
         along = np.matvec(held.mT, apart[:, k])
         assert np.max(np.abs(along), initial=0.0) <= terms
     assert np.max(np.abs(found.velocity_terms())) > 0.1
