@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from plumbline.equations.responses import Responses
-from plumbline.model.kinematics import rotation_matrix
+from plumbline.model.kinematics import rotation_matrix, stack_states
 from plumbline.model.loops import cut_open
 from plumbline.model.sampling import compared_states
 from plumbline.truth.certified_state import certify_state
@@ -33,7 +33,9 @@ def test_solutions_are_true(name):
     states = compared_states(scenario.model, scenario.state, scenario.seed, 3)
     model, opened, ends = cut(name, 3)
     place = cut_open(scenario.model).place[: scenario.model.n] if ends else np.arange(model.n)
-    for solution, state in zip(Responses(model, opened, *ends).solution, states, strict=True):
+    found = Responses(model, opened, *ends).solution
+    np.testing.assert_array_equal(Responses(model, stack_states(opened), *ends).solution, found)
+    for solution, state in zip(found, states, strict=True):
         true, bound = (
             certify_state(scenario.model, state).quantities,
             state_rounding_bound(scenario.model, state),
