@@ -11,7 +11,7 @@ from collections import defaultdict
 from collections.abc import Sequence
 from copy import copy
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -98,13 +98,27 @@ JACOBIANS = {
 MAX_AWAKE = 12  # steps after which what may sleep does
 INVERSE_STAGES = ("mj_invPosition", "mj_invVelocity", "mj_invConstraint")
 STILL_SENSORS = {"FRAMELINACC": False, "ACCELEROMETER": True}  # by name whether in own axes
-# By what makes forces of dampers zero the names that only a step with it uses.
-CLAMPED = {
-    "actuator_forcerange": ("mjtBias.mjBIAS_AFFINE", "mjtTrn.mjTRN_TENDON"),
-    "tendon_actfrcrange": ("mjtBias.mjBIAS_AFFINE", "mjtObj.mjOBJ_TENDON"),
-    "jnt_actfrcrange": ("mjtBias.mjBIAS_AFFINE", "mjtTrn.mjTRN_JOINT"),
-    "actuator_actearly": ("mjtGain.mjGAIN_AFFINE", "mjtDyn.mjDYN_INTEGRATOR"),
-}
+
+
+class Clamp(NamedTuple):
+    """What makes the forces of dampers zero in a step."""
+
+    limit: tuple[str, str]  # arrays of the model: the ranges and their flags; of early forces the flags alone
+    is_of_actuators: bool  # whether these are of the actuators, or of what they act on
+    transmission: str  # of the dampers
+    names: Call  # that only a step with it uses
+
+
+CLAMPS = (
+    Clamp(("actuator_forcerange", "actuator_forcelimited"), True, "mjtTrn.mjTRN_TENDON",
+          ("mjtBias.mjBIAS_AFFINE", "mjtTrn.mjTRN_TENDON")),
+    Clamp(("tendon_actfrcrange", "tendon_actfrclimited"), False, "mjtTrn.mjTRN_TENDON",
+          ("mjtBias.mjBIAS_AFFINE", "mjtObj.mjOBJ_TENDON")),
+    Clamp(("jnt_actfrcrange", "jnt_actfrclimited"), False, "mjtTrn.mjTRN_JOINT",
+          ("mjtBias.mjBIAS_AFFINE", "mjtTrn.mjTRN_JOINT")),
+    Clamp(("", "actuator_actearly"), True, "mjtTrn.mjTRN_TENDON",
+          ("mjtGain.mjGAIN_AFFINE", "mjtDyn.mjDYN_INTEGRATOR")),
+)  # fmt: skip
 SENSOR_STAGES = ("mj_sensorPos", "mj_sensorVel", "mj_sensorAcc")
 SIZES = {"p": 4, "R": 9, "r": 3, "phi": 3, "w": 3, "pdot": 4, "2pdot": 4}
 
@@ -510,7 +524,7 @@ def _add_implicit_steps(s: Probed) -> None:
             s.add("kinetic_energy", ("MjData.qLU",), twice / 2)
         call = "mj_implicit", f"mjtIntegrator.mjINT_{name}"
         _add_force_of_step(s, (*call, "MjData.qDeriv", "mjtDisableBit.mjDSBL_ACTUATION"), other, D, h)
-        add_parts(s.found, *(partial(_add_clamped_step, s, own, limit, call, D) for limit in CLAMPED))
+        add_parts(s.found, *(partial(_add_clamped_step, s, own, clamp, call, D) for clamp in CLAMPS))
 
 
 def _add_force_of_step(s: Probed, call: Call, end: Any, D: Array, h: float) -> None:
@@ -520,27 +534,26 @@ def _add_force_of_step(s: Probed, call: Call, end: Any, D: Array, h: float) -> N
     s.add_forces("inverse_dynamics", {call: force})
 
 
-def _add_clamped_step(s: Probed, usual: Any, limit: str, call: Call, D: Array) -> None:
+def _add_clamped_step(s: Probed, usual: Any, clamp: Clamp, call: Call, D: Array) -> None:
     """Take an implicit step with dampers on tendons or joints whose force is zero.
 
     By a limit, or by activations that are zero at the end of the step, from where the force comes early.
     """
-    own, transmission = copy(usual), "JOINT" if limit.startswith("jnt") else "TENDON"
-    a = np.flatnonzero(own.actuator_trntype == member(f"mjtTrn.mjTRN_{transmission}"))
+    own, (ranges, flags) = copy(usual), clamp.limit
+    a = np.flatnonzero(own.actuator_trntype == member(clamp.transmission))
     if not len(a):
         return
     own.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
     own.actuator_gainprm[:] = own.actuator_biasprm[:] = 0.0  # of all others
-    if limit.endswith("early"):
-        own.actuator_gaintype[a], own.actuator_gainprm[a, 2] = mujoco.mjtGain.mjGAIN_AFFINE, -7.0
-        own.actuator_actearly[a] = True
-    else:
+    of = a if clamp.is_of_actuators else own.actuator_trnid[a, 0]
+    getattr(own, flags)[of] = True
+    if ranges:
+        getattr(own, ranges)[of] = 0.0
         own.actuator_biastype[a], own.actuator_biasprm[a, 2] = mujoco.mjtBias.mjBIAS_AFFINE, -7.0
-        of = a if limit.startswith("actuator") else own.actuator_trnid[a, 0]
-        getattr(own, limit)[of] = 0.0
-        getattr(own, limit.replace("range", "limited"))[of] = True
+    else:
+        own.actuator_gaintype[a], own.actuator_gainprm[a, 2] = mujoco.mjtGain.mjGAIN_AFFINE, -7.0
     other = data_like(own, s.d, "qfrc_applied", "xfrc_applied")
     other.act[:], other.ctrl[:] = 1.0, -1.0 / own.opt.timestep
     mujoco.mj_forward(own, other)
     mujoco.mj_implicit(own, other)
-    _add_force_of_step(s, (*call, *CLAMPED[limit]), other, D, own.opt.timestep)
+    _add_force_of_step(s, (*call, *clamp.names), other, D, own.opt.timestep)

@@ -22,7 +22,9 @@ from plumbline.model.datatypes import Array, Call, Float
 # μ over the largest entry of J M⁻¹ Jᵀ, and how often the step is taken.  Measured on squeezer: with 1e-5 the
 # twelve steps do not converge (771 rad/s² off), with 1e-7 they end 5e-7 off, with 1e-8 within the bound.
 DAMPING, STEPS = 1e-8, 12
-DEPENDENT = 1e-10  # singular values of rows, over the largest: below it a row depends on others
+# Singular values of rows over the largest, below which a row depends on others: between what rounding leaves,
+# 1e-15, and the 1e-6 of poses that are singular and not compared.
+DEPENDENT = 1e-10
 CORNERS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # m, points that hold a frame
 
 

@@ -130,9 +130,9 @@ def write_scripts(
     if not tasks and not written.files:
         return written
     scripts.mkdir(exist_ok=True)
-    for key, shown_by in written.files.items():
-        written.files[key] = scripts / shown_by.name
-        write_atomically(written.files[key], shown_by.read_bytes())
+    for shown_by in set(written.files.values()):
+        write_atomically(scripts / shown_by.name, shown_by.read_bytes())
+    written.files = {key: scripts / shown_by.name for key, shown_by in written.files.items()}
     for outcome in _outcomes(tasks, results or ResultCache(), jobs):
         if not outcome.is_cached:
             written.cpu_time += outcome.cpu_time + outcome.overhead_cpu_time

@@ -72,7 +72,8 @@ class _Check:
     def __init__(self, flint: Any, model: Model, state: State, balls: dict[str, Any]) -> None:
         self.mat, self.arb, self.model, self.state, self.balls = flint.arb_mat, flint.arb, model, state, balls
         self.is_sharp, self.scale = True, balls["scale"]
-        # relative gaps of rounded geometry are from 1e-20 to 1e-16; below, the balls of exact one are to hold
+        # Rounded geometry leaves relative gaps of 1e-20 to 1e-16 (of turned loops of the catalogue); those of
+        # exact geometry are radii of balls, far smaller, and leave the slack in proportion.
         size, gap = max(self.scale["r"], self.scale["v"]), self.scale.get("gap", 0.0)
         self.slack = MAX_OPEN_DEVIATION * min(1.0, gap / (MAX_DIFFERENCE * size)) if gap else 0.0
         self.zero, self.one = self.mat(3, 1, [0] * 3), self.mat(3, 3, [1, 0, 0, 0, 1, 0, 0, 0, 1])

@@ -62,6 +62,7 @@ from plumbline.model.welding import BodyParts, part_offsets, undivided_bodies
 from plumbline.processes.worker_pool import Pickled
 
 EPS = 2.0**-53
+OF_JOINTS = ("joint_reaction", "joint_moment")  # the other quantities are of bodies
 TINY = float(np.finfo(float).tiny)  # replaces a bound of zero, so that an error of zero has the ratio 0
 ROUNDING_FACTOR = 64  # state quantities; the worst error of a sound engine is about a sixth of it (tests)
 SUM_ROUNDING_FACTOR = 256  # energies, momenta, entries of the mass matrix
@@ -248,7 +249,7 @@ def _of_loops(model: Model, states: State, method: JointSpaceMethod | None) -> R
     sizes = np.stack([*largest.values()], -1)[:, None]
     total = totals + of_welds + sizes
     total = total + (terms.of_rows + of_welds + sizes) * (spread - 1)[:, None, None]
-    counts = {name: len(model.kind) if name.startswith("joint") else model.n for name in largest}
+    counts = {name: len(model.kind) if name in OF_JOINTS else model.n for name in largest}
     scale = {name: np.repeat(value[:, None], counts[name], axis=1) for name, value in largest.items()}
     spread_sums = {name: size * spread for name, size in sums.items()}
     largest_motion = np.repeat(np.max(motion, axis=-1, keepdims=True), model.n, axis=-1)
