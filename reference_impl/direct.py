@@ -7,7 +7,6 @@ null space of these rows' transpose: it is 0 in the others.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -213,30 +212,6 @@ class DirectSystem:
         """
         values, b, joints, elements = self._entries(motion, x)
         return self._solution_from_unknowns(motion[1], solve_dense(self._dense(values), b), joints, elements)
-
-    def corrected(
-        self,
-        *motion: *Motion,
-        x: Float[Array, "joints coordinates"] | None,
-        unknowns: Float[Array, "m"],
-        correction: Callable[[Array], Array],
-    ) -> tuple[Solution, ElementForces | None]:
-        """Correct unknowns that nearly solve (N5): x + S₀⁻¹ (b − S x), with the S₀ of a system nearby.
-
-        Args:
-            motion: r, p, ṙ and ṗ.
-            x: as for `solve`.
-            unknowns: in the printed order.
-            correction: from b − S x to S₀⁻¹ (b − S x).
-
-        Returns:
-            The corrected solution, and what elements there are.
-
-        """
-        values, b, joints, elements = self._entries(motion, x)
-        lack = b - np.bincount(self._i, values * unknowns[self._j], self.size)
-        unknowns = unknowns + correction(lack)
-        return self._solution_from_unknowns(motion[1], unknowns, joints, elements), elements
 
     def _loop_unknowns(
         self,

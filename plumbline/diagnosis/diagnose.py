@@ -35,7 +35,6 @@ from plumbline.diagnosis.needs import find_needs
 from plumbline.diagnosis.outputs import Outputs
 from plumbline.diagnosis.prediction import (
     QUANTITIES,
-    SUMS,
     VECTORS,
     WRENCHES,
     Answers,
@@ -48,6 +47,7 @@ from plumbline.diagnosis.prediction import (
 from plumbline.diagnosis.readings import other_branches
 from plumbline.diagnosis.terms import Terms, force_places, is_spanned
 from plumbline.engines.registry import load_adapter
+from plumbline.equations.tree import SUMS
 from plumbline.model.datatypes import Array, Model, StateQuantities
 from plumbline.model.kinematics import complete_state
 from plumbline.truth.ground_truth import StateTruth

@@ -15,7 +15,6 @@ import numpy as np
 from plumbline.diagnosis.cause import Cause, quantity_words, significant
 from plumbline.diagnosis.edits import WORDS, gyroscopic_moment
 from plumbline.diagnosis.prediction import (
-    SUMS,
     WRENCHES,
     Answers,
     Case,
@@ -28,7 +27,7 @@ from plumbline.diagnosis.prediction import (
 from plumbline.diagnosis.terms import is_spanned, open_end_rows
 from plumbline.equations.arithmetic import floats, stacked
 from plumbline.equations.responses import EndRows, Responses
-from plumbline.equations.tree import Tree
+from plumbline.equations.tree import SUMS, Tree
 from plumbline.model.datatypes import Array
 from plumbline.model.kinematics import JointFrame, cross, rotate_vectors, rotation_matrix
 from plumbline.model.loops import CutMechanism, cut_open

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from plumbline.equations.arithmetic import floats, quantity_arrays
 from plumbline.equations.responses import EndRows, Responses
-from plumbline.equations.tree import Tree
+from plumbline.equations.tree import SUMS, Tree
 from plumbline.model.datatypes import Array, Model, State, StateQuantities, StepRun
 from plumbline.model.invariants import angular_momentum, kinetic_energy, potential_energy
 from plumbline.model.kinematics import (
@@ -38,7 +38,6 @@ from reference_impl.singular_system import SingularSystem
 
 VECTORS = ("acceleration", "angular_acceleration", "joint_reaction", "joint_moment")
 WRENCHES = VECTORS[2:]
-SUMS = ("kinetic_energy", "potential_energy", "angular_momentum")
 QUANTITIES = (*VECTORS, *SUMS)
 CONSTANT_FIELDS = ("kind", "body", "spring_body")
 CLOSED = 1e-9  # m, rad and their rates: a larger gap is an open loop
@@ -194,7 +193,7 @@ class Predictor:
         cut = cut_open(self.case.model)
         found = Responses(model, state, cut.ends, cut.row_scale, self.view.end_rows)
         projectors = [self.projectors[i % self.count] for i in range(len(state.p))]
-        sums = quantity_arrays(dict(zip(SUMS, found.tree.totals(), strict=True)), (len(state.p),))
+        sums = quantity_arrays(found.tree.sums(), (len(state.p),))
         return self.vectors(found.solution, found.tree, cut.place, projectors) | sums
 
     def vectors(

@@ -39,6 +39,7 @@ class Arithmetic:
     cross: Callable[[Any, Any], Any]  # a × b
     cross_matrix: Callable[[Any], Any]  # ã: ã b = a × b
     inverse: Callable[[Any], Any]  # of a symmetric 3×3 matrix
+    solve: Callable[[Any, Any], Any]  # x of a x = b, of floating-point numbers, jets and balls
     sqrt: Callable[[Any], Any]  # of a scalar that is not negative, but for rounding
     sin_cos: Callable[[Any], tuple[Any, Any]]  # of a scalar
     turn_over_sine: Callable[[Any, Any], Any]  # θ/sin θ by sin θ and cos θ, 0 ≤ θ < π
@@ -109,6 +110,9 @@ class _Floats(Arithmetic):
         cofactors = self.cross(a.take(_NEXT, -1), a.take(_LAST, -1))
         with np.errstate(divide="ignore", invalid="ignore"):
             return self.symmetric(cofactors / self.dot(a[..., :1], cofactors[..., :1]))
+
+    def solve(self, a: Any, b: Any) -> Any:
+        return np.linalg.solve(a, b)
 
     def sqrt(self, x: Any) -> Any:
         return np.sqrt(x)
@@ -266,6 +270,9 @@ class _Balls(Arithmetic):
 
     def inverse(self, a: Any) -> Any:
         return a.inv()
+
+    def solve(self, a: Any, b: Any) -> Any:
+        return a.solve(b)
 
     def sqrt(self, x: Any) -> Any:
         return x.nonnegative_part().sqrt()

@@ -156,6 +156,11 @@ class _Jets(Arithmetic):
         x = self.num.inverse(a.value)
         return Jet(x, None if a.slope is None else self.num.symmetric(-(x @ a.slope @ x)))
 
+    def solve(self, a: Jet, b: Jet) -> Jet:
+        x = Jet(self.num.solve(a.value, b.value))
+        left = b - self.mul(a, x)
+        return Jet(x.value, None if left.slope is None else self.num.solve(a.value, left.slope))
+
     def sqrt(self, x: Jet) -> Jet:
         root = self.num.sqrt(x.value)
         if x.slope is None:

@@ -30,6 +30,8 @@ from plumbline.equations.arithmetic import Arithmetic
 from plumbline.model.datatypes import KINDS, Model, State
 from plumbline.model.kinematics import own_rates, rate_count
 
+SUMS = ("kinetic_energy", "potential_energy", "angular_momentum")
+
 
 @dataclass(frozen=True, eq=False)
 class Articulated:
@@ -209,6 +211,7 @@ class Tree:
         arm: from the far body's near point to the point that this joint carries: the near point, or of a rod
             the far one; from the world's origin where the far body is the world.
         blocks: what each joint is made of, from the far body on.
+        shifted: by body, inertia about all axes [kg m²] that it has more than the model's.
 
     """
 
@@ -220,6 +223,7 @@ class Tree:
 
         """
         self.num, self.model, self.state = num, model, state
+        self.shifted: Mapping[int, float] = {}
         self.zero, self.one = num.vector(np.zeros(3)), num.matrix(np.eye(3))
         self.far = [int(far) for far in model.body[: model.n, 0]]
         self.A: list[Any] = []
@@ -336,7 +340,8 @@ class Tree:
             A matrix, body axes [kg m²].
 
         """
-        return self.num.matrix(self.model.inertia[..., k, :, :])
+        own = self.num.matrix(self.model.inertia[..., k, :, :])
+        return own + self.one * self.num.scalar(self.shifted[k]) if k in self.shifted else own
 
     def near_inertia(self, k: int) -> Any:
         """Return the inertia of a body about its near point.
@@ -657,6 +662,37 @@ class Tree:
             acceleration.append(a + num.mul(num.cross_matrix(self.near[k]), alpha) - inward)
         return Solution(acceleration, turning, forces, moments, rates)
 
+    def solve_joined(self, ends: Sequence[tuple[int, int]], rows: Sequence[int]) -> Solution:
+        """Solve with forces λ that hold parts of one body together where loops are cut.
+
+        They follow from the response to unit wrenches on the two parts,
+
+            K λ = −(a_b − a_c, A_bᵀ (α_b − α_c)) at λ = 0,    K = what λ adds to the right-hand side.
+
+        Args:
+            ends: the parts b and c of each loop.
+            rows: of six per loop those that do not depend on others; of the others λ is 0.
+
+        """
+        if not rows:
+            return self.solve()
+        num, wrenches, relative = self.num, list[dict[int, tuple[Any, Any]]](), list[Any]()
+        units = [num.vector(e) for e in np.eye(3)]
+        for row in rows:
+            (b, c), axis, is_force = ends[row // 6], units[row % 3], bool(row % 6 < 3)
+            wrenches.append(self.end_wrench(b, c, axis if is_force else num.mul(self.A[b], axis), is_force))
+        found = self.solve(wrenches)
+        for b, c in ends:
+            relative.append(found.acceleration[b] - found.acceleration[c])
+            relative.append(num.mul(num.transpose(self.A[b]), found.turning[b] - found.turning[c]))
+        kept = [[num.entry(relative[row // 3], row % 3, j) for j in range(len(rows) + 1)] for row in rows]
+        multipliers = num.solve(
+            num.from_rows([row[1:] for row in kept]), num.from_rows([[-row[0]] for row in kept])
+        )
+        own = [[num.scalar(1.0)], *([num.entry(multipliers, i)] for i in range(len(rows)))]
+        shares = num.from_rows(own)
+        return found.combined(lambda x: num.mul(x, shares))
+
     def end_wrench(
         self, b: int, c: int, axis: Any, is_force: bool, lever: Any | None = None
     ) -> dict[int, tuple[Any, Any]]:
@@ -699,16 +735,16 @@ class Tree:
 
         Accelerations, forces and moments are in world axes, angular accelerations in those of their bodies.
         """
-        kinetic, potential, momentum = self.totals()
         return {
             "acceleration": solution.acceleration,
             "angular_acceleration": self.in_bodies(solution.turning),
             "joint_reaction": solution.force,
             "joint_moment": [self.zero if moment is None else moment for moment in solution.moment],
-            "kinetic_energy": kinetic,
-            "potential_energy": potential,
-            "angular_momentum": momentum,
-        }
+        } | self.sums()
+
+    def sums(self) -> dict[str, Any]:
+        """Return the sums over all bodies of `totals` by their names as state quantities."""
+        return dict(zip(SUMS, self.totals(), strict=True))
 
     def in_bodies(self, vectors: Sequence[Any]) -> list[Any]:
         """Turn a vector of each body from world axes to the body's."""

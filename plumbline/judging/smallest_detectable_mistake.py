@@ -256,7 +256,7 @@ def _add_squares(
     sizes = [_natural_sizes(model, state, "state") for state in states]
     scale, worst = np.array([one.scale for one in some]), dict[str, list[Array]]()
     for mistake in (MAX_MISTAKE, MAX_MISTAKE / 3):
-        effects = difference_effects(model, states, some, mistake, is_central=False)
+        effects = difference_effects(model, states, some, mistake)
         for name in sizes[0].keys() & effects[0].keys():
             parts = [
                 np.max(effect[name] / own[name], axis=1) for effect, own in zip(effects, sizes, strict=True)
@@ -601,14 +601,14 @@ def _vanishing(
     """The doubtful parameters with which nothing changes, of mistakes of both signs up to a tenth.
 
     At state level no compared quantity changes by its bound, along a motion no acceleration by `NO_EFFECT`.
-    Changes at smaller mistakes count in proportion, and those of loops are of first order.
+    Changes at smaller mistakes count in proportion.
     """
     sizes = [_natural_sizes(model, state, level) for state in states]
     what = "quantity" if level == "state" else "acceleration"
     left = [int(i) for i in np.flatnonzero(doubtful)]
     for mistake in (MAX_MISTAKE, -MAX_MISTAKE, MAX_MISTAKE / 3, -MAX_MISTAKE / 3):
         some = [parameters[i] for i in left]
-        effects = difference_effects(model, states, some, mistake, is_central=False) if left else []
+        effects = difference_effects(model, states, some, mistake) if left else []
         largest = np.zeros(len(left))
         for effect, own in zip(effects, sizes, strict=False):
             for name in own.keys() & effect.keys():

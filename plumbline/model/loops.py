@@ -11,6 +11,7 @@ not unique, and of each joint's wrench only the determinate part is (`determinat
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -59,6 +60,7 @@ NEWTON_STEPS, MAX_HALVINGS = 30, 6
 SHARE_ROUNDING = 64 * np.finfo(float).eps
 NEARLY_CLOSED = 1e-11  # of a gap [m, rad]: the next step of Newton's method leaves only rounding
 PER_BODY = ("acceleration", "angular_acceleration")  # quantities with one row per body
+PER_JOINT = ("joint_reaction", "joint_moment")
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +78,11 @@ class CutMechanism:
         parts = _fields_of_parts(source, np.argsort(self.place), self.share)
         kept = {name: getattr(self.model, name) for name in ("kind", "body", "spring_body")}
         return replace(self, source=source, model=replace(source, **kept, **parts))
+
+    def with_whole_bodies(self) -> CutMechanism:
+        """Cut the same mechanism so that parts have no mass."""
+        is_body = np.isin(np.arange(len(self.place)), self.place[: self.source.n])
+        return replace(self, share=is_body.astype(float))
 
     @property
     def row_scale(self) -> Float[Array, "loop_rows"]:
@@ -125,10 +132,19 @@ class CutMechanism:
             return answer
         bodies, found = self.place[: self.source.n], {}
         for name, value in vars(answer).items():
-            of_joint = name in ("joint_reaction", "joint_moment")
-            places = self.place if of_joint else bodies if name in PER_BODY else None
+            places = self.place if name in PER_JOINT else bodies if name in PER_BODY else None
             found[name] = value if value is None or places is None else value[places]
         return StateQuantities(**found | {"mass_matrix": None})
+
+    def of_source(self, quantities: Mapping[str, Any]) -> dict[str, Any]:
+        """Order lists over the tree's bodies and their joints as the mechanism has them; the rest is kept."""
+        bodies = self.place[: self.source.n]
+        return {
+            name: [value[k] for k in (self.place if name in PER_JOINT else bodies)]
+            if isinstance(value, list)
+            else value
+            for name, value in quantities.items()
+        }
 
     def source_run(self, run: Trajectory) -> Trajectory:
         """Describe a run of the tree as one of the mechanism.

@@ -22,10 +22,10 @@ from plumbline.scenario.line_and_column_errors import ScenarioError
 from plumbline.scenario.loader import Scenario, scenario_from_dict
 from plumbline.scenario.mechanism_document import mechanism_document
 from plumbline.studies.coverage_study import run_all
-from plumbline.truth.parameter_effects import evaluate_models, evaluate_to_first_order
+from plumbline.truth.parameter_effects import evaluate_models
 from plumbline.truth.rounding_bound import state_rounding_bound
 
-MIN_RATIO = 100.0  # of an effect over the tolerance: effects in loops are of first order
+MIN_RATIO = 100.0  # of an effect over the tolerance, from which on it counts as shown
 STATES = 2  # random ones, besides the initial one, at which a feature is left out
 EXAMPLE_PLACES = 4  # of each half of an example's places
 _EXAMPLE = {"schema_version": 1, "name": "example", "title": "Example", "purpose": "Any.", "level": "state"}
@@ -92,7 +92,7 @@ def _is_shown(model: Model, state: State, some: Sequence[Feature]) -> NDArray[np
     changed = [model, *(without_feature(model, one) for one in some)]
     with np.errstate(all="ignore"):
         cases = [(one, complete_state(one, stacked)) for one in changed]
-        found = evaluate_to_first_order(model, [state], cases) if model.has_loops else evaluate_models(cases)
+        found = evaluate_models(model, [state], cases)
     bound = state_rounding_bound(model, state)
     for name, values in found.items():
         effect, tolerance = np.abs(values[1:, 0] - values[0, 0]), np.asarray(bound.tolerance(name))

@@ -17,7 +17,7 @@ from plumbline.equations.arithmetic import balls as ball_arithmetic
 from plumbline.equations.arithmetic import entries, flatten, midpoints
 from plumbline.equations.tree import Solution, Tree
 from plumbline.model.datatypes import Model, State, StateQuantities
-from plumbline.model.loops import determinate_part
+from plumbline.model.loops import CutMechanism, determinate_part
 from plumbline.processes.exceptions import PlumblineError
 from plumbline.truth import import_truth_tool
 from plumbline.truth.definition import definition_holds
@@ -142,14 +142,8 @@ def _enclose(flint: Any, model: Model, state: State, mass_matrix: bool) -> dict[
             balls["mass_matrix"] = tree.mass_matrix().tolist()
         return balls | {"scale": quantity_scales(tree, balls)}
     tree, solution, cut, gap = solve_loop(flint, model, state)
-    balls = tree_quantities(tree, solution)
-    scale = quantity_scales(tree, balls) | {"gap": gap}
-    for name, ball in balls.items():
-        if name in ("joint_reaction", "joint_moment"):
-            balls[name] = [ball[k] for k in cut.place]
-        elif len(ball) == cut.model.n and isinstance(ball[0], list):
-            balls[name] = [ball[k] for k in cut.place[: model.n]]
-    return balls | {"scale": scale}
+    balls = tree_quantities(tree, solution, cut)
+    return balls | {"scale": quantity_scales(tree, balls) | {"gap": gap}}
 
 
 def _is_sharp(name: str, balls: dict[str, Any]) -> bool:
@@ -157,11 +151,12 @@ def _is_sharp(name: str, balls: dict[str, Any]) -> bool:
     return all(float(x.rad()) <= MAX_RELATIVE_RADIUS * balls["scale"][name] for x in flatten(balls[name]))
 
 
-def tree_quantities(tree: Tree, solution: Solution) -> dict[str, Any]:
+def tree_quantities(tree: Tree, solution: Solution, cut: CutMechanism | None = None) -> dict[str, Any]:
     """List the balls of a solved tree.
 
     Args:
         tree: in balls.
+        cut: of which mechanism it is; absent: of itself.
 
     Returns:
         By quantity, as `plumbline.truth.certified_state.enclose_quantities`, without mass matrix and scales.
@@ -171,6 +166,7 @@ def tree_quantities(tree: Tree, solution: Solution) -> dict[str, Any]:
     found: dict[str, Any] = {name: [vectors.pop(name)] for name in ("kinetic_energy", "potential_energy")}
     found["angular_momentum"] = entries(vectors.pop("angular_momentum"))
     vectors |= {"r": tree.r, "v": tree.v, "attitude": tree.A, "angular_velocity": tree.in_bodies(tree.w)}
+    vectors = vectors if cut is None else cut.of_source(vectors)
     return found | {name: [entries(x) for x in each] for name, each in vectors.items()}
 
 

@@ -9,11 +9,8 @@ numbers of a ball joint, seen from the far body; two tangents of a rod)
 As many rows are kept as are independent, and as many coordinates depend on the others, whose doubles are
 exact.  Krawczyk's operator proves that the dependent ones have exactly one solution near their doubles, and
 encloses it:  K(Z) = z − Y F(z) + (1 − Y F_z(Z)) (Z − z) inside Z, Y ≈ F_z⁻¹.  Rates follow likewise, linear.
-The forces λ that hold b and c together follow from the tree's response to unit wrenches on the two,
-
-    K λ = −(a_b − a_c, A_bᵀ (α_b − α_c)) at λ = 0,    K = what λ adds to the right-hand side.
-
-Of dependent rows λ is one of many: only the determinate parts of joint wrenches are unique.
+Of dependent rows the forces that hold b and c together (`Tree.solve_joined`) are one of many: only the
+determinate parts of joint wrenches are unique.
 """
 
 from __future__ import annotations
@@ -44,7 +41,6 @@ class _LoopTree(Tree):
     ) -> None:
         self.mat, self.arb, self.z, self.nu = flint.arb_mat, flint.arb, z, nu
         self.chart: dict[int, list[list[Any]]] = {}
-        self.shifted: dict[int, float] = {}
         super().__init__(ball_arithmetic(flint), model, state)
 
     def _above(self, k: int) -> tuple[Any, Any, Any]:
@@ -79,10 +75,6 @@ class _LoopTree(Tree):
         ways = [turn * side * size for side in sides]  # ∂u/∂z, but for the part along u
         self.chart[k] = [[self.num.dot(t, way) / self.num.dot(t, t) for way in ways] for t in tangents]
         return u, self.num.cross(w, u) + tangents[0] * self.nu[k][0] + tangents[1] * self.nu[k][1]
-
-    def inertia(self, k: int) -> Any:
-        J = super().inertia(k)
-        return J + self.one * self.arb(self.shifted[k]) if k in self.shifted else J
 
     def chart_matrix(self) -> Any:
         """The matrix from ż to ν."""
@@ -186,12 +178,11 @@ def solve_loop(flint: Any, model: Model, state: State) -> tuple[Tree, Solution, 
     moving = _dependent_columns(cut, midpoints(kept.tolist()), rows, sizes)
     nu = _closed_rates(flint, given, kept, moving)
     c = _LoopTree(flint, cut.model, start, z, _per_joint(nu, sizes))
-    if model.lacks_inertia:
-        c.shifted = _shifted_inertia(cut)
+    c.shifted = shifted_inertia(cut)
     dropped = np.setdiff1d(np.arange(J.nrows()), rows)
     gap, rate = c.gap(cut.ends), entries(J * flint.arb_mat(len(nu), 1, nu))
     widest = max((float(abs(x[int(i)]).upper()) for x in (gap, rate) for i in dropped), default=0.0)
-    return c, _constrained_motion(flint, c, cut, rows), cut, widest
+    return c, c.solve_joined(cut.ends, [int(row) for row in rows]), cut, widest
 
 
 def _rate_count(kind: str) -> int:
@@ -202,7 +193,7 @@ def _rate_count(kind: str) -> int:
     return 3 + 2 * joint.holds_distance + 3 * joint.holds_nothing
 
 
-def _shifted_inertia(cut: CutMechanism) -> dict[int, float]:
+def shifted_inertia(cut: CutMechanism) -> dict[int, float]:
     """Inertia that parts get and their bodies lose: open, the tree may not turn a body without any.
 
     Since b and c move as one, only the forces between them change.
@@ -319,21 +310,3 @@ def _relative_rates(c: Tree) -> list[Any]:
             found += entries(c.w[k] - far_w)
         found += [c.coordinate(k, i)[1] for i in range(len(kind.motions))]
     return found
-
-
-def _constrained_motion(flint: Any, c: _LoopTree, cut: CutMechanism, rows: NDArray[np.intp]) -> Solution:
-    """Solve for λ."""
-    units = [flint.arb_mat(3, 1, [int(i == j) for i in range(3)]) for j in range(3)]
-    wrenches = []
-    for row in rows:
-        (b, part), axis, is_force = cut.ends[row // 6], units[row % 3], bool(row % 6 < 3)
-        wrenches.append(c.end_wrench(b, part, axis if is_force else c.A[b] * axis, is_force))
-    found = c.solve(wrenches)
-    relative = []
-    for b, part in cut.ends:
-        relative += (found.acceleration[b] - found.acceleration[part]).tolist()
-        relative += (c.A[b].transpose() * (found.turning[b] - found.turning[part])).tolist()
-    kept = [relative[int(row)] for row in rows]
-    K, opening = flint.arb_mat([row[1:] for row in kept]), flint.arb_mat([[-row[0]] for row in kept])
-    shares = flint.arb_mat(len(rows) + 1, 1, [1, *entries(K.solve(opening))])
-    return found.combined(lambda x: x * shares)

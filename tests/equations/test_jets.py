@@ -11,6 +11,7 @@ from plumbline.equations.jets import jets, with_slopes
 from plumbline.equations.tree import Tree
 from plumbline.model.datatypes import KINDS
 from plumbline.model.kinematics import stack_states
+from plumbline.model.loops import cut_open, independent_rows
 from plumbline.model.random_mechanisms import ELEMENTS, random_tree
 from plumbline.model.sampling import random_states
 from plumbline.truth.parameters import derivative, list_parameters
@@ -46,23 +47,23 @@ def along(step):
     return Along(flint)
 
 
-def evaluated(num, model, states):
+def evaluated(num, model, states, *joined):
     tree = Tree(num, model, states)
-    return tree.quantities(tree.solve()) | {"mass_matrix": tree.mass_matrix()}
+    return tree.quantities(tree.solve_joined(*joined)) | {"mass_matrix": tree.mass_matrix()}
 
 
-def check_jets(model, state, seed):
+def check_jets(model, state, seed, *joined):
     """Every direction's derivatives of every quantity, over the largest of that quantity by that number."""
     every = [one for one in list_parameters(model, state) if one.scale]
     chosen = np.random.default_rng(seed).permutation(len(every))[:DIRECTIONS]
     parameters, states = [every[i] for i in sorted(chosen)], stack_states([state])
     directions = [derivative(model, state, one) for one in parameters]
-    found = evaluated(jets(), *with_slopes(model, states, directions))
+    found = evaluated(jets(), *with_slopes(model, states, directions), *joined)
     with flint.ctx.workprec(BITS):
         h = flint.arb(STEP)
         for i, direction in enumerate(directions):
             moved = with_slopes(model, states, [direction])
-            plus, minus = (evaluated(along(sign * h), *moved) for sign in (1, -1))
+            plus, minus = (evaluated(along(sign * h), *moved, *joined) for sign in (1, -1))
             for quantity in found:
                 own, a, b = (listed(some[quantity]) for some in (found, plus, minus))
                 true = [midpoints((x - y) / (2 * h)) for x, y in zip(a, b, strict=True)]
@@ -95,13 +96,21 @@ def test_derivatives_of_trees_with_every_element(kinds, seed):
         spring_point=0.5 * rng.normal(size=(3, 2, 3)),
         **{f"spring_{name}": rng.uniform(0.5, 1.5, 3) for name in ("stiffness", "damping", "length")},
     )
-    check_jets(model, random_states(model, 1, seed)[0], seed)
+    check_jets(model, random_states(model, 1, seed)[0], seed, (), ())
 
 
 @pytest.mark.parametrize("name", ["chain-5-mixed", "loaded-tree", "point-mass-arm", "sprung-ball-on-slide"])
 def test_derivatives_of_catalogue_mechanisms(name):
     scenario = catalogue_scenarios()[name]
-    check_jets(scenario.model, scenario.state, 1)
+    check_jets(scenario.model, scenario.state, 1, (), ())
+
+
+@pytest.mark.parametrize("name", ["squeezer", "crowded-loops-bare"])
+def test_derivatives_where_loops_are_cut(name):
+    scenario = catalogue_scenarios()[name]
+    cut = cut_open(scenario.model)
+    state = cut.state(scenario.state)
+    check_jets(cut.model, state, 1, cut.ends, [*independent_rows(cut.jacobian(state), cut.row_scale)])
 
 
 def test_a_batch_of_states_is_its_states():
@@ -109,9 +118,9 @@ def test_a_batch_of_states_is_its_states():
     model, states = scenario.model, random_states(scenario.model, 3, 1)
     some = [one for one in list_parameters(model, states[0])[::9] if one.kind in vars(model)]
     directions = [derivative(model, states[0], one) for one in some]
-    together = evaluated(jets(), *with_slopes(model, stack_states(states), directions))
+    together = evaluated(jets(), *with_slopes(model, stack_states(states), directions), (), ())
     for i, state in enumerate(states):
-        alone = evaluated(jets(), *with_slopes(model, stack_states([state]), directions))
+        alone = evaluated(jets(), *with_slopes(model, stack_states([state]), directions), (), ())
         for a, b in zip(together["acceleration"], alone["acceleration"], strict=True):
             np.testing.assert_allclose(
                 a.slope[:, i], b.slope[:, 0], rtol=0, atol=1e-12 * np.max(np.abs(b.slope))

@@ -18,10 +18,14 @@ from plumbline.judging.smallest_detectable_mistake import (
     scenario_coverage,
 )
 from plumbline.model.datatypes import KINDS
+from plumbline.model.invariants import kinetic_energy
+from plumbline.model.kinematics import complete_state, kinetic_energy_of_rotors, stack_states
+from plumbline.model.sampling import compared_states
 from plumbline.scenario import loader as scenarios
 from plumbline.studies.coverage_study import blind_spots, summarize_coverage
-from plumbline.truth.parameter_effects import effects_at_states
-from plumbline.truth.parameters import STATE_KINDS, list_parameters, perturb
+from plumbline.truth.certified_state import certify_state
+from plumbline.truth.parameter_effects import effects_at_states, evaluate_models
+from plumbline.truth.parameters import STATE_KINDS, list_parameters, perturb, perturb_model
 from plumbline.truth.rounding_bound import EPS, state_rounding_bound
 from plumbline.truth.trajectory_truth import accurate_runs, perturbed_motions, resolved_motions
 from tests.helpers.coverage_confirmation import coverage, is_reported, scenario, states
@@ -251,6 +255,26 @@ def test_effects_in_a_loop_are_those_of_differences():
             norms = np.linalg.norm(rate.reshape(*effect[i].shape, -1), axis=-1)
             allowed = np.max(bound.tolerance(quantity)) / (d * one.scale)
             np.testing.assert_allclose(effect[i], norms, rtol=0, atol=allowed, err_msg=f"{one}, {quantity}")
+
+
+@pytest.mark.parametrize("name", ["bricard", "flyball-governor", "crowded-loops-bare", "crowded-loops-3"])
+def test_loops_without_a_mistake_have_the_quantities_of_the_truth(name):
+    """Rows that depend on others, a body without inertia, several loops; and energies of changed points."""
+    model = scenario(name).model
+    states = compared_states(model, scenario(name).state, name, 2)[1:]
+    one = next(x for x in list_parameters(model, states[0]) if x.kind == "proximal")
+    changed, at = perturb_model(model, one, 0.1), stack_states(states)
+    cases = [(model, at), (changed, complete_state(changed, at))]
+    found = evaluate_models(model, states, cases)
+    for i, state in enumerate(states):
+        truth, bound = certify_state(model, state).quantities, state_rounding_bound(model, state)
+        for quantity, values in found.items():
+            true, own = getattr(truth, quantity), np.max(bound.tolerance(quantity))
+            if true is not None:
+                np.testing.assert_allclose(values[0, i], true, rtol=0, atol=10 * own, err_msg=quantity)
+        own = cases[1][1][i]
+        energy = kinetic_energy(changed, own.v, own.omega) + kinetic_energy_of_rotors(changed, own)
+        np.testing.assert_allclose(found["kinetic_energy"][1, i], energy, rtol=1e-12)
 
 
 def test_the_table_of_a_scenario_has_every_parameter_once():

@@ -7,7 +7,7 @@ from plumbline.model.kinematics import maximal_coordinates
 from plumbline.model.random_mechanisms import random_tree
 from plumbline.model.sampling import random_states
 from plumbline.scenario.loader import find_scenario_file, load_scenario
-from reference_impl.direct import DirectSystem, solve_dense
+from reference_impl.direct import DirectSystem
 from reference_impl.elements import Elements
 from reference_impl.euler_parameters import L
 from reference_impl.fast.collocation import integrate_collocation
@@ -65,26 +65,6 @@ def test_a_run_chooses_as_many_rows_again_where_its_own_come_near_to_dependence(
     (after, *_) = system.solve_unknowns(*parts)
     assert len(system._run_rows) == count
     np.testing.assert_allclose(after[: 7 * model.n], before[: 7 * model.n], rtol=1e-10, atol=1e-10)
-
-
-def test_a_correction_ends_at_the_solution():
-    """With S₀ = S one correction takes any unknowns there; of a loop whose rows are independent."""
-    model, parts = loop_state("slider-crank")
-    system = DirectSystem(model)
-    S, kept = system.assemble(*parts)[0], system.solve(*parts).kept
-    used = np.r_[np.ones(7 * model.n, bool), kept, np.ones(model.n, bool)]
-    expected, (unknowns, *_) = system.solve(*parts), system.solve_unknowns(*parts)
-
-    def correction(lack):
-        found = np.zeros(len(lack))
-        found[used] = solve_dense(S[np.ix_(used, used)], lack[used])
-        return found
-
-    off = np.where(used, unknowns + 1.0, 0.0)
-    found, elements = system.corrected(*parts, x=None, unknowns=off, correction=correction)
-    assert elements is None
-    for name in ("acceleration", "pddot", "joint_moment"):
-        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["four-bar", "double-loaded-balls"])
