@@ -112,7 +112,8 @@ class _Floats(Arithmetic):
             return self.symmetric(cofactors / self.dot(a[..., :1], cofactors[..., :1]))
 
     def solve(self, a: Any, b: Any) -> Any:
-        return np.linalg.solve(a, b)
+        is_singular = np.linalg.slogdet(a).sign == 0  # of which the others of a batch must not fail
+        return np.linalg.solve(np.where(is_singular[..., None, None], np.nan, a), b)
 
     def sqrt(self, x: Any) -> Any:
         return np.sqrt(x)

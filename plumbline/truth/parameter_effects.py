@@ -19,7 +19,13 @@ from plumbline.equations.jets import Jet, jets, with_slopes
 from plumbline.equations.tree import Tree
 from plumbline.model.datatypes import Array, Model, State
 from plumbline.model.kinematics import complete_state, stack_states
-from plumbline.model.loops import cut_open, determinate_wrenches, independent_rows
+from plumbline.model.loops import (
+    PER_JOINT,
+    CutMechanism,
+    cut_open,
+    determinate_wrenches,
+    independent_rows,
+)
 from plumbline.truth.loop_closure import shifted_inertia
 from plumbline.truth.parameters import STATE_KINDS, Parameter, derivative, perturb, perturb_model
 
@@ -64,8 +70,9 @@ def _effects_by_jets(model: Model, states: Sequence[State], parameters: Sequence
     def slope(x: Jet) -> Any:
         return np.zeros(x.value.shape[-2:]) if x.slope is None else x.slope
 
-    found = _quantities(jets(), model, states[0], (changed, there), (len(parameters), len(states)), slope)
-    return {name: _sizes(name, x) for name, x in found.items()}
+    lead = len(parameters), len(states)
+    found = _quantities(jets(), cut_open(model), states[0], (changed, there), lead, slope)
+    return {name: _sizes(name, x) for name, x in _determinate(model, states[0], found).items()}
 
 
 def _moved_trees(
@@ -107,7 +114,7 @@ def _derivatives(model: Model, states: Sequence[State], parameter: Parameter) ->
 
 def _quantities(
     num: Arithmetic,
-    model: Model,
+    cut: CutMechanism,
     at: State,
     changed: tuple[Model, State],
     lead: tuple[int, ...],
@@ -116,12 +123,11 @@ def _quantities(
     """All quantities, or a part of their numbers: (*lead, N, 3), (*lead, 3), (*lead) and matrices of trees.
 
     Args:
-        model: without the changes.
-        at: a state of it; of loops, whose rows may depend on others, the one that is evaluated.
+        at: a state of the mechanism, at which the rows that do not depend on others are chosen.
         changed: a model of the same joints, and the coordinates of its tree.
 
     """
-    cut, rows, own = cut_open(model), list[int](), dict[str, Array]()
+    rows, own = list[int](), dict[str, Array]()
     tree = Tree(num, cut.with_numbers(changed[0]).model, changed[1])
     if cut.ends:
         rows = [int(row) for row in independent_rows(cut.jacobian(cut.state(at)), cut.row_scale)]
@@ -134,10 +140,13 @@ def _quantities(
         whole = Tree(num, cut.with_whole_bodies().with_numbers(changed[0]).model, changed[1])
         found |= whole.sums()
     parts = {name: [*map(part, x)] if isinstance(x, list) else part(x) for name, x in found.items()}
-    own |= quantity_arrays(parts, lead)
-    names = "joint_reaction", "joint_moment"
-    own |= zip(names, determinate_wrenches(model, at, *(own[name] for name in names)), strict=True)
-    return own
+    return own | quantity_arrays(parts, lead)
+
+
+def _determinate(model: Model, at: State, found: dict[str, Array]) -> dict[str, Array]:
+    """Keep of joints' wrenches, or of their changes, the parts that are unique without the changes."""
+    wrenches = determinate_wrenches(model, at, *(found[name] for name in PER_JOINT))
+    return found | dict(zip(PER_JOINT, wrenches, strict=True))
 
 
 def _sizes(name: str, change: Array) -> Array:
@@ -190,35 +199,35 @@ def evaluate_models(
     Args:
         model: without changes.
         states: S states of it.
-        cases: K mechanisms of as many bodies, of loops with the same joints, each with S states of
-            `complete_state`.
+        cases: K mechanisms of as many bodies and joints, each with S states of `complete_state`.
 
     Returns:
         By quantity (K, S, ...), with the names and units of `StateQuantities`; of loops the determinate
         parts, without mass matrices.
 
     """
-    if model.has_loops:
-        each = [
-            _evaluate_together(model, at, [(one, there[i : i + 1]) for one, there in cases])
-            for i, at in enumerate(states)
-        ]
-        return {name: np.concatenate([one[name] for one in each], axis=1) for name in each[0]}
-    joints = [(model.kind, model.body.tobytes()) for model, _ in cases]
+    given, *joints = [(one.kind, one.body.tobytes()) for one in (model, *(own for own, _ in cases))]
     groups = [[i for i, one in enumerate(joints) if one == own] for own in dict.fromkeys(joints)]
-    parts = [_evaluate_together(cases[group[0]][0], states[0], [cases[i] for i in group]) for group in groups]
-    order = np.argsort(np.concatenate(groups))
-    return {name: np.concatenate([part[name] for part in parts])[order] for name in parts[0]}
+    order, each = np.argsort(np.concatenate(groups)), list[dict[str, Array]]()
+    for i, base in enumerate(states if model.has_loops else states[:1]):
+        some = slice(i, i + 1) if model.has_loops else slice(None)
+        parts = []
+        for group in groups:
+            at = base if joints[group[0]] == given else cases[group[0]][1][i]
+            parts.append(_evaluate_together(at, [(cases[k][0], cases[k][1][some]) for k in group]))
+        found = {name: np.concatenate([part[name] for part in parts])[order] for name in parts[0]}
+        each.append(_determinate(model, base, found))
+    return {name: np.concatenate([one[name] for one in each], axis=1) for name in each[0]}
 
 
-def _evaluate_together(model: Model, at: State, cases: Sequence[tuple[Model, State]]) -> dict[str, Array]:
-    """Evaluate mechanisms with the same joints between the same bodies."""
+def _evaluate_together(at: State, cases: Sequence[tuple[Model, State]]) -> dict[str, Array]:
+    """Evaluate mechanisms with the same joints between the same bodies; of loops at one state of theirs."""
     models, states = zip(*cases, strict=True)
     numbers: dict[str, Any] = {
         name: np.array([getattr(one, name) for one in models])[:, None]
-        for name in vars(model).keys() - {"kind", "body", "spring_body"}
+        for name in vars(models[0]).keys() - {"kind", "body", "spring_body"}
     }
-    changed, stacked = replace(model, **numbers), stack_states(states)
-    there = cut_open(model).with_numbers(changed).state(stacked)
+    changed, stacked, cut = replace(models[0], **numbers), stack_states(states), cut_open(models[0])
+    there = cut.with_numbers(changed).state(stacked)
     with np.errstate(divide="ignore", invalid="ignore"):  # a mechanism may move without inertia
-        return _quantities(floats(), model, at, (changed, there), stacked.p.shape[:2])
+        return _quantities(floats(), cut, at, (changed, there), stacked.p.shape[:2])

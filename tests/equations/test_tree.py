@@ -72,6 +72,11 @@ def test_a_loop_may_hold_a_body_that_could_turn_without_inertia(seed):
     assert regular
 
 
+def test_of_a_batch_only_a_singular_system_has_no_solution():
+    a, b = np.array([np.eye(2), np.zeros((2, 2))]), np.ones((2, 2, 1))
+    np.testing.assert_array_equal(floats().solve(a, b), [np.ones((2, 1)), np.full((2, 1), np.nan)])
+
+
 def batch(states):
     """Many states as one, of arrays with a leading axis."""
     return State(**{name: np.stack([getattr(state, name) for state in states]) for name in vars(states[0])})
