@@ -79,8 +79,8 @@ def write_scripts(
     All rows of a cell and level (of one relation) share a script. Engines run in worker processes.
 
     Args:
-        keys: the wanted rows; by default all that disagree: less time is spent on each, those of a known
-            issue that has a script get that, and scripts of an earlier run are removed.
+        keys: the wanted rows; by default one cell of each finding and level: less time is spent on each, rows
+            of a known issue that has a script get that, and scripts of an earlier run are removed.
         results: scripts of earlier runs, used where nothing that they depend on has changed.
         document: content of the folder's results.json, where it has been read already.
 
@@ -108,21 +108,31 @@ def write_scripts(
         recorded = _recorded_scripts() if keys is None else {}
         changes = read_version_changes(folder)
         jobs = int(document.get("run", {}).get("machine", {}).get("jobs", 1))
-        for cell, rows in wanted.items():
+        found = {key: (f["name"], place) for f in document["findings"] for place, key in enumerate(f["rows"])}
+        scripted: dict[tuple[str, str], str] = {}  # of findings at a level the row whose script shows it
+        # rows of a finding begin with those of its smallest mechanism
+        for cell, rows in sorted(
+            wanted.items(), key=lambda x: min(found.get(r["key"], ("", 0))[1] for r in x[1])
+        ):
             if all(row["known_issue"] in recorded for row in rows):
                 written.files |= {row["key"]: recorded[row["known_issue"]] for row in rows}
                 continue
+            shown = {(found.get(row["key"], (row["key"],))[0], row["level"]) for row in rows}
             try:
                 if keys is None:
+                    if shown <= scripted.keys():
+                        first = scripted[min(shown)]
+                        raise NotReproducible(f"the script of {first} shows the same finding; {HINT}")
                     _check_worthwhile(cell, rows, cells)
                 seconds = UNREQUESTED_SECONDS if keys is None else REQUESTED_SECONDS
                 disagreement = find_disagreement(document, cells[cell], seconds)
             except NotReproducible as error:
                 written.reasons |= {row["key"]: str(error) for row in rows}
                 continue
+            scripted |= dict.fromkeys(shown - scripted.keys(), rows[0]["key"])
             quantities = ", ".join(row["quantity"] for row in rows)
-            shown = rows[0] | {"quantity": quantities, "since": _version_sentence(rows, changes)}
-            tasks.append(Task(cell, make_script, (disagreement, shown)))
+            head = rows[0] | {"quantity": quantities, "since": _version_sentence(rows, changes)}
+            tasks.append(Task(cell, make_script, (disagreement, head)))
     index = {} if keys is None else read_script_index(folder)
     if keys is None and scripts.is_dir():  # of an earlier run in the same folder
         for old in (*scripts.glob("*.py"), *scripts.glob("index.json")):
@@ -275,18 +285,9 @@ def _check_worthwhile(
     scenario, engine, level, integrator, *_ = cell
     if (level, integrator) == ("relations", "-") and (scenario, engine, "state", "-") in cells:
         raise NotReproducible(f"the state-level script of this engine and scenario shows it; {HINT}")
-    if level == "surface" or rows[0]["known_issue"]:  # one script of each mistake
-        same = (own[0] for own in cells.values() if _mistake(own[0]) == _mistake(rows[0]))
-        if (first := next(same)["key"]) != rows[0]["key"]:
-            raise NotReproducible(f"the script of {first} shows the same mistake; {HINT}")
     seconds = rows[0].get("cpu_time", 0.0) if level in ("trajectory", "invariants") else 0.0
     if seconds > UNREQUESTED_SECONDS / MIN_CANDIDATES:
         raise NotReproducible(f"one candidate takes {seconds:.1f} s, too long at the end of a run; {HINT}")
-
-
-def _mistake(row: StoredRow) -> tuple[str, ...]:
-    """What a row shows: the finding that it is recorded as, else of the surface the call that is wrong."""
-    return row["engine"], row["level"], str(row["known_issue"] or row["extra"].get(WRONG_CALL, ""))
 
 
 def _largest_printed_ratio(printed: str) -> float:

@@ -1,6 +1,7 @@
 """Scripts of a results folder: which rows get one, and what damaged or wrong input leads to."""
 
 import json
+from types import SimpleNamespace
 from unittest.mock import patch
 
 import numpy as np
@@ -152,18 +153,50 @@ def test_at_the_end_of_a_run_nothing_long_is_begun(results):
 
 
 @pytest.mark.parametrize("level", ["surface", "state"])
-def test_at_the_end_of_a_run_a_recorded_mistake_has_one_script_at_each_level(level, results):
+def test_at_the_end_of_a_run_a_finding_has_one_script_at_each_level(level, results):
+    """Of its smallest mechanism, whichever version it is of; where that has none, of the next."""
     document = results_store.read_results(results)
-    row = document["rows"][0] | {"level": level, "integrator": "-", "known_issue": "wrong"}
-    names = "frame_axes", "frame_position"
-    document["rows"] = [row | {"key": name, "quantity": name, "scenario": name} for name in names]
-    document["scenarios"] |= dict.fromkeys(names, document["scenarios"]["chain"])
+    row = document["rows"][0] | {"integrator": "-"}
+    document["rows"] = [
+        row | {"key": name, "quantity": "frame_axes", "scenario": name, "engine": engine, "level": own}
+        for name, engine, own in (
+            ("large", "mujoco", level),
+            ("small", "mujoco@3.6.0", level),
+            ("without", "mujoco", level),
+            ("moving", "mujoco", "trajectory"),
+            ("other", "mujoco", level),
+        )
+    ]
+    document["scenarios"] |= {one["key"]: document["scenarios"]["chain"] for one in document["rows"]}
+    document["engines"] |= {one["engine"]: document["engines"]["pinocchio-aba"] for one in document["rows"]}
+    lists = "versions", "right_versions", "scenarios", "quantities", "identity"
+    about = {"engine": "mujoco", "verdict": "disagrees", "title": "wrong", "sentence": "wrong"}
+    about |= {"known_issue": None, "largest_ratio": 2.0, **{name: [] for name in lists}}
+    document["findings"] = [
+        about | {"name": "wrong", "rows": ["without", "small", "large", "moving"]},
+        about | {"name": "other", "rows": ["other"]},
+    ]
     store(results, document)
-    with patch("plumbline.reproduce.write.find_disagreement", side_effect=NotReproducible("began")):
+    begun = []
+
+    def begin(_, rows, seconds):
+        if rows[0]["key"] == "without":
+            raise NotReproducible("nothing to measure")
+        begun.append(rows[0]["key"])
+        return SimpleNamespace(engine=SimpleNamespace(python="of another version"))
+
+    def lost(_, tasks):
+        return [Outcome(t.key, failure="hung") for t in tasks]
+
+    with (
+        patch("plumbline.reproduce.write.find_disagreement", side_effect=begin),
+        patch("plumbline.reproduce.write.WorkerPool.run", lost),
+    ):
         reasons = write_scripts(results).reasons
-        assert write_scripts(results, ["frame_position"]).reasons == {"frame_position": "began"}
-    same = "the script of frame_axes shows the same mistake; request this row by its key"
-    assert reasons == {"frame_axes": "began", "frame_position": same}
+        assert write_scripts(results, ["large"]).reasons == {"large": "hung"}
+    assert sorted(begun) == ["large", "moving", "other", "small"]
+    assert reasons.pop("large") == "the script of small shows the same finding; request this row by its key"
+    assert reasons.pop("without") == "nothing to measure" and set(reasons.values()) == {"hung"}
 
 
 def test_rows_of_a_known_issue_get_its_script_at_the_end_of_a_run(results):
