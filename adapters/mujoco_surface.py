@@ -409,9 +409,9 @@ def _add_factors(s: Probed) -> None:
 def _add_sum(s: Probed) -> None:
     """Add the kinetic energy by M added to nothing."""
     m, v, added = s.m, s.d.qvel, np.zeros(s.m.nM)
-    columns = np.zeros(m.nM, np.int32)  # the binding's sizes; it fills nC
+    columns = np.zeros(m.nM, np.int32)  # the binding's size, of which versions fill nC or all
     of = structure_of(m, s.d, "M")
-    columns[: m.nC] = of.M_colind
+    columns[: len(of.M_colind)] = of.M_colind
     mujoco.mj_addM(m, s.d, added, of.M_rownnz.copy(), of.M_rowadr.copy(), columns)
     lower = dense_rows(added, m, s.d, "M")
     s.add("kinetic_energy", ("mj_addM",), v @ (lower @ v + np.tril(lower, -1).T @ v) / 2)
