@@ -46,8 +46,9 @@ def unpack_state(y: Float[Array, "... entries"], n: int) -> Motion:
         r (..., N, 3), p (..., N, 4), ṙ (..., N, 3) and ṗ (..., N, 4).
 
     """
-    parts = np.split(y, np.cumsum([3 * n, 4 * n, 3 * n]), axis=-1)
-    r, p, v, pdot = (part.reshape(*y.shape[:-1], n, -1) for part in parts)
+    lead, q, rate = y.shape[:-1], y[..., : 7 * n], y[..., 7 * n :]
+    r, v = (part[..., : 3 * n].reshape(*lead, n, 3) for part in (q, rate))
+    p, pdot = (part[..., 3 * n :].reshape(*lead, n, 4) for part in (q, rate))
     return r, p, v, pdot
 
 

@@ -307,30 +307,30 @@ class DenseSystem(TreeSystem):
         c, each = len(gamma) // batch, np.arange(len(gamma) // batch)
         order, gamma = self.by_mechanism, gamma[self.by_mechanism]
         first, compliance = order[:c], self.compliance[order].reshape(batch, c)
-        near, far = near[order].reshape(batch, c, 6), far[order].reshape(batch, c, 6)
-        places = [6 * body[first, None] + np.arange(6) for body in (self.near, self.far)]  # columns of C
-        C, held = np.zeros((c, 6 * n)), np.flatnonzero(self.far[first] >= 0)
-        C[each[:, None], places[0]] = near[0]
-        C[held[:, None], places[1][held]] = far[0, held]
+        C, held = np.zeros((batch, c, 6 * n)), np.flatnonzero(self.far[first] >= 0)
+        for part, body, rows in ((near, self.near, each), (far, self.far, held)):
+            columns = 6 * body[first[rows], None] + np.arange(6)
+            C[:, rows[:, None], columns] = part[order].reshape(batch, c, 6)[:, rows]
         is_soft = compliance[0] > 0
         of_joints = np.flatnonzero(~is_soft)
-        kept = of_joints[independent_rows(C[of_joints], RUN_RANK_TOLERANCE)]
+        kept = of_joints[independent_rows(C[0, of_joints], RUN_RANK_TOLERANCE)]
         kept = np.sort(np.concatenate([kept, np.flatnonzero(is_soft)]))
-        size = 6 * n + len(kept)
-        S = np.zeros((batch, size, size))
+        C, compliance, inertia = C[:, kept], compliance[:, kept], self.inertia.reshape(batch, n, 6, 6)
+        # S is scaled before it is put together: most of its entries are 0
+        size, of_rows = np.abs(C), np.abs(inertia).max(axis=-1).reshape(batch, -1)
+        largest = [np.maximum(of_rows, size.max(axis=1)), np.maximum(compliance, size.max(axis=2))]
+        of_a, of_rows = scales = [power_of_two_scale(x) for x in largest]
+        C *= of_rows[:, :, None]
+        C *= of_a[:, None]
+        S = np.zeros((batch, 6 * n + len(kept), 6 * n + len(kept)))
+        S[:, 6 * n :, : 6 * n], S[:, : 6 * n, 6 * n :] = C, C.mT
         for k in range(n):
             own = slice(6 * k, 6 * k + 6)
-            S[:, own, own] = self.inertia.reshape(batch, n, 6, 6)[:, k]
+            S[:, own, own] = inertia[:, k] * of_a[:, own, None] * of_a[:, None, own]
         each = 6 * n + np.arange(len(kept))
-        S[:, each, each] = -compliance[:, kept]
-        for part, columns, some in zip(
-            (near, far), places, (kept >= 0, self.far[first[kept]] >= 0), strict=True
-        ):
-            row, column, values = each[some, None], columns[kept[some]], part[:, kept[some]]
-            S[:, row, column], S[:, column, row] = values, values
+        S[:, each, each] = -compliance * of_rows**2
         right = np.concatenate([wrench.reshape(batch, -1), gamma.reshape(batch, -1)[:, kept]], axis=1)
-        scale = power_of_two_scale(np.max(np.abs(S), axis=-1))
-        S *= scale[:, :, None] * scale[:, None]
+        scale = np.concatenate(scales, axis=1)
         try:
             found = scale * np.linalg.solve(S, (right * scale)[..., None])[..., 0]
         except np.linalg.LinAlgError:
