@@ -76,10 +76,17 @@ class _Floats(Arithmetic):
         return out
 
     def columns(self, vectors: Sequence[Any]) -> Any:
-        return np.concatenate(np.broadcast_arrays(*vectors), -1)
+        out = np.empty((*np.broadcast_shapes(*(x.shape[:-1] for x in vectors)), len(vectors)), self.dtype)
+        for j, x in enumerate(vectors):
+            out[..., j] = x[..., 0]
+        return out
 
     def widened(self, x: Any, like: Any) -> Any:
-        return x if like.shape[-1] == 1 else self.columns([x] + [np.zeros_like(x)] * (like.shape[-1] - 1))
+        if like.shape[-1] == 1:
+            return x
+        out = np.zeros((*x.shape[:-1], like.shape[-1]), self.dtype)
+        out[..., 0] = x[..., 0]
+        return out
 
     def assemble(self, size: int, blocks: Mapping[tuple[int, int], Any]) -> Any:
         lead = np.broadcast_shapes(*(block.shape[:-2] for block in blocks.values()))

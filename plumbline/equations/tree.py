@@ -559,9 +559,9 @@ class Tree:
         if pull is not None:
             f, n = f - pull[0], n - pull[1]
         if wrenches:
-            own = [wrench.get(k, (self.zero, self.zero)) for wrench in wrenches]
-            f = num.columns([f, *(-force for force, _ in own)])
-            n = num.columns([n, *(num.cross(s, force) - moment for force, moment in own)])
+            own = [wrench.get(k) for wrench in wrenches]  # None where one acts on other bodies
+            f = num.columns([f, *(-one[0] if one else self.zero for one in own)])
+            n = num.columns([n, *(num.cross(s, one[0]) - one[1] if one else self.zero for one in own)])
         return Articulated(c, b, i, f, n)
 
     def _own_load(self, k: int) -> tuple[Any, Any]:
