@@ -108,28 +108,32 @@ def write_scripts(
         recorded = _recorded_scripts() if keys is None else {}
         changes = read_version_changes(folder)
         jobs = int(document.get("run", {}).get("machine", {}).get("jobs", 1))
-        found = {key: (f["name"], place) for f in document["findings"] for place, key in enumerate(f["rows"])}
-        scripted: dict[tuple[str, str], str] = {}  # of findings at a level the row whose script shows it
-        # rows of a finding begin with those of its smallest mechanism
-        for cell, rows in sorted(
-            wanted.items(), key=lambda x: min(found.get(r["key"], ("", 0))[1] for r in x[1])
-        ):
+        # by row key the place in its finding, which begins with the smallest mechanism, and the name of that
+        found = {row: (place, f["name"]) for f in document["findings"] for place, row in enumerate(f["rows"])}
+        begun: dict[tuple[str, str], str] = {}  # of findings at a level the first row of the cell to be tried
+        left_to: dict[str, str] = {}  # by row key that of the row whose script is to show it
+
+        def place_of(cell: tuple[str, ...]) -> int:
+            return min(found.get(row["key"], (0, ""))[0] for row in wanted[cell])
+
+        for cell in sorted(wanted, key=place_of):
+            rows = wanted[cell]
             if all(row["known_issue"] in recorded for row in rows):
                 written.files |= {row["key"]: recorded[row["known_issue"]] for row in rows}
                 continue
-            shown = {(found.get(row["key"], (row["key"],))[0], row["level"]) for row in rows}
+            shown = {(str(found.get(row["key"], (0, row["key"]))[1]), str(row["level"])) for row in rows}
+            if keys is None and shown <= begun.keys():
+                left_to |= {row["key"]: begun[min(shown)] for row in rows}
+                continue
             try:
                 if keys is None:
-                    if shown <= scripted.keys():
-                        first = scripted[min(shown)]
-                        raise NotReproducible(f"the script of {first} shows the same finding; {HINT}")
                     _check_worthwhile(cell, rows, cells)
                 seconds = UNREQUESTED_SECONDS if keys is None else REQUESTED_SECONDS
                 disagreement = find_disagreement(document, cells[cell], seconds)
             except NotReproducible as error:
                 written.reasons |= {row["key"]: str(error) for row in rows}
                 continue
-            scripted |= dict.fromkeys(shown - scripted.keys(), rows[0]["key"])
+            begun |= dict.fromkeys(shown - begun.keys(), str(rows[0]["key"]))
             quantities = ", ".join(row["quantity"] for row in rows)
             head = rows[0] | {"quantity": quantities, "since": _version_sentence(rows, changes)}
             tasks.append(Task(cell, make_script, (disagreement, head)))
@@ -153,6 +157,10 @@ def write_scripts(
             written.files |= {row["key"]: path for row in wanted[outcome.key]}
         else:
             written.reasons |= {row["key"]: reason for row in wanted[outcome.key]}
+    for key, other in left_to.items():
+        reason = written.reasons.get(other)
+        what = f"has none ({reason})" if reason else "has a script"
+        written.reasons[key] = f"{other} shows the same finding and {what}; {HINT}"
     write_script_index(folder, index | {key: path.name for key, path in written.files.items()})
     return written
 

@@ -24,6 +24,7 @@ from plumbline.model.kinematics import (
 from plumbline.model.sampling import compared_states
 from plumbline.studies.random_steps import mechanism_of
 from plumbline.truth import step_formulas
+from plumbline.truth.rounding_bound import EPS
 from plumbline.truth.step_charts import StepCharts
 from plumbline.truth.step_comparison import RUN_QUANTITIES, StepsFromSamples
 from tests.helpers.catalogue import catalogue_scenarios
@@ -216,7 +217,8 @@ def test_a_rod_that_spins_about_itself_is_as_fast_as_it_turns():
     off = np.linalg.norm(
         angular_velocity(motion.p.astype(np.longdouble), motion.pdot) - steps.here.omega, axis=-1
     )
-    assert np.max(off) < 1e-12 * spin
+    # what is left is rounding: of two rotations of a vector, from quaternions, about ten in each entry
+    assert np.max(off) < 20 * EPS * spin
     assert np.all(off <= steps.of_samples["step_rate"])
 
 

@@ -259,7 +259,7 @@ def test_effects_in_a_loop_are_those_of_differences():
 
 @pytest.mark.parametrize("name", ["bricard", "flyball-governor", "crowded-loops-bare", "crowded-loops-3"])
 def test_loops_without_a_mistake_have_the_quantities_of_the_truth(name):
-    """Rows that depend on others, a body without inertia, several loops; and energies of changed points."""
+    """With dependent rows, rods, several loops; of changed points, energies are those of whole bodies."""
     model = scenario(name).model
     states = compared_states(model, scenario(name).state, name, 2)[1:]
     one = next(x for x in list_parameters(model, states[0]) if x.kind == "proximal")
@@ -271,10 +271,11 @@ def test_loops_without_a_mistake_have_the_quantities_of_the_truth(name):
         for quantity, values in found.items():
             true, own = getattr(truth, quantity), np.max(bound.tolerance(quantity))
             if true is not None:
-                np.testing.assert_allclose(values[0, i], true, rtol=0, atol=10 * own, err_msg=quantity)
+                np.testing.assert_allclose(values[0, i], true, rtol=0, atol=own, err_msg=quantity)
         own = cases[1][1][i]
         energy = kinetic_energy(changed, own.v, own.omega) + kinetic_energy_of_rotors(changed, own)
-        np.testing.assert_allclose(found["kinetic_energy"][1, i], energy, rtol=1e-12)
+        # the same sums of the same size, of points that are off by a tenth
+        assert abs(found["kinetic_energy"][1, i] - energy) <= bound.tolerance("kinetic_energy")
 
 
 def test_the_table_of_a_scenario_has_every_parameter_once():

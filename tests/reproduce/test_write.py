@@ -185,18 +185,21 @@ def test_at_the_end_of_a_run_a_finding_has_one_script_at_each_level(level, resul
         begun.append(rows[0]["key"])
         return SimpleNamespace(engine=SimpleNamespace(python="of another version"))
 
-    def lost(_, tasks):
-        return [Outcome(t.key, failure="hung") for t in tasks]
+    def run(answer):
+        return lambda _, tasks: [Outcome(task.key, **answer) for task in tasks]
 
-    with (
-        patch("plumbline.reproduce.write.find_disagreement", side_effect=begin),
-        patch("plumbline.reproduce.write.WorkerPool.run", lost),
-    ):
-        reasons = write_scripts(results).reasons
-        assert write_scripts(results, ["large"]).reasons == {"large": "hung"}
-    assert sorted(begun) == ["large", "moving", "other", "small"]
-    assert reasons.pop("large") == "the script of small shows the same finding; request this row by its key"
+    with patch("plumbline.reproduce.write.find_disagreement", side_effect=begin):
+        with patch("plumbline.reproduce.write.WorkerPool.run", run({"failure": "hung"})):
+            reasons = write_scripts(results).reasons
+            assert write_scripts(results, ["large"]).reasons == {"large": "hung"}
+        with patch("plumbline.reproduce.write.WorkerPool.run", run({"raw_value": ("text", "")})):
+            written = write_scripts(results)
+    assert sorted(begun) == sorted(["large", *["moving", "other", "small"] * 2])
+    hint = "request this row by its key"
+    assert reasons.pop("large") == f"small shows the same finding and has none (hung); {hint}"
     assert reasons.pop("without") == "nothing to measure" and set(reasons.values()) == {"hung"}
+    assert set(written.files) == {"small", "moving", "other"}
+    assert written.reasons["large"] == f"small shows the same finding and has a script; {hint}"
 
 
 def test_rows_of_a_known_issue_get_its_script_at_the_end_of_a_run(results):
