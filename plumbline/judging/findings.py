@@ -3,8 +3,9 @@
 A row that disagrees belongs to the causes that the diagnosis of its cell names.  Causes are the same where
 engine, term and change are, wherever in a mechanism they are; of what is unexplained, where engine, quantity
 and needs are.  Rows of levels without a diagnosis follow from the causes of the same scenario and engine, at
-steps of the same integrator or at states.  Recorded rows belong to their entry of known_issues.yaml.  Nothing
-of this depends on which scenarios there are, so that another scenario renames no finding.
+steps of the same integrator or at states; one that names a call of the engine, only from a cause of its class
+of quantities.  Recorded rows belong to their entry of known_issues.yaml.  Nothing of this depends on which
+scenarios there are, so that another scenario renames no finding.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from packaging.version import InvalidVersion, Version
 
 from plumbline.diagnosis.cause import Cause, Condition, Occurrence, describe, join_words
 from plumbline.judging.rows import VERDICT_STYLES, WRONG_CALL, Row, Verdict
+from plumbline.judging.state_level import STATE_UNITS
 
 CLASSES = {  # of quantities, in the order in which one follows from another
     "accelerations": ("acceleration", "angular_acceleration"),
@@ -279,16 +281,15 @@ class _Groups:
             named += [(row, cause) for cause in own]
             if not own:
                 left.append(row)
-        of_cells: dict[tuple[str, ...], list[_Group]] = {}
+        of_cells: dict[tuple[str, ...], list[tuple[Cause, _Group]]] = {}
         for row, cause in sorted(named, key=lambda one: len(one[1].equal)):
             group = self._group_of(_engine(row), cause)
             group.rows[row.key], group.causes[row.key] = row, cause
-            cell = of_cells.setdefault((row.scenario, row.engine, row.integrator), [])
-            if not any(one is group for one in cell):
-                cell.append(group)
+            of_cells.setdefault((row.scenario, row.engine, row.integrator), []).append((cause, group))
         for row in left:
             at = row.scenario, row.engine
-            followed = of_cells.get((*at, row.integrator)) or of_cells.get((*at, "-"), [])
+            causes = of_cells.get((*at, row.integrator)) or of_cells.get((*at, "-"), [])
+            followed = [group for cause, group in causes if _may_follow(row, cause)]
             for group in followed:
                 group.rows[row.key] = row
             if not followed:
@@ -311,6 +312,17 @@ def _is_about(cause: Cause, row: Row) -> bool:
     if cause.kind == "unexplained" and cause.change:
         return False  # too close to the bound, or not diagnosed: it may follow from another cause
     return not cause.quantities or row.quantity in cause.quantities
+
+
+def _may_follow(row: Row, cause: Cause) -> bool:
+    """Whether a row without a cause may follow from one of its cell; a call's, only where it is of its class.
+
+    A quantity of the surface is in the classes of the state quantities with its unit.
+    """
+    if WRONG_CALL not in row.extra or not cause.quantities:
+        return True
+    alike = {quantity for quantity, unit in STATE_UNITS.items() if unit == row.unit}
+    return any(alike & set(some) and set(cause.quantities) & set(some) for some in CLASSES.values())
 
 
 def _by_amount(group: _Group) -> list[_Group]:

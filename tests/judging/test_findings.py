@@ -133,6 +133,38 @@ def test_rows_without_a_diagnosis_follow_from_the_causes_of_their_cell():
     assert with_cause == ["small/mujoco/state/-/joint_reaction", motion.key]
 
 
+def called(quantity, unit, call="mj_rne", level="surface"):
+    return replace(row("small", quantity=quantity, level=level, extra={"wrong_call": call}), unit=unit)
+
+
+@pytest.mark.parametrize("call", [called("joint_force_local", "N"), called("joint_moment_by_option", "N m")])
+def test_a_wrong_call_of_the_class_of_a_cause_follows_from_it(call):
+    (found,) = find_findings([row("small", output(SPRINGS)), call], BODIES)
+    assert found.identity[0] == "mujoco" and [r.key for r in found.rows][1] == call.key
+
+
+@pytest.mark.parametrize("call", [called("frame_acceleration", "m/s²"), called("frame_axes", "1")])
+def test_a_wrong_call_of_another_class_is_a_finding_by_its_name(call):
+    found = find_findings([row("small", output(SPRINGS)), call], BODIES)
+    assert {f.title: f.quantities for f in found} == {
+        f"joint forces {SPRINGS}": ["joint_reaction"], "wrong by mj_rne": [call.quantity],
+    }  # fmt: skip
+
+
+def test_a_wrong_call_follows_from_what_is_wrong_in_the_mechanism_and_from_one_of_two_causes():
+    unknown = Cause("unexplained", "kinetic energy", quantities=("kinetic_energy",), needs=("motion",))
+    rows = [row("small", output(SPRINGS), unknown), row("small", unknown, quantity="kinetic_energy")]
+    energy, axes = called("mechanical_energy", "J"), called("frame_axes", "1")
+    assert {f.title: f.quantities for f in find_findings([*rows, energy, axes], BODIES)} == {
+        f"joint forces {SPRINGS}": ["joint_reaction"],
+        "wrong energies with motion": ["kinetic_energy", "mechanical_energy"],
+        "wrong by mj_rne": ["frame_axes"],
+    }
+    wrong_mass = row("small", number("mass", 1.1), quantity="acceleration")
+    (found,) = find_findings([wrong_mass, energy, axes], BODIES)
+    assert len(found.rows) == 3
+
+
 def test_a_cause_is_about_its_own_quantities():
     causes = (
         output(SPRINGS, quantities=("joint_reaction",)),
