@@ -26,7 +26,7 @@ from plumbline.model.datatypes import EngineFailure
 from plumbline.scenario.yaml_reader import read_yaml
 
 # Beside the files of engines: by engine and name the rows that a change turns red.
-EXERCISED = "exercised.json"
+EXERCISED_FILE = ROOT / "adapters" / "surface" / "exercised.json"
 SURFACE_ROWS = "rows of the level surface"  # the names of these are exercised
 SURFACES = ("mujoco", "pinocchio", "exudyn")  # columns whose engines are read
 COMPARED, OUTSIDE_STATUS, NOT_YET, NOT_MOTION = "compared", "outside", "not yet", "not about motion"
@@ -48,8 +48,7 @@ def exercised_rows(engine: str) -> Mapping[str, Sequence[str]]:
         By name the quantities whose rows turn red where what it returns changes by 1e-6.
 
     """
-    text = (ROOT / "adapters" / "surface" / EXERCISED).read_text(encoding="utf-8")
-    found: dict[str, dict[str, list[str]]] = json.loads(text)
+    found: dict[str, dict[str, list[str]]] = json.loads(EXERCISED_FILE.read_text(encoding="utf-8"))
     return found[engine]
 
 

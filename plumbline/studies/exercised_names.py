@@ -1,9 +1,11 @@
 """Which names of an engine's surface are exercised: a change of 1e-6 in what a name returns turns a row red.
 
-    python -m plumbline.studies.exercised_names [ENGINE ...] > adapters/surface/exercised.json
+    python -m plumbline.studies.exercised_names [ENGINE ...]
 
-computes it for all engines with a surface, on `MECHANISMS`; the file's entries of other engines stay.
-The pages docs/surface/ENGINE.md are made from it.  All columns of an engine are asked, by single steps too.
+computes it for all engines with a surface, or for some, on `MECHANISMS`, and writes it into
+adapters/surface/exercised.json, where the entries of other engines stay.  The pages docs/surface/ENGINE.md
+are made from it.  All columns of an engine are asked, by single steps too.  A night computes it, and fails
+where the file says otherwise (tests/engines/test_surface.py).
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from dataclasses import replace
 
 from plumbline.engines.engine_calls import SURFACE_STATES, Evaluation, StepAttempt, evaluate_states
 from plumbline.engines.registry import load_adapter
-from plumbline.engines.surface import SURFACES, exercised_rows, other_names
+from plumbline.engines.surface import EXERCISED_FILE, SURFACES, exercised_rows, other_names
 from plumbline.engines.variants import NoAnswer
 from plumbline.judging.rows import Row, RowContext, Verdict
 from plumbline.judging.state_level import judge_states, judge_variants
@@ -122,33 +124,38 @@ def _add_red_rows(found: dict[str, set[str]], call: Call, before: list[Row], aft
         found[name] |= red
 
 
-def main() -> None:
-    """Print the names of all engines."""
-    scenarios = load_scenarios(MECHANISMS)
-    engines = sys.argv[1:] or SURFACES
-    found: dict[str, dict[str, set[str]]] = {engine: defaultdict(set) for engine in engines}
-    for s in scenarios:
+def names_of_engine(engine: str) -> dict[str, list[str]]:
+    """Compute it on `MECHANISMS`.
+
+    Args:
+        engine: one of `plumbline.engines.surface.SURFACES`, which is imported.
+
+    Returns:
+        By name of the engine the quantities of the rows that turn red, both sorted.
+
+    """
+    names = defaultdict[str, set[str]](set)
+    for s in load_scenarios(MECHANISMS):
         states = compared_states(s.model, s.state, s.seed, SURFACE_STATES)[:SURFACE_STATES]
         truth = state_truth(s.model, states)
-        for engine, names in found.items():
-            for column in filter(None, (engine, load_adapter(engine).other_formulation)):
-                evaluation = evaluate_states(column, s.model, states)
-                own = [call for call, suits in load_adapter(column).column_names if suits(s.model)]
-                of_steps = names_of_steps(column, s.model, states[:1])
-                for seen in (exercised_names(truth, evaluation, own), of_steps):
-                    for name, quantities in seen.items():
-                        names[name] |= quantities
-    for engine, names in found.items():
-        for name, same in other_names(engine).items():
-            for other in same if name in names else ():
-                names[other] |= names[name]
-    written = {
-        engine: {name: sorted(found[engine][name]) for name in sorted(found[engine])}
-        if engine in found
-        else exercised_rows(engine)
-        for engine in SURFACES
-    }
-    print(json.dumps(written, indent=1))
+        for column in filter(None, (engine, load_adapter(engine).other_formulation)):
+            evaluation = evaluate_states(column, s.model, states)
+            own = [call for call, suits in load_adapter(column).column_names if suits(s.model)]
+            of_steps = names_of_steps(column, s.model, states[:1])
+            for seen in (exercised_names(truth, evaluation, own), of_steps):
+                for name, quantities in seen.items():
+                    names[name] |= quantities
+    for name, same in other_names(engine).items():
+        for other in same if name in names else ():
+            names[other] |= names[name]
+    return {name: sorted(names[name]) for name in sorted(names)}
+
+
+def main() -> None:
+    """Write the names of all engines, or of those that are given."""
+    found = {engine: names_of_engine(engine) for engine in sys.argv[1:] or SURFACES}
+    written = {engine: found.get(engine) or exercised_rows(engine) for engine in SURFACES}
+    EXERCISED_FILE.write_text(json.dumps(written, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

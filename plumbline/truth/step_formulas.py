@@ -123,13 +123,13 @@ def fastest_rates(model: Model, states: Sequence[State]) -> Array:
 
     tiny, growth = LongDouble(1e-7), []
     for _ in range(POWER_ITERATIONS):
-        total = size(theta, rate)
+        total = np.maximum(size(theta, rate), np.finfo(float).tiny)  # where no force depends on the motion
         theta, rate = tiny * theta / total, tiny * rate / total
         change = system.acceleration(system.move(q, theta), v + rate) - a
         # d/dt of a displacement in the moving frame: δθ̇ = δv − [v, θ]
         theta, rate = rate - system.bracket(v, theta), change
         growth.append(size(theta, rate) / tiny)
-    with np.errstate(divide="ignore"):  # nothing grows where no force depends on the motion
+    with np.errstate(divide="ignore"):
         later = np.log(np.array(growth[POWER_ITERATIONS // 2 :], float))
     return np.asarray(np.exp(np.mean(later, axis=0)).ravel())
 

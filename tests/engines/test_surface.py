@@ -18,6 +18,7 @@ from plumbline.execution.runner import compare_surfaces
 from plumbline.judging.known_issues import recorded_mistakes
 from plumbline.model.datatypes import EngineFailure
 from plumbline.processes.worker_pool import WorkerPool
+from plumbline.studies.exercised_names import names_of_engine
 from plumbline.studies.surface_page import surface_pages
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -35,6 +36,14 @@ def test_every_public_name_of_the_installed_engines_is_declared():
 def test_what_is_compared_by_rows_of_the_surface_is_exercised(engine):
     names = {one.name for one in declared_surface(engine).names if one.detail == SURFACE_ROWS}
     assert names == set(exercised_rows(engine)) and len(names) >= 10
+
+
+@pytest.mark.full
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("engine", SURFACES)
+def test_a_change_of_what_each_exercised_name_returns_turns_a_row_red(engine):
+    computed, written = set(names_of_engine(engine)), set(exercised_rows(engine))
+    assert computed == written, "run: python -m plumbline.studies.exercised_names"
 
 
 def test_new_and_vanished_names_are_found(monkeypatch):

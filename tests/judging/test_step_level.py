@@ -563,6 +563,11 @@ def test_steps_that_have_no_formula_say_why(name, engine, words):
     assert words in row.reason and row.verdict in (Verdict.UNSUPPORTED, Verdict.INFORMATION)
 
 
+def test_forces_that_do_not_depend_on_the_motion_have_the_rate_zero():
+    model = random_tree(np.random.default_rng(0), 2, ("slide",), loads=False)
+    assert step_formulas.fastest_rates(model, random_states(model, 1, 0)) == 0
+
+
 def test_steps_of_loops_are_small_enough_to_close_gaps():
     model, states = loop_subject("slider-crank")
     slow_states = [replace(s, omega=0 * s.omega, v=0 * s.v, xdot=0 * s.xdot) for s in states]
