@@ -467,9 +467,9 @@ class ExudynTree(ExudynAdapter):
             )
         angles, rates, r, v, omega = (np.array(column) for column in zip(*samples, strict=True))
         p = tree.quaternions_at(angles)
-        steps, own = round(float(times[-1] / resolution)), {"velocities": rates}
-        own["coordinates"] = angles + tree.linkage.start
-        return Trajectory(clock, r, p, v, quaternion_rate(p, omega), steps, **own)
+        pdot, steps = quaternion_rate(p, omega), round(float(times[-1] / resolution))
+        coordinates = angles + tree.linkage.start
+        return Trajectory(clock, r, p, v, pdot, steps, coordinates=coordinates, velocities=rates)
 
     def _step(self, model: Model, state: State, times: Array, integrator: Integrator, step: float) -> StepRun:
         groups = _Linkage(model, state).revolute_groups

@@ -292,9 +292,9 @@ class Mujoco(MetamorphicHooks):
         return self._sampled_run(chain, state, (times, integrator, resolution))
 
     def _step(self, model: Model, state: State, times: Array, integrator: Integrator, step: float) -> StepRun:
-        is_soft = is_constrained(model) and not self.option
-        run = self._limit_of_steps if is_soft else self._simulate
-        return StepRun(run(model, state, times, integrator, step))
+        if is_constrained(model) and not self.option:
+            return self._limit_of_steps(model, state, times, integrator, step)
+        return super()._step(model, state, times, integrator, step)
 
     def _softened(self, model: Model, largest: float) -> list[_SoftMechanism]:
         """The mechanism at regularisations that fall from the largest."""
@@ -309,7 +309,7 @@ class Mujoco(MetamorphicHooks):
     def _rigid_run(
         self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
     ) -> Trajectory:
-        """Run at falling regularisations, extrapolate to none; the last order's change is the uncertainty."""
+        """Run at falling regularisations, extrapolate to none."""
         runs = list[Trajectory]()
         for soft in self._softened(model, LARGEST_RUN_REGULARISATION):
             run = self._sampled_run(soft.tree, soft.state(state), (times, integrator, resolution))
@@ -318,14 +318,11 @@ class Mujoco(MetamorphicHooks):
         for name in ("r", "p", "v", "pdot"):
             limit[name], change = _at_zero([getattr(run, name) for run in runs])
             before[name] = limit[name] - change
-        spins = [kinematics.angular_velocity(x["p"], x["pdot"]) for x in (limit, before)]
-        changes = [limit[name] - before[name] for name in ("r", "p", "v")] + [spins[0] - spins[1]]
-        error = ERROR_UNITS * [_largest_norm(change) for change in changes]
-        return replace(runs[-1], **limit, limit_error=np.tile(error, (len(times), 1)))
+        return replace(runs[-1], **limit, softer=replace(runs[-1], **before))
 
     def _limit_of_steps(
         self, model: Model, state: State, times: Array, integrator: Integrator, step: float
-    ) -> Trajectory:
+    ) -> StepRun:
         """Extrapolate every step to no regularisation, and take the next one from there.
 
         The uncertainty of a step is three times the largest difference between the limits of two sequences in
@@ -353,7 +350,7 @@ class Mujoco(MetamorphicHooks):
         run = softs[0].cut.source_run(self._sampled_run(first, start, (times, integrator, step), advance))
         around = np.pad(errors, ((NEARBY_STEPS, NEARBY_STEPS), (0, 0)), "edge")
         largest = np.max(sliding_window_view(around, 2 * NEARBY_STEPS + 1, axis=0), axis=-1)
-        return replace(run, limit_error=3 * ERROR_UNITS * largest)
+        return StepRun(run, limit_error=3 * ERROR_UNITS * largest)
 
     def _sampled_run(
         self, chain: _MujocoChain, state: State, run: Run, advance: Callable[[int], None] | None = None
@@ -373,9 +370,10 @@ class Mujoco(MetamorphicHooks):
                 joint_v.append(chain.d.qvel.copy())
         r, p, v, omega = (np.array(column) for column in zip(*rows, strict=True))
         pdot = kinematics.quaternion_rate(p, omega)
-        own = dict(zip(("coordinates", "velocities"), chain.joint_samples(joint_q, joint_v), strict=True))
-        steps = int(counts[-1])
-        return Trajectory(t=np.array(t), r=r, p=p, v=v, pdot=pdot, steps=steps, **own)
+        coordinates, velocities = chain.joint_samples(joint_q, joint_v)
+        return Trajectory(
+            np.array(t), r, p, v, pdot, int(counts[-1]), coordinates=coordinates, velocities=velocities
+        )
 
 
 HALF_TURN = np.array([0.0, 1.0, 0.0, 0.0])  # about x

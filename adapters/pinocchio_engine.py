@@ -623,8 +623,8 @@ class PinocchioChain:
             for k, row in enumerate(self.body_rows)
         ]
         p = np.stack([quaternion_product(*pair) for pair in pairs], 1)
-        own = {"coordinates": self._joint_coordinates(q), "velocities": v}
-        return Trajectory(t=times, r=r, p=p, v=rdot, pdot=quaternion_rate(p, omega), steps=steps, **own)
+        pdot, coordinates = quaternion_rate(p, omega), self._joint_coordinates(q)
+        return Trajectory(times, r, p, rdot, pdot, steps, coordinates=coordinates, velocities=v)
 
     def _joint_coordinates(self, q: Array) -> Array:
         """Return q (T, nq) as `Trajectory` orders it: quaternions scalar first, in the bodies' axes."""

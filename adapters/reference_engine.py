@@ -77,6 +77,7 @@ class Reference(NotesAdapter):
             turned = there.r[-1], there.p[-1], -there.v[-1], -there.pdot[-1]
             system = eliminated_system([model], there.x[-1])
             back = integrate_collocation(system, *turned, times[:2], resolution)
-        names = ("r", "p", "v", "pdot")
-        rows = {name: np.vstack([getattr(there, name), getattr(back, name)[1:]]) for name in names}
-        return Trajectory(t=times, **rows, steps=there.steps + back.steps)
+        r, p, v, pdot = (
+            np.vstack([getattr(there, name), getattr(back, name)[1:]]) for name in ("r", "p", "v", "pdot")
+        )
+        return Trajectory(times, r, p, v, pdot, there.steps + back.steps)

@@ -283,7 +283,11 @@ class Adapter(ABC):
                 f"{self.name}._simulate, {integrator}: steps is {trajectory.steps!r}, but {count} steps of "
                 f"{resolution:g} s lead to t = {times[-1]:g} s"
             )
-        return replace(trajectory, initial_x=state.x, coordinates=None, velocities=None)  # steps need them
+        trajectory = replace(
+            trajectory, initial_x=state.x, coordinates=None, velocities=None
+        )  # steps need them
+        softer = trajectory.softer and replace(trajectory.softer, initial_x=state.x)
+        return replace(trajectory, softer=softer)
 
     def step(self, model: Model, state: State, integrator: str, step: float, count: int) -> StepRun:
         """Take a few steps from a state and sample after each; errors are those of `evaluate`.
@@ -447,6 +451,8 @@ def check_samples(model: Model, times: Float[Array, "samples"], run: Trajectory,
 def _check_trajectory(model: Model, times: Array, run: Trajectory, label: str) -> None:
     """Check the samples of a run, and that no row repeats the one before or the initial state."""
     check_samples(model, times, run, label)
+    if run.softer is not None:
+        check_samples(model, times, run.softer, f"{label}: softer")
     rows = np.concatenate([getattr(run, k).reshape(len(times), -1) for k in ("r", "p", "v", "pdot")], axis=1)
     moving = np.any(run.v != 0, axis=(1, 2)) | np.any(run.pdot != 0, axis=(1, 2))
     repeated = np.all(rows[1:] == rows[:-1], axis=1) & moving[1:]

@@ -12,7 +12,7 @@ from plumbline.judging.rows import Row, Verdict, first_decided, with_unit
 from plumbline.measurements.order_and_limit import observed_order
 from plumbline.measurements.refinement_study import ROUNDING_PER_STEP, rounding_floor
 from plumbline.model.datatypes import Array
-from plumbline.model.invariants import INVARIANT_UNITS
+from plumbline.model.invariants import INVARIANT_UNITS, UNCERTAIN
 from plumbline.truth.ground_truth import DETECTABLE_PARAMETER_ERROR
 
 
@@ -42,7 +42,7 @@ def _invariant_row(study: RefinementAnalysis, quantity: str, unit: str, samples:
     assert last is not None
     accepted = 0.0 if study.has_steps else study.runs[-1].resolution  # by step control in every step
     floor, per_step = rounding_floor(steps, scale, accepted), ROUNDING_PER_STEP + accepted
-    work_uncertainty = last.work_uncertainty if quantity == "energy_drift" else 0.0
+    uncertainty = last.uncertainty[quantity]
     drift = np.maximum.accumulate(np.max(np.linalg.norm(samples[-1], axis=-1), axis=1))
     rounding = f"{steps} steps, {per_step:.1g} × {with_unit(scale, unit, 3)} each: {floor:.2g}"
 
@@ -65,7 +65,7 @@ def _invariant_row(study: RefinementAnalysis, quantity: str, unit: str, samples:
     end, failure, tolerance = len(times) - 1, "", np.full(len(times), floor)
     try:
         limit = study.extrapolated_limit(samples)
-        tolerance = limit.uncertainty + floor + work_uncertainty
+        tolerance = limit.uncertainty + floor + uncertainty
     except ValueError as error:
         failure = str(error)
     if drift[end] <= floor:
@@ -86,7 +86,7 @@ def _invariant_row(study: RefinementAnalysis, quantity: str, unit: str, samples:
         )
         derivation = (
             f"{to_limit:.2g} from the finest step to step zero, itself ± {limit.uncertainty[at]:.2g}; "
-            f"{rounding}; the work by quadrature ± {work_uncertainty:.2g}"
+            f"{rounding}; {UNCERTAIN} ± {uncertainty:.2g}"
         )
         ratio = float(limit_drift[at] / tolerance[at])
         extra = {"limit": float(limit_drift[at]), "limit_tolerance": float(tolerance[at])}

@@ -28,7 +28,7 @@ from plumbline.measurements.drift_order import (
 )
 from plumbline.measurements.long_run_study import LongRunStudy, decisive_windows, leaves_range
 from plumbline.model.datatypes import Integrator, Model
-from plumbline.model.invariants import ALL_LONG, INVARIANT_UNITS
+from plumbline.model.invariants import ALL_LONG, INVARIANT_UNITS, UNCERTAIN
 from plumbline.truth.ground_truth import DETECTABLE_PARAMETER_ERROR
 
 UNSTABLE_GROWTH_FACTOR = 2.0  # times as fast as time: neither a bounded drift nor a secular one grows so
@@ -130,6 +130,8 @@ class _DriftJudge:
         cause = "rounding"
         if self.integrator.kind == "tolerance":
             cause = f"the error that the tolerance {self.finest.resolution:g} accepts in every step"
+        elif drift.max_drift > floor - drift.uncertainty:
+            cause = f"rounding, or by {UNCERTAIN}, ± {drift.uncertainty:.2g}"
         steps = f"{self.finest.steps} steps in {self.finest.reached_time:g} s"
         derivation = f"{steps}, a scale of {with_unit(drift.scale, self.unit, 3)}"
         if floor <= DETECTABLE_PARAMETER_ERROR * drift.scale:

@@ -25,6 +25,7 @@ from plumbline.model.invariants import (
     Invariants,
     compute_invariants,
     invariant_scales,
+    motion_errors,
     motion_scales,
 )
 from plumbline.model.kinematics import angular_velocity
@@ -97,11 +98,9 @@ class RefinementAnalysis:
         return {"alias_of": alias, "cpu_time": sum(run.cpu_time for run in self.runs)}
 
     @property
-    def limit_error(self) -> dict[str, float]:
-        """Of each name of `MOTION_UNITS`, in its unit: of the finest run, where it is itself a limit."""
-        errors = self.finest.limit_error
-        found = np.zeros(len(MOTION_UNITS)) if errors is None else np.max(errors, axis=0)
-        return dict(zip(MOTION_UNITS, found.tolist(), strict=True))
+    def limit_error(self) -> dict[str, Array]:
+        """Of each name of `MOTION_UNITS` (T,), in its unit: of the finest run, where it is itself a limit."""
+        return motion_errors(self.finest, self.finest.softer or self.finest)
 
     @property
     def rounding_description(self) -> str:

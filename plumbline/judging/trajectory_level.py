@@ -136,7 +136,7 @@ def trajectory_rows(study: RefinementAnalysis) -> list[Row]:
         the same run, and what their difference leaves out of the accepted errors is not known.
 
     """
-    truth = study.truth
+    truth, limit_error = study.truth, study.limit_error
     rows = [_order_row(study)] if study.has_steps else []
     for name, true in motion_samples(truth.trajectory).items():
         if not (study.has_steps or name in FINEST_RUN_SHOWN):
@@ -145,7 +145,7 @@ def trajectory_rows(study: RefinementAnalysis) -> list[Row]:
             study,
             _ComparedQuantity(
                 name, MOTION_UNITS[name], study.samples[name], true, truth.uncertainty[name],
-                truth.detectable[name], study.limit_error[name], study.motion_scales[name],
+                truth.detectable[name], limit_error[name], study.motion_scales[name],
             ),
         )  # fmt: skip
         rows += found if name in FINEST_RUN_SHOWN else found[:1]
@@ -200,7 +200,8 @@ class _ComparedQuantity:
     true: Array
     truth_uncertainty: Float[Array, "samples"]  # in ``unit``
     detectable: Float[Array, "samples"]  # in ``unit``: effect of the smallest mistake that must be detected
-    limit_error: float  # in ``unit``: of runs that are themselves the limit of softer ones
+    # in ``unit``: of runs that are themselves the limit of softer ones
+    limit_error: Float[Array, "samples"]
     scale: float  # of rounding, in ``unit``
 
 

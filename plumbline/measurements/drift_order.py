@@ -41,7 +41,7 @@ class LongRun:
     steps: int
     reached_time: float  # s
     failure: str | None  # of the longest run that was tried, where a shorter one replaces it
-    work_uncertainty: dict[float, float]  # J
+    uncertainty: dict[float, dict[str, float]]  # `Invariants.uncertainty` by window and invariant
     invariant_scales: dict[float, dict[str, float]]  # by window and invariant
     windows: dict[str, dict[float, DriftWindow]]  # by invariant and window
     cpu_time: float  # s, failed runs included
@@ -126,13 +126,17 @@ class InvariantDrift:
         """Steps of the finest run in this window."""
         return self.finest.steps * self.end / self.finest.reached_time
 
+    @property
+    def uncertainty(self) -> float:
+        """Drift by the quadrature of work and by the limit of softer runs."""
+        return self.finest.uncertainty[self.end][self.quantity]
+
     def rounding_floor(self, parts: int = 1) -> float:
-        """Drift in a part of the window by rounding, by the steps' solver and by the quadrature of work."""
+        """Drift in a part of the window by rounding and by the steps' solver, and its uncertainty."""
         steps = max(self.steps / parts, 64.0)
         # The solver's errors are independent from step to step: they add up like a random walk.
         relative = steps * ROUNDING_PER_STEP + np.sqrt(steps) * self.integrator.solver_rtol
-        work_uncertainty = self.finest.work_uncertainty[self.end] if self.quantity == "energy_drift" else 0.0
-        return float(relative * self.scale) + work_uncertainty
+        return float(relative * self.scale) + self.uncertainty
 
     @property
     def allowed_drift(self) -> float:

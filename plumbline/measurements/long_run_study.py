@@ -254,19 +254,19 @@ def _reduce_run(
         return LongRun(resolution, 0, 0.0, failure, {}, {}, {}, time.process_time() - begin)
     length, end = float(np.sum(stretched_length(model))), float(run.t[-1])
     windows: dict[str, dict[float, DriftWindow]] = {}
-    scales, work_uncertainty = {}, {}
+    scales, uncertainty = {}, {}
     for window_end in _window_ends(end, plan):
         number = int(np.searchsorted(run.t, window_end)) + 1
         part = run.at(slice(number))
         invariants = compute_invariants(model, part)
         scales[window_end] = invariant_scales(model, part, length)
-        work_uncertainty[window_end] = invariants.work_uncertainty
+        uncertainty[window_end] = invariants.uncertainty
         for quantity in INVARIANT_UNITS:
             series = getattr(invariants, quantity)
             if series is not None:
                 windows.setdefault(quantity, {})[window_end] = _reduce_window(series)
     cost = time.process_time() - begin
-    return LongRun(resolution, run.steps, end, failure, work_uncertainty, scales, windows, cost)
+    return LongRun(resolution, run.steps, end, failure, uncertainty, scales, windows, cost)
 
 
 def _reduce_window(series: Array) -> DriftWindow:

@@ -135,8 +135,9 @@ def extrapolated_order(last: Sequence[float], declared: int) -> float | None:
     """Extrapolate the three finest observed orders.
 
     Observed orders are off by c h + …: where two halvings of the step have each about halved the distance to
-    the declared order, the next halving is extrapolated; where three orders stay away from it by many
-    times their own changes, the method has another order.
+    the declared order, and the next halving leads to it, they show that order.  Where it leads elsewhere, the
+    distance does not halve yet.  Where three orders stay away from the declared one by many times their own
+    changes, the method has another order.
 
     Args:
         last: the three finest orders, coarse to fine; fewer where there are not as many.
@@ -150,8 +151,9 @@ def extrapolated_order(last: Sequence[float], declared: int) -> float | None:
         return None
     left = np.asarray(last) - declared
     halved = bool(np.all(np.abs(left[1:] / left[:-1] - 0.5) <= 0.2))
-    if halved and abs(left[2]) <= 2 * ORDER_MARGIN:
-        return float(2 * last[2] - last[1])
+    following = 2 * last[2] - last[1]
+    if halved and abs(left[2]) <= 2 * ORDER_MARGIN and abs(following - declared) <= ORDER_MARGIN:
+        return float(following)
     changes = abs(last[1] - last[0]) + abs(last[2] - last[1])
     return float(last[2]) if abs(left[2]) > ORDER_MARGIN + ORDER_CHANGE_FACTOR * changes else None
 

@@ -163,16 +163,16 @@ class Trajectory:
     steps: int  # steps the integrator took
     # rad or m: joint coordinates at t[0], angles unwrapped; None: angles are principal values there
     initial_x: Float[Array, "bodies coordinates"] | None = None
-    # m, rad, m/s, rad/s: uncertainty of positions, attitudes, ṙ and ω′, where the run is the limit of
-    # softer ones; of consecutive steps that of each by itself
-    limit_error: Float[Array, "samples 4"] | None = None
+    # where the run is the limit of softer ones, that by an order less: their difference is the uncertainty
+    softer: Trajectory | None = None
     # the engine's own configuration and velocity, joint by joint as `JointSpaceMethod` orders them
     coordinates: Float[Array, "samples entries"] | None = None
     velocities: Float[Array, "samples rates"] | None = None
 
     def at(self, samples: Any) -> Trajectory:
         """Take some samples of the motion; the engine's own coordinates stay as they are."""
-        return replace(self, **{name: getattr(self, name)[samples] for name in ("t", "r", "p", "v", "pdot")})
+        parts = {name: getattr(self, name)[samples] for name in ("t", "r", "p", "v", "pdot")}
+        return replace(self, **parts, softer=self.softer and self.softer.at(samples))
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,6 +186,9 @@ class StepRun:
     multipliers: Float[Array, "samples bodies 4"] | None = None
     # world axes of revolute joints at the start, from the pivot on
     angle_axes: Float[Array, "angles 3"] | None = None
+    # m, rad, m/s, rad/s: uncertainty of positions, attitudes, ṙ and ω′ of each step by itself, where that is
+    # the limit of softer ones
+    limit_error: Float[Array, "samples 4"] | None = None
 
 
 @dataclass(frozen=True)

@@ -203,7 +203,8 @@ class Invariants:
     joint_gap: Float[Array, "samples joints 3"]  # m: d of a ball joint; (|d| - ℓ, 0, 0) of a rod
     gap_rate: Float[Array, "samples joints 3"]  # m/s: its rate
     norm_drift: Float[Array, "samples bodies 1"]  # |p| - 1
-    work_uncertainty: float  # J: of W by quadrature over the samples
+    # by invariant, in its unit: of W by quadrature over the samples, and of a limit of softer runs
+    uncertainty: dict[str, float]
 
 
 MOTION_UNITS = {"position": "m", "attitude": "rad", "velocity": "m/s", "angular_velocity": "rad/s"}
@@ -215,6 +216,8 @@ INVARIANT_UNITS = {
     "gap_rate": "m/s",
     "norm_drift": "1",
 }
+# what `Invariants.uncertainty` is of, in words
+UNCERTAIN = "the work by quadrature, or the limit of softer runs"
 ALL_LONG = "all_long"  # quantity of long runs that were refused or failed
 LONG_RUN_QUANTITIES = frozenset(
     {ALL_LONG, "energy_drift_long_growth", *(f"{name}_long" for name in INVARIANT_UNITS)}
@@ -346,7 +349,7 @@ def compute_invariants(model: Model, run: Trajectory) -> Invariants:
     energy = kinetic_energy(model, run.v, omega) + potential_energy(model, run.r)
     elements = element_energies(model, run, omega)
     energy = energy + elements.rotors + elements.springs
-    done, uncertainty = work_of_loads(model, run, omega)
+    done, of_work = work_of_loads(model, run, omega)
     gravity = np.linalg.norm(model.gravity)
     momentum = None
     is_bare = not (model.has_loads or model.has_drag or model.has_elements)
@@ -362,14 +365,20 @@ def compute_invariants(model: Model, run: Trajectory) -> Invariants:
     stretching[..., 0] = np.sum(d * ddot, axis=-1) / np.where(distance > 0, distance, 1.0)
     rods = model.rods[:, None]
     d, ddot = _across_slides(model, run.p, omega, d, ddot)
-    return Invariants(
-        energy_drift=(energy - energy[0] - done)[:, None, None],
-        momentum_drift=momentum,
-        joint_gap=np.where(rods, stretch, d),
-        gap_rate=np.where(rods, stretching, ddot),
-        norm_drift=np.linalg.norm(run.p, axis=-1, keepdims=True) - 1,
-        work_uncertainty=uncertainty,
-    )
+    series = {
+        "energy_drift": (energy - energy[0] - done)[:, None, None],
+        "momentum_drift": momentum,
+        "joint_gap": np.where(rods, stretch, d),
+        "gap_rate": np.where(rods, stretching, ddot),
+        "norm_drift": np.linalg.norm(run.p, axis=-1, keepdims=True) - 1,
+    }
+    uncertainty = dict.fromkeys(series, 0.0) | {"energy_drift": of_work}
+    if run.softer is not None:
+        other = compute_invariants(model, run.softer)
+        for name, found in series.items():
+            if found is not None:
+                uncertainty[name] += float(np.max(np.linalg.norm(found - getattr(other, name), axis=-1)))
+    return Invariants(**series, uncertainty=uncertainty)
 
 
 @dataclass(frozen=True, eq=False)

@@ -261,7 +261,7 @@ class FormulaSteps:
             motion = runs[i].trajectory
             if count >= len(motion.t):
                 continue
-            place, soft = Place(*self.places[i], count), _limit_errors(motion)
+            place, soft = Place(*self.places[i], count), _limit_errors(runs[i])
             off = _differences(_reported(motion, count), self.true[i][count])
             for quantity, error in _norms(off).items():
                 lacking = count * float(np.max(soft[quantity][:count]))
@@ -561,9 +561,11 @@ def _norms(differences: dict[str, Array]) -> dict[str, Array]:
     return {name: np.linalg.norm(x, axis=-1) for name, x in differences.items()}
 
 
-def _limit_errors(run: Trajectory) -> dict[str, Array]:
+def _limit_errors(run: StepRun) -> dict[str, Array]:
     """By quantity what the steps (steps, 1) are uncertain by, where they are limits of softer ones."""
-    errors = np.zeros((len(run.t), len(_MOTION))) if run.limit_error is None else run.limit_error
+    errors = run.limit_error
+    if errors is None:
+        errors = np.zeros((len(run.trajectory.t), len(_MOTION)))
     return {f"step_{of}": error[1:, None] for of, error in zip(_MOTION, errors.T, strict=True)}
 
 
@@ -771,7 +773,7 @@ class RunSteps(StepsFromSamples):
         charts = StepCharts(model, method, [state], [run.angle_axes])
         count = len(motion.velocities) - 1
         super().__init__(
-            method, model, charts, motion.coordinates, motion.velocities, h, count, _limit_errors(motion)
+            method, model, charts, motion.coordinates, motion.velocities, h, count, _limit_errors(run)
         )
 
     def compare(self) -> dict[str, StepDeviations]:

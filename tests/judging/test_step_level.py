@@ -543,7 +543,7 @@ def test_every_step_of_a_run_of_a_loop_is_compared_with_what_the_limit_is_uncert
     model, states = loop_subject("slider-crank")
     integrator = load_adapter("mujoco").integrator("implicit")
     answer = run_step_study("mujoco", integrator, model, states[:1])
-    limit = answer.run.run.trajectory.limit_error
+    limit = answer.run.run.limit_error
     assert np.all(limit[1:] > 0) and np.max(limit) < 1e-11
     assert not disagreeing(judge_steps(CONTEXT, integrator, model, states[:1], answer).rows)
     heavier = replace(model, mass=model.mass * [1 + 1e-7, 1, 1])

@@ -56,6 +56,7 @@ def test_the_order_is_seen_and_the_limit_is_reached(order, powers):
         ((float("nan"), 4.3, 4.15), None),
         ((4.3, 4.15), None),
         ((5.0, 4.5, 4.25), None),  # halving what is left, but not there yet
+        ((4.75, 4.41, 4.15), None),  # on its way, faster than by half: its next order is not known
         ((4.5, 4.6, 4.5), None),  # away by less than three times the way it has gone, there and back
         ((4.22, 4.2, 4.18), None),  # near 4 and hardly moving: neither on its way there nor far enough
     ],

@@ -130,7 +130,9 @@ def test_a_script_measures_drifts_as_the_harness_does(engine, integrator, loaded
         # The harness integrates the work over polynomials through positions and rates, the script over rates:
         # of steps of order q they differ by O(h^q) too, which falls by 2^(q - 1) or more, and by quadrature.
         work = quantity == "energy_drift" and loaded
-        by_work = max(2 * drifts[-1].work_uncertainty, apart[0] / 2 ** (measure.integrator.order - 1))
+        by_work = max(
+            2 * drifts[-1].uncertainty["energy_drift"], apart[0] / 2 ** (measure.integrator.order - 1)
+        )
         assert apart[1] <= 0.01 * harness + 1e-13 + work * by_work, quantity
 
 
