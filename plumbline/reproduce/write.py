@@ -34,6 +34,7 @@ from plumbline.storage.version_changes import read_version_changes
 from plumbline.truth.step_comparison import RUN_QUANTITIES
 
 REQUESTED_SECONDS, UNREQUESTED_SECONDS = 60.0, 3.0  # of shrinking: a script by its key, at the end of a run
+MAX_TRIED = 3  # cells of a finding and level for which a script is tried at the end of a run
 MIN_CANDIDATES = 6  # shrinking needs at least so many; where they would take too long, it is not begun
 HINT = "request this row by its key"
 
@@ -79,8 +80,9 @@ def write_scripts(
     All rows of a cell and level (of one relation) share a script. Engines run in worker processes.
 
     Args:
-        keys: the wanted rows; by default one cell of each finding and level: less time is spent on each, rows
-            of a known issue that has a script get that, and scripts of an earlier run are removed.
+        keys: the wanted rows; by default one cell of each finding and level, where that has no script the
+            next: less time is spent on each, rows of a known issue that has a script get that, and scripts of
+            an earlier run are removed.
         results: scripts of earlier runs, used where nothing that they depend on has changed.
         document: content of the folder's results.json, where it has been read already.
 
@@ -93,7 +95,7 @@ def write_scripts(
 
     """
     document = document or read_results(folder)
-    scripts, written, tasks = scripts_folder(folder), WrittenScripts(), []
+    scripts, written = scripts_folder(folder), WrittenScripts()
     with _checked(folder):
         disagreeing = _disagreements(document)
         for key in keys or ():
@@ -110,21 +112,33 @@ def write_scripts(
         jobs = int(document.get("run", {}).get("machine", {}).get("jobs", 1))
         # by row key the place in its finding, which begins with the smallest mechanism, and the name of that
         found = {row: (place, f["name"]) for f in document["findings"] for place, row in enumerate(f["rows"])}
-        begun: dict[tuple[str, str], str] = {}  # of findings at a level the first row of the cell to be tried
-        left_to: dict[str, str] = {}  # by row key that of the row whose script is to show it
 
         def place_of(cell: tuple[str, ...]) -> int:
             return min(found.get(row["key"], (0, ""))[0] for row in wanted[cell])
 
-        for cell in sorted(wanted, key=place_of):
+        def shown_by(cell: tuple[str, ...]) -> set[tuple[str, str]]:
+            """The findings of a cell, at its level."""
+            every = wanted[cell]
+            return {(str(found.get(row["key"], (0, row["key"]))[1]), str(row["level"])) for row in every}
+
+        pending = sorted(wanted, key=place_of)
+        for cell in list(pending):
+            if all(row["known_issue"] in recorded for row in wanted[cell]):
+                written.files |= {row["key"]: recorded[row["known_issue"]] for row in wanted[cell]}
+                pending.remove(cell)
+    tried: dict[tuple[str, str], list[str]] = {}  # of findings at a level the first rows of the cells
+    scripted: set[tuple[str, str]] = set()  # those that have a script
+
+    @_checked(folder)
+    def next_tasks() -> list[Task]:
+        """Take one pending cell of each finding and level that has no script; by keys all of them."""
+        tasks, begun = list[Task](), set(scripted)
+        for cell in list(pending):
             rows = wanted[cell]
-            if all(row["known_issue"] in recorded for row in rows):
-                written.files |= {row["key"]: recorded[row["known_issue"]] for row in rows}
+            wanting = {x for x in shown_by(cell) - begun if len(tried.get(x, ())) < MAX_TRIED}
+            if keys is None and not wanting:
                 continue
-            shown = {(str(found.get(row["key"], (0, row["key"]))[1]), str(row["level"])) for row in rows}
-            if keys is None and shown <= begun.keys():
-                left_to |= {row["key"]: begun[min(shown)] for row in rows}
-                continue
+            pending.remove(cell)
             try:
                 if keys is None:
                     _check_worthwhile(cell, rows, cells)
@@ -133,34 +147,44 @@ def write_scripts(
             except NotReproducible as error:
                 written.reasons |= {row["key"]: str(error) for row in rows}
                 continue
-            begun |= dict.fromkeys(shown - begun.keys(), str(rows[0]["key"]))
+            begun |= wanting
+            for one in wanting:
+                tried.setdefault(one, []).append(str(rows[0]["key"]))
             quantities = ", ".join(row["quantity"] for row in rows)
             head = rows[0] | {"quantity": quantities, "since": _version_sentence(rows, changes)}
             tasks.append(Task(cell, make_script, (disagreement, head)))
+        return tasks
+
     index = {} if keys is None else read_script_index(folder)
     if keys is None and scripts.is_dir():  # of an earlier run in the same folder
         for old in (*scripts.glob("*.py"), *scripts.glob("index.json")):
             old.unlink()
+    tasks = next_tasks()
     if not tasks and not written.files:
         return written
     scripts.mkdir(exist_ok=True)
-    for shown_by in set(written.files.values()):
-        write_atomically(scripts / shown_by.name, shown_by.read_bytes())
-    written.files = {key: scripts / shown_by.name for key, shown_by in written.files.items()}
-    for outcome in _outcomes(tasks, results or ResultCache(), jobs):
-        if not outcome.is_cached:
-            written.cpu_time += outcome.cpu_time + outcome.overhead_cpu_time
-        text, reason = outcome.value or ("", outcome.failure)
-        if text:
-            path = scripts / _file_name("/".join(outcome.key))
-            write_atomically(path, text.encode())
-            written.files |= {row["key"]: path for row in wanted[outcome.key]}
-        else:
-            written.reasons |= {row["key"]: reason for row in wanted[outcome.key]}
-    for key, other in left_to.items():
+    for recorded_script in set(written.files.values()):
+        write_atomically(scripts / recorded_script.name, recorded_script.read_bytes())
+    written.files = {key: scripts / path.name for key, path in written.files.items()}
+    while tasks:
+        for outcome in _outcomes(tasks, results or ResultCache(), jobs):
+            if not outcome.is_cached:
+                written.cpu_time += outcome.cpu_time + outcome.overhead_cpu_time
+            text, reason = outcome.value or ("", outcome.failure)
+            if text:
+                path = scripts / _file_name("/".join(outcome.key))
+                write_atomically(path, text.encode())
+                written.files |= {row["key"]: path for row in wanted[outcome.key]}
+                scripted |= shown_by(outcome.key)
+            else:
+                written.reasons |= {row["key"]: reason for row in wanted[outcome.key]}
+        tasks = next_tasks()
+    for cell in pending:
+        other = tried[min(shown_by(cell))][-1]
         reason = written.reasons.get(other)
         what = f"has none ({reason})" if reason else "has a script"
-        written.reasons[key] = f"{other} shows the same finding and {what}; {HINT}"
+        reason = f"{other} shows the same finding and {what}; {HINT}"
+        written.reasons |= {row["key"]: reason for row in wanted[cell]}
     write_script_index(folder, index | {key: path.name for key, path in written.files.items()})
     return written
 

@@ -154,7 +154,7 @@ def test_at_the_end_of_a_run_nothing_long_is_begun(results):
 
 @pytest.mark.parametrize("level", ["surface", "state"])
 def test_at_the_end_of_a_run_a_finding_has_one_script_at_each_level(level, results):
-    """Of its smallest mechanism, whichever version it is of; where that has none, of the next."""
+    """Of its smallest mechanism, whichever version it is of; where that has none, of the next two."""
     document = results_store.read_results(results)
     row = document["rows"][0] | {"integrator": "-"}
     document["rows"] = [
@@ -165,6 +165,8 @@ def test_at_the_end_of_a_run_a_finding_has_one_script_at_each_level(level, resul
             ("without", "mujoco", level),
             ("moving", "mujoco", "trajectory"),
             ("other", "mujoco", level),
+            ("larger", "mujoco", level),
+            ("largest", "mujoco", level),
         )
     ]
     document["scenarios"] |= {one["key"]: document["scenarios"]["chain"] for one in document["rows"]}
@@ -173,7 +175,7 @@ def test_at_the_end_of_a_run_a_finding_has_one_script_at_each_level(level, resul
     about = {"engine": "mujoco", "verdict": "disagrees", "title": "wrong", "sentence": "wrong"}
     about |= {"known_issue": None, "largest_ratio": 2.0, **{name: [] for name in lists}}
     document["findings"] = [
-        about | {"name": "wrong", "rows": ["without", "small", "large", "moving"]},
+        about | {"name": "wrong", "rows": ["without", "small", "large", "larger", "largest", "moving"]},
         about | {"name": "other", "rows": ["other"]},
     ]
     store(results, document)
@@ -185,19 +187,29 @@ def test_at_the_end_of_a_run_a_finding_has_one_script_at_each_level(level, resul
         begun.append(rows[0]["key"])
         return SimpleNamespace(engine=SimpleNamespace(python="of another version"))
 
-    def run(answer):
-        return lambda _, tasks: [Outcome(task.key, **answer) for task in tasks]
+    def run(*hung):
+        """All have a script, but these scenarios."""
+
+        def outcomes(_, tasks):
+            text = {"raw_value": ("text", "")}
+            return [Outcome(t.key, **({"failure": "hung"} if t.key[0] in hung else text)) for t in tasks]
+
+        return patch("plumbline.reproduce.write.WorkerPool.run", outcomes)
 
     with patch("plumbline.reproduce.write.find_disagreement", side_effect=begin):
-        with patch("plumbline.reproduce.write.WorkerPool.run", run({"failure": "hung"})):
+        with run("small", "moving", "large", "other", "larger"):
             reasons = write_scripts(results).reasons
             assert write_scripts(results, ["large"]).reasons == {"large": "hung"}
-        with patch("plumbline.reproduce.write.WorkerPool.run", run({"raw_value": ("text", "")})):
+        assert begun == ["other", "small", "moving", "large", "larger", "large"]
+        with run("small"):
+            second = write_scripts(results)
+        with run():
             written = write_scripts(results)
-    assert sorted(begun) == sorted(["large", *["moving", "other", "small"] * 2])
     hint = "request this row by its key"
-    assert reasons.pop("large") == f"small shows the same finding and has none (hung); {hint}"
+    assert reasons.pop("largest") == f"larger shows the same finding and has none (hung); {hint}"
     assert reasons.pop("without") == "nothing to measure" and set(reasons.values()) == {"hung"}
+    assert set(second.files) == {"large", "moving", "other"} and second.reasons["small"] == "hung"
+    assert second.reasons["larger"] == f"large shows the same finding and has a script; {hint}"
     assert set(written.files) == {"small", "moving", "other"}
     assert written.reasons["large"] == f"small shows the same finding and has a script; {hint}"
 
