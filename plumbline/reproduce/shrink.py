@@ -147,7 +147,7 @@ def smallest_case(
         assert search.case is not None
         runs = 2 * [_shorter_run, _fewer_steps] if case.steps else []
         numbers = [partial(_changed_once, change) for change in _simplifications(search.case.model)]
-        shrink(search.case, [_fewer_bodies, *runs, *numbers], search.accepts, lambda: False)
+        shrink(search.case, [fewer_bodies, *runs, *numbers], search.accepts, lambda: False)
     if search.best is None:
         search.required_ratio = 1.0
         search.accepts(case)
@@ -180,8 +180,13 @@ def _parts(case: ReproductionCase, count: int) -> Iterator[ReproductionCase]:
         yield replace(case, model=model, state=complete_state(model, state))
 
 
-def _fewer_bodies(case: ReproductionCase) -> Iterator[ReproductionCase]:
-    """One body, two, four …, then all but … four, two, one: a quick way to few, and between them."""
+def fewer_bodies(case: ReproductionCase) -> Iterator[ReproductionCase]:
+    """List parts of a mechanism, its first bodies and its last ones.
+
+    Yields:
+        One body, two, four …, then all but … four, two, one: a quick way to few, and between them.
+
+    """
     n = case.model.n
     powers = [2**k for k in range(n.bit_length()) if 2**k < n]
     for count in sorted({*powers, *(n - power for power in powers)}):

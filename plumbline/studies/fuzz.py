@@ -30,9 +30,10 @@ from plumbline.model.features import features
 from plumbline.processes.cpu_time import CpuTimes
 from plumbline.processes.exceptions import PlumblineError
 from plumbline.processes.worker_pool import Executor
-from plumbline.reproduce.shrink import shrink
+from plumbline.reproduce.shrink import ReproductionCase, fewer_bodies, shrink
 from plumbline.scenario.generator import random_mechanism, random_scenario
 from plumbline.scenario.loader import Scenario, scenario_from_dict
+from plumbline.scenario.mechanism_document import mechanism_document
 from plumbline.storage.results_store import ResultTables, write_atomically
 
 BATCH = 8  # scenarios compared together, whatever the number of jobs
@@ -192,7 +193,16 @@ def _shrink(
             smallest[finding.name] = candidate
         return is_shown
 
-    shrink(scenario.document, [_smaller, _smaller], shows, lambda: tried >= MAX_SHRINKINGS)
+    passes = [_fewer_bodies, _smaller, _smaller]
+    shrink(scenario.document, passes, shows, lambda: tried >= MAX_SHRINKINGS)
+
+
+def _fewer_bodies(document: Document) -> Iterator[Document]:
+    """Documents of a part of the mechanism."""
+    scenario = scenario_from_dict(document, "part.yaml")
+    other = {name: x for name, x in document.items() if name not in ("springs", "closes")}
+    for part in fewer_bodies(ReproductionCase(scenario.model, scenario.state)):
+        yield other | mechanism_document(part.model, part.state)
 
 
 def _smaller(document: Document) -> Iterator[Document]:

@@ -6,7 +6,7 @@ from plumbline.execution.exit_codes import ExitCode
 from plumbline.processes.exceptions import PlumblineError
 from plumbline.scenario.generator import random_mechanism
 from plumbline.scenario.loader import load_scenarios, scenario_from_dict
-from plumbline.studies.fuzz import BATCH, Corpus, _smaller, scenario_of
+from plumbline.studies.fuzz import BATCH, Corpus, _fewer_bodies, _smaller, scenario_of
 from tests.helpers.commands import invoke
 
 PLANTED = """
@@ -59,6 +59,16 @@ def test_what_is_made_smaller_has_one_thing_less_and_most_of_it_is_a_mechanism()
         except PlumblineError:
             continue
     assert legal > len(smaller) / 2
+
+
+def test_few_bodies_are_tried_first_from_either_end():
+    document = scenario_of(3, 41).document
+    models = [scenario_from_dict(one, "x.yaml").model for one in _fewer_bodies(document)]
+    whole = scenario_from_dict(document, "x.yaml").model
+    assert whole.n > 8 and len(whole.spring_body)
+    assert [model.n for model in models[:6]] == [1, 1, 2, 2, 4, 4] and models[-1].n == whole.n - 1
+    assert [model.kind[0] for model in models[::2]] == [whole.kind[0]] * (len(models) // 2)
+    assert [model.mass[-1] for model in models[1::2]] == [whole.mass[-1]] * (len(models) // 2)
 
 
 def test_a_corpus_keeps_new_combinations_up_to_its_size_and_where_a_search_ended(tmp_path):
