@@ -35,7 +35,7 @@ from plumbline.model.datatypes import (
     Trajectory,
     Unsupported,
 )
-from plumbline.processes.exceptions import describe_exception
+from plumbline.processes.exceptions import describe_exception, place_of
 from plumbline.processes.isolation import EndedEarly, call_in_fork
 
 T = TypeVar("T")
@@ -57,6 +57,7 @@ class Evaluation:
     # what the engine reports besides: `SurfaceAnswer` with all of the first states in one array
     surface: SurfaceAnswer = field(default_factory=dict)
     surface_failure: str = ""  # what it did instead
+    place: str = ""  # `place_of` what it raised, in one or the other
     # by kind and names of a variant the quantities at the first states, or what the engine did instead
     variants: Mapping[VariantKind, Mapping[Call, list[StateQuantities] | NoAnswer]] = field(
         default_factory=dict
@@ -71,6 +72,7 @@ class RefinementRun:
     trajectory: Trajectory | None
     failure: str | None
     cpu_time: float  # CPU s
+    place: str = ""  # `place_of` what it raised
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +82,7 @@ class RefinementStudy:
     runs: list[RefinementRun]
     unsupported: str | None  # the engine's reason for refusing
     gap: str = ""  # the declared gap that this follows from
+    place: str = ""  # `place_of` the refusal
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +95,7 @@ class StepAttempt:
     refusal: str = ""  # why the engine refused to take more steps
     failure: str = ""  # what it did instead of taking more steps
     gap: str = ""  # the declared gap that the refusal follows from
+    place: str = ""  # `place_of` the failure, or of the refusal
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,11 +157,11 @@ def attempt(call: Callable[..., T], *arguments: Any) -> T | NoAnswer:
     try:
         return call(*arguments)
     except Unsupported as refusal:
-        return NoAnswer(describe_exception(refusal), True, refusal.gap, refusal.missing)
+        return NoAnswer(describe_exception(refusal), True, refusal.gap, refusal.missing, place_of(refusal))
     except MemoryError:
         raise
     except Exception as error:
-        return NoAnswer(describe_exception(error), is_refusal=False)
+        return NoAnswer(describe_exception(error), is_refusal=False, place=place_of(error))
 
 
 def evaluate_states(
@@ -181,7 +185,7 @@ def evaluate_states(
     if isinstance(found, NoAnswer):
         return _no_evaluation(found, begin, declared)
     surplus = [name for name in adapter.unsupported for one in found if getattr(one, name, None) is not None]
-    surface, surface_failure = dict[str, dict[Call, Array]](), ""
+    surface, surface_failure, place = dict[str, dict[Call, Array]](), "", ""
     variants: dict[VariantKind, dict[Call, list[StateQuantities] | NoAnswer]] = {}
     IS_APART.set(APART in besides)
     if found and not surplus and "surface" in besides:
@@ -189,7 +193,7 @@ def evaluate_states(
         if not isinstance(stacked, NoAnswer):
             surface = stacked
         elif not stacked.is_refusal:
-            surface_failure = stacked.message
+            surface_failure, place = stacked.message, stacked.place
         elif stacked.missing:  # else the adapter offers nothing of the mechanism
             surface = {MISSING_NAMES: {(stacked.missing,): np.zeros((1, 1, 1))}}
     if found and not surplus and "variants" in besides:
@@ -198,12 +202,13 @@ def evaluate_states(
         f"{engine} returns the {surplus[-1]} that its adapter declares as unsupported" if surplus else None
     )
     cpu_time = time.process_time() - begin
-    return Evaluation(found, None, failure, cpu_time, "", declared, surface, surface_failure, variants)
+    return Evaluation(found, None, failure, cpu_time, "", declared, surface, surface_failure, place, variants)
 
 
 def _no_evaluation(answer: NoAnswer, begin: float, declared: tuple[str, ...]) -> Evaluation:
     unsupported, failure = (answer.message, None) if answer.is_refusal else (None, answer.message)
-    return Evaluation([], unsupported, failure, time.process_time() - begin, answer.gap, declared)
+    cpu_time = time.process_time() - begin
+    return Evaluation([], unsupported, failure, cpu_time, answer.gap, declared, place=answer.place)
 
 
 def evaluate_variants(
@@ -271,9 +276,12 @@ def run_refinement(
         begin = time.process_time()
         found = attempt(adapter.simulate, model, state, times, integrator, resolution)
         if isinstance(found, NoAnswer) and found.is_refusal:
-            return RefinementStudy(runs, found.message, found.gap)
-        trajectory, failure = (None, found.message) if isinstance(found, NoAnswer) else (found, None)
-        runs.append(RefinementRun(resolution, trajectory, failure, time.process_time() - begin))
+            return RefinementStudy(runs, found.message, found.gap, found.place)
+        cpu_time = time.process_time() - begin
+        if isinstance(found, NoAnswer):
+            runs.append(RefinementRun(resolution, None, found.message, cpu_time, found.place))
+        else:
+            runs.append(RefinementRun(resolution, found, None, cpu_time))
         if is_enough is not None and is_enough(model, adapter.integrator(integrator), runs):
             break
     return RefinementStudy(runs, None)
@@ -305,10 +313,11 @@ def run_steps(
                 if not isinstance(found, NoAnswer):
                     record = replace(record, run=found)
                     break
-                if not found.is_refusal:
-                    record = replace(record, failure=record.failure or found.message)
-                elif not record.refusal:
-                    record = replace(record, refusal=found.message, gap=found.gap)
+                if not (found.is_refusal or record.failure):
+                    record = replace(record, failure=found.message, place=found.place)
+                elif found.is_refusal and not record.refusal:
+                    place = record.place or found.place
+                    record = replace(record, refusal=found.message, gap=found.gap, place=place)
             attempts.append(record)
     return StepEvaluation(attempts, time.process_time() - begin)
 

@@ -9,11 +9,11 @@ from types import ModuleType
 import numpy as np
 
 from plumbline.model.datatypes import Array, Call, Unsupported
-from plumbline.processes.exceptions import describe_exception
+from plumbline.processes.exceptions import describe_exception, place_of
 from plumbline.processes.isolation import EndedEarly, call_in_fork
 
 # Under these names an answer of the surface has the names of the engine that its version lacks, and what
-# parts failed by.
+# parts failed by, each with the place of what was raised.
 MISSING_NAMES, FAILED_PARTS = "missing names", "failed parts"
 # Whether each part has a process of its own, that a crash ends alone.
 IS_APART = ContextVar("IS_APART", default=False)
@@ -63,7 +63,7 @@ def add_parts(found: dict[str, dict[Call, Array]], *parts: Callable[[], object])
             else:
                 _add_part(found, part)
         except EndedEarly as error:
-            _note(found, FAILED_PARTS, f"{_label(part)}: {error}")
+            _note(found, FAILED_PARTS, f"{_label(part)}: {error}", "")
 
 
 def _add_part(
@@ -79,12 +79,12 @@ def _add_part(
             raise
         _note(found, MISSING_NAMES, name)
     except Exception as error:  # an engine may raise anything, and other parts are to be compared
-        _note(found, FAILED_PARTS, f"{_label(part)}: {describe_exception(error)}")
+        _note(found, FAILED_PARTS, f"{_label(part)}: {describe_exception(error)}", place_of(error))
     return found
 
 
-def _note(found: dict[str, dict[Call, Array]], kind: str, words: str) -> None:
-    found.setdefault(kind, {})[words,] = np.zeros((1, 1))
+def _note(found: dict[str, dict[Call, Array]], kind: str, *words: str) -> None:
+    found.setdefault(kind, {})[words] = np.zeros((1, 1))
 
 
 def _label(part: Callable[[], object]) -> str:

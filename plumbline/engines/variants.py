@@ -93,3 +93,4 @@ class NoAnswer:
     is_refusal: bool  # by the engine or its adapter; else a failure
     gap: str = ""  # the declared gap that the refusal follows from
     missing: str = ""  # name that the installed version lacks, where that is the reason
+    place: str = ""  # `place_of` what was raised

@@ -21,7 +21,7 @@ from typing import Any
 from packaging.version import InvalidVersion, Version
 
 from plumbline.diagnosis.cause import Cause, Condition, Occurrence, describe, join_words
-from plumbline.judging.rows import VERDICT_STYLES, WRONG_CALL, Row, Verdict
+from plumbline.judging.rows import PLACE, VERDICT_STYLES, WRONG_CALL, Row, Verdict
 from plumbline.judging.state_level import STATE_UNITS
 
 CLASSES = {  # of quantities, in the order in which one follows from another
@@ -33,6 +33,7 @@ CLASSES = {  # of quantities, in the order in which one follows from another
 }
 MAX_NAME = 76  # characters of a name: a line of the terminal
 SAME = 1e-6  # relative: amounts of one cause in two scenarios
+NUMBER = re.compile(r"(?<![\w.])\d+(\.\d+)?(e[+-]?\d+)?(?!\w|\.\d)")  # no digits of a name or version
 TRANSLITERATED = str.maketrans({"ω": "omega", "γ": "gamma", "×": " x "})
 Identity = tuple[str, ...]
 
@@ -174,6 +175,8 @@ def _plain_identity(row: Row) -> Identity:
     if row.verdict == Verdict.HARNESS_FAILED:
         return "", row.verdict, row.quantity
     if row.verdict in (Verdict.UNSUPPORTED, Verdict.FAILED):
+        if place := row.extra.get(PLACE):  # one failure says other numbers of every mechanism
+            return _engine(row), row.verdict, str(place), NUMBER.sub("#", row.reason)
         return _engine(row), row.verdict, str(row.extra.get(WRONG_CALL, row.reason))
     return _engine(row), row.verdict, row.level, row.integrator, str(row.extra.get(WRONG_CALL, row.quantity))
 

@@ -93,6 +93,7 @@ VERDICT_STYLES = {
 SAME_SIZE = 0.1  # of the worst call's error: within a decade
 WRONG_CALL = "wrong_call"  # in ``extra`` of a row: of the engine's calls, that of `most_wrong_call`
 FAILED_CALLS = "failed_calls"  # the same: all that failed or are off, one per line
+PLACE = "place"  # the same, of one that failed or was refused: class and place of what was raised
 CHECKED = "checked"  # the same: what was checked of it where its diagnosis is a record's; may be empty
 RUN_FAMILY = "run"  # of a row that is about the whole run, in place of a scenario's family
 RECORDED = "recorded"  # what terminal and report show for a disagreement or failure that is recorded
@@ -234,6 +235,7 @@ class RowContext:
         reason: str,
         unit: str = "1",
         gap: str = "",
+        place: str = "",
         **more: Any,
     ) -> Row:
         """Make a row about this scenario and engine.
@@ -244,6 +246,7 @@ class RowContext:
             reason: the verdict's reason, one sentence.
             unit: unit of ``value`` and ``tolerance``.
             gap: declared by the engine's column, from which a refusal follows; it is expected then.
+            place: of the exception behind a failure or refusal.
             **more: other fields of `Row`. ``ratio`` is the quotient of ``value`` and ``tolerance`` unless
                 given: of many comparisons the worst ratio need not belong to the largest error.
 
@@ -251,6 +254,8 @@ class RowContext:
         more = {"value": None, "tolerance": None} | more
         if gap and verdict == Verdict.UNSUPPORTED:
             more |= {"known_issue": gap, "is_declared": True}
+        if place and verdict in (Verdict.FAILED, Verdict.UNSUPPORTED):
+            more["extra"] = more.get("extra", {}) | {PLACE: place}
         if more.get("ratio") is None:
             more["ratio"] = error_ratio(more["value"], more["tolerance"])
         return Row(

@@ -58,13 +58,15 @@ def judge_states(context: RowContext, truth: StateTruth, evaluation: Evaluation)
         One row per quantity, and per state the worst body (table "states").
 
     """
+    place = evaluation.place
     if evaluation.unsupported is not None:
         row = context.make_row(
-            "state", "-", "all", Verdict.UNSUPPORTED, evaluation.unsupported, gap=evaluation.gap
+            "state", "-", "all", Verdict.UNSUPPORTED, evaluation.unsupported, gap=evaluation.gap, place=place
         )
         return JudgingResult([row])
     if evaluation.failure is not None:
-        return JudgingResult([context.make_row("state", "-", "all", Verdict.FAILED, evaluation.failure)])
+        row = context.make_row("state", "-", "all", Verdict.FAILED, evaluation.failure, place=place)
+        return JudgingResult([row])
     result = JudgingResult(fingerprints=state_fingerprints(evaluation.quantities))
     for quantity, unit in STATE_UNITS.items():
         if all(getattr(true, quantity) is None for true in truth.quantities):

@@ -96,29 +96,30 @@ def all_steps_agree(rows: Sequence[Row]) -> bool:
 def _single_step_rows(
     context: RowContext, integrator: Integrator, model: Model, states: Sequence[State], answer: StepEvaluation
 ) -> list[Row]:
-    method, verdict, reason, gap = integrator.method, Verdict.UNSUPPORTED, "", ""
+    method, verdict, reason, gap, place = integrator.method, Verdict.UNSUPPORTED, "", "", ""
     attempts = [attempt for attempt in answer.attempts if attempt.run is not None]
     runs = [(attempt.state, attempt.step, attempt.run) for attempt in attempts if attempt.run is not None]
-    if isinstance(method, ConstrainedMethod):
-        failures = [attempt.failure for attempt in answer.attempts]
-    else:
-        failures = [attempt.failure for attempt in answer.attempts if attempt.run is None]
-    if any(failures):
-        verdict, reason = Verdict.FAILED, next(filter(None, failures))
+    is_short = isinstance(method, ConstrainedMethod)
+    failed = [one for one in answer.attempts if one.failure and (is_short or one.run is None)]
+    if failed:
+        verdict, reason, place = Verdict.FAILED, failed[0].failure, failed[0].place
     elif not runs:
-        reason, gap = next((attempt.refusal, attempt.gap) for attempt in answer.attempts)
+        reason, gap, place = next((one.refusal, one.gap, one.place) for one in answer.attempts)
     elif not HAS_EXTENDED_PRECISION:
         reason = NO_EXTENDED_PRECISION
     elif isinstance(method, JointSpaceMethod) and not keeps_dependent_rows(model, states[0]):
         verdict, reason = Verdict.INFORMATION, OPEN_ROWS
     if reason:
-        return [context.make_row("step", integrator.name, "all", verdict, reason, gap=gap)]
+        return [context.make_row("step", integrator.name, "all", verdict, reason, gap=gap, place=place)]
     if isinstance(method, JointSpaceMethod):
         starts = [(index, h, run.angle_axes) for index, h, run in runs]
         steps = FormulaSteps(method, model, states, starts)
         for i, attempt in enumerate(attempts):
             if attempt.failure and steps.is_stable(i):
-                return [context.make_row("step", integrator.name, "all", Verdict.FAILED, attempt.failure)]
+                failure, place = attempt.failure, attempt.place
+                return [
+                    context.make_row("step", integrator.name, "all", Verdict.FAILED, failure, place=place)
+                ]
         found, table = steps.compare([run for *_, run in runs]), STEP_QUANTITIES
     else:
         assert isinstance(method, ConstrainedMethod)
@@ -178,7 +179,9 @@ def _run_rows(
         return []
 
     def one(verdict: Verdict, reason: str, gap: str = "") -> list[Row]:
-        return [context.make_row("step", integrator.name, "run", verdict, reason, gap=gap)]
+        return [
+            context.make_row("step", integrator.name, "run", verdict, reason, gap=gap, place=attempt.place)
+        ]
 
     run, h = attempt.run, attempt.step
     if attempt.failure:

@@ -36,15 +36,16 @@ def judge_surface(context: RowContext, truth: StateTruth, evaluation: Evaluation
 
     """
     if evaluation.surface_failure and truth.surface:
-        return [context.make_row("surface", "-", "all", Verdict.FAILED, evaluation.surface_failure)]
+        failed, place = evaluation.surface_failure, evaluation.place
+        return [context.make_row("surface", "-", "all", Verdict.FAILED, failed, place=place)]
     rows = [
         _row(context, name, truth.surface[name], evaluation)
         for name in SURFACE_QUANTITIES
         if name in truth.surface and name in evaluation.surface
     ]
-    if failed := evaluation.surface.get(FAILED_PARTS):
-        reason = "; ".join(sorted(words for (words,) in failed))
-        rows.append(context.make_row("surface", "-", "all", Verdict.FAILED, reason))
+    if parts := sorted(evaluation.surface.get(FAILED_PARTS, ())):
+        reason, place = ("; ".join(some) for some in zip(*parts, strict=True))
+        rows.append(context.make_row("surface", "-", "all", Verdict.FAILED, reason, place=place))
     if missing := evaluation.surface.get(MISSING_NAMES):  # what was not compared is no agreement
         names = ", ".join(name for call in missing for name in call)
         reason = f"version {context.version} has no {names}: what they report is not compared"

@@ -67,13 +67,16 @@ def judge_trajectory(
                     Verdict.UNSUPPORTED,
                     study.unsupported,
                     gap=study.gap,
+                    place=study.place,
                 )
             ]
         )
     finest = study.runs[-1]
     if finest.trajectory is None:
         reason = f"at the finest resolution {finest.resolution:g}: {finest.failure}"
-        return JudgingResult([context.make_row("trajectory", integrator.name, "all", Verdict.FAILED, reason)])
+        failed = Verdict.FAILED
+        row = context.make_row("trajectory", integrator.name, "all", failed, reason, place=finest.place)
+        return JudgingResult([row])
     analysis = RefinementAnalysis(context, model, truth, integrator, study.runs, truth.horizon)
     rows = [*trajectory_rows(analysis), *invariant_rows(analysis)]
     deviations = {

@@ -1,5 +1,7 @@
 """The base class of the project's public exceptions, and how any exception is written in one line."""
 
+import traceback
+
 MAX_TEXT = 2000  # characters of a message from outside that are shown and stored
 
 
@@ -38,3 +40,16 @@ def describe_exception(error: BaseException) -> str:
     except BaseException:  # a message that cannot be made is an engine's fault, too
         text = "no readable message"
     return text if isinstance(error, PlumblineError) else f"{one_line(type(error).__name__)}: {text}"
+
+
+def place_of(error: BaseException) -> str:
+    """Write the class of what was raised first, and the functions that called each other up to there.
+
+    Returns:
+        The same for the same failure, whatever numbers its message has.
+
+    """
+    while error.__context__ is not None:
+        error = error.__context__
+    calls = dict.fromkeys(frame.f_code.co_name for frame, _ in traceback.walk_tb(error.__traceback__))
+    return one_line(f"{type(error).__name__} in {' > '.join(calls)}")

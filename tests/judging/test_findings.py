@@ -191,6 +191,45 @@ def test_a_long_name_is_cut_and_has_the_same_digits_whatever_else_is_found():
     assert len(alone) <= MAX_NAME and alone in names(long, row("large", output(SPRINGS)))
 
 
+def failure(scenario, reason, place="ValueError in adapter.evaluate", **more):
+    extra = {"place": place} if place else {}
+    failed = row(scenario, quantity="all", verdict=Verdict.FAILED, extra=extra, **more)
+    return replace(failed, reason=reason)
+
+
+SHAPES = "ValueError: could not broadcast input array from shape {} into shape {}"
+
+
+def test_a_failure_is_one_finding_whatever_numbers_it_says():
+    rows = [failure(s, SHAPES.format(*x)) for s, x in (("small", ("(21,)", 6)), ("large", ("(106,)", 91)))]
+    (found,) = find_findings(rows, BODIES)
+    assert found.sentence == rows[0].reason and len(found.rows) == 2
+    (alone,) = find_findings(rows[1:], BODIES)
+    assert (alone.identity, alone.name) == (found.identity, found.name)
+    (refused,) = find_findings([replace(one, verdict=Verdict.UNSUPPORTED) for one in rows], BODIES)
+    assert len(refused.rows) == 2
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        failure("large", SHAPES.format(106, 91), "ValueError in adapter.step"),
+        failure("large", SHAPES.format(106, 91), "TypeError in adapter.evaluate"),
+        failure("large", SHAPES.format(106, 91), ""),
+        failure("large", SHAPES.format(21, 6), engine="exudyn"),
+        failure("large", SHAPES.format(21, 6) + " of ODE23"),
+    ],
+)
+def test_failures_of_other_places_classes_engines_or_words_stay_apart(other):
+    assert len(find_findings([failure("small", SHAPES.format(21, 6)), other], BODIES)) == 2
+
+
+@pytest.mark.parametrize("words", ["joint1 is no hinge", "version 3.1.1 is too old", "no mj_step1"])
+def test_digits_of_names_and_versions_are_no_numbers(words):
+    other = words.replace("1", "2")
+    assert len(find_findings([failure("small", words), failure("large", other)], BODIES)) == 2
+
+
 def test_recorded_rows_are_one_finding_by_entry_and_declared_gaps_are_none():
     rows = [
         row("small", known_issue="known"), row("large", known_issue="known", quantity="acceleration"),

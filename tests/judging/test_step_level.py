@@ -228,9 +228,9 @@ def test_an_engine_that_refuses_or_fails_has_one_row():
     refused = StepEvaluation([StepAttempt(0, 0.01, refusal="angles are singular")], 0.1)
     (row,) = judge_steps(CONTEXT, integrator, model, states, refused).rows
     assert (row.verdict, row.quantity, row.reason) == (Verdict.UNSUPPORTED, "all", "angles are singular")
-    failed = StepEvaluation([StepAttempt(0, 0.01, failure="it crashed")], 0.1)
+    failed = StepEvaluation([StepAttempt(0, 0.01, failure="it crashed", place="in f")], 0.1)
     (row,) = judge_steps(CONTEXT, integrator, model, states, failed).rows
-    assert (row.verdict, row.reason) == (Verdict.FAILED, "it crashed")
+    assert (row.verdict, row.reason, row.extra["place"]) == (Verdict.FAILED, "it crashed", "in f")
 
 
 @pytest.mark.parametrize("draw", [(601, 0), (601, 141), (802, 82)])

@@ -272,9 +272,9 @@ def test_a_name_that_this_project_lacks_is_a_failure(tree, monkeypatch):
     model, states, _ = tree
     monkeypatch.delattr(mujoco_surface, "SENSOR_STAGES")
     found = evaluate_states("mujoco", model, states, ["surface"])
-    assert list(found.surface[FAILED_PARTS]) == [
-        ("add sensors: NameError: name 'SENSOR_STAGES' is not defined",)
-    ]
+    ((words, place),) = found.surface[FAILED_PARTS]
+    assert words == "add sensors: NameError: name 'SENSOR_STAGES' is not defined"
+    assert place.startswith("NameError in ") and place.endswith("add_sensors")
     assert "frame_position" in found.surface, "the other parts are compared"
     with pytest.raises(AttributeError):
         add_parts({}, lambda: np.a_name_of_a_package_that_every_environment_has)
@@ -298,7 +298,7 @@ def test_a_part_that_fails_or_ends_its_process_costs_that_part_only():
         add_parts(found, add_singular, add_crash, add_energy)
     finally:
         IS_APART.reset(token)
-    assert {words for (words,) in found.pop(FAILED_PARTS)} == {
+    assert {words for words, _ in found.pop(FAILED_PARTS)} == {
         "add singular: LinAlgError: Singular matrix",
         "add crash: crashed: the process died of SIGKILL",
     }
