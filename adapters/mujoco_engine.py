@@ -478,11 +478,9 @@ class _MujocoChain:
 
     def copied(self, change: Change) -> _MujocoChain:
         """The same, compiled alike, with data and numbers of its own that are changed."""
-        other, m = copy(self), copy(self.m)
-        d = mujoco.MjData(m)
-        mujoco.mj_copyData(d, m, self.d)
+        other = copy(self)
         other.change = change
-        other.m, other.d = change.remake(m, d)
+        other.m, other.d = change.remake(copy(self.m), copy(self.d))
         return other
 
     def _add_link(self, parent: Any, k: int, hang: Array, pieces: tuple[RigidPart, ...]) -> Any:
