@@ -706,9 +706,9 @@ class _MovingTree(Tree):
         # a row that is 0, as those out of a plane, is met anyway
         scale = 1 / np.sqrt(np.maximum(size, LongDouble(1e-30) * np.max(size, -1, keepdims=True)))
         K, missing = K * scale[..., None] * scale[..., None, :], missing * scale
-        unit = np.eye(K.shape[-1], dtype=LongDouble)
-        damped = (K + PROXIMAL_DAMPING * unit)[..., None, :, :]
-        inverse = solve_definite(damped, np.broadcast_to(unit, K.shape))
+        unit = np.eye(K.shape[-1])
+        # in doubles: the iterations take its rounding away with the damping
+        inverse = floats().solve(np.asarray(K + PROXIMAL_DAMPING * unit, float), unit).astype(LongDouble)
         push = np.zeros_like(missing)
         for _ in range(PROXIMAL_STEPS):
             push = push + rotate_vectors(inverse, missing - rotate_vectors(K, push))
