@@ -166,6 +166,8 @@ def run_nightly(
     for name, about in result.scenarios.items():
         if about["family"] == RANDOM_FAMILY and random_seed(name) == night.seed:
             about["file"] = (place / "scenarios" / f"{name}.yaml").as_posix()
+    if plan.level == "all":
+        log("every cell is compared; next: the smallest mistake in each number that this night would show")
     coverage = night_coverage(result, plan, progress) if plan.level == "all" else None
     drawn = [features(s.model) for s in random_scenarios.mechanisms]
     if drawn:
@@ -185,6 +187,7 @@ def run_nightly(
     if coverage is not None:
         write_table(coverage, folder / COVERAGE_FILE)
     write_random_scenario_files(result, random_scenarios, folder / "scenarios")
+    log("next: scripts of the findings, and the report")
     with result.cpu_times.measure("report"):
         result.cpu_times.seconds["report"] += write_scripts(folder).cpu_time
         reports.write(folder, history)
