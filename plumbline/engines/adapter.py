@@ -283,11 +283,9 @@ class Adapter(ABC):
                 f"{self.name}._simulate, {integrator}: steps is {trajectory.steps!r}, but {count} steps of "
                 f"{resolution:g} s lead to t = {times[-1]:g} s"
             )
-        trajectory = replace(
-            trajectory, initial_x=state.x, coordinates=None, velocities=None
-        )  # steps need them
         softer = trajectory.softer and replace(trajectory.softer, initial_x=state.x)
-        return replace(trajectory, softer=softer)
+        # Only steps are judged by coordinates and velocities, runs by their poses.
+        return replace(trajectory, initial_x=state.x, coordinates=None, velocities=None, softer=softer)
 
     def step(self, model: Model, state: State, integrator: str, step: float, count: int) -> StepRun:
         """Take a few steps from a state and sample after each; errors are those of `evaluate`.
