@@ -427,10 +427,7 @@ class PinocchioChain:
         return np.asarray(pin.aba(self.pin_model, self.data, q, v, torque, self.fext, *conventions))
 
     def _load(self, q: Array, v: Array) -> Array:
-        """Set the loads without forces of loops, and return the torques of the joints."""
-        if self.ends:
-            self.loads = list(self.constant_loads)
-            self._add_up_loads()
+        """Set the loads, and return the torques of the joints."""
         self.update_loads(q, v)
         return self.joint_torque(q, v)
 
@@ -444,17 +441,20 @@ class PinocchioChain:
         return np.asarray(push - pin.rnea(self.pin_model, self.data, q, v, self.zero_torque, self.fext))
 
     def _closed_acceleration(self, q: Array, v: Array, torque: Array) -> Array:
-        """Evaluate the accelerations with the loops closed; their forces are added to the loads."""
+        """Evaluate the accelerations with the loops closed."""
         engine, data = self.pin_model, self.data
         push = self._push(q, v, torque)
         settings = pin.ProximalSettings(*PROXIMAL_SETTINGS)
-        a = pin.constraintDynamics(engine, data, q, v, push, self.welds, self.weld_data, settings).copy()
+        a = pin.constraintDynamics(engine, data, q, v, push, self.welds, self.weld_data, settings)
+        return np.array(a)
+
+    def _add_forces_of_loops(self) -> None:
+        """Add the forces that close the loops, of the last accelerations, to the loads."""
         for (b, c), solved in zip(self.ends, self.weld_data, strict=True):
             force = solved.contact_force  # on b, in the frame of b and c
             self.loads[b] = self.loads[b] + self.placements[b].act(force).vector
             self.loads[c] = self.loads[c] - self.placements[c].act(force).vector
         self._add_up_loads()
-        return np.asarray(a)
 
     def exponential_coordinate_rate(
         self,
@@ -508,6 +508,7 @@ class PinocchioChain:
         engine, data = self.pin_model, self.data
         q, v = self.coordinates(state)
         a = self.acceleration(q, v)
+        self._add_forces_of_loops()
         pin.forwardKinematics(engine, data, q, v, a)
         pin.updateFramePlacements(engine, data)
         acceleration = [point_acceleration(engine, data, f) for f in self.com_frames]
@@ -517,6 +518,9 @@ class PinocchioChain:
         pin.rnea(engine, data, q, v, a, self.fext)
         wrenches = [(r @ f.linear, r @ f.angular) for r, f in zip(turn, self._joint_wrenches(), strict=True)]
         reaction, moment = np.array(wrenches).swapaxes(0, 1)
+        if self.ends:  # the next accelerations are without these forces
+            self.loads = list(self.constant_loads)
+            self._add_up_loads()
         rates = self.rate_map(state)
         return StateQuantities(
             acceleration=np.array(acceleration),
