@@ -7,7 +7,7 @@ Rounding that an algorithm amplifies gives another error each time.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import ParamSpec, TypeVar
 
@@ -17,7 +17,6 @@ from plumbline.diagnosis.cause import Cause, CauseKind, quantity_words
 from plumbline.diagnosis.fit import Difference
 from plumbline.diagnosis.prediction import (
     QUANTITIES,
-    Answers,
     Predictor,
     View,
     error_ratio,
@@ -61,6 +60,20 @@ def ask(engine: Callable[_P, _T], *given: _P.args, **named: _P.kwargs) -> _T:
         return engine(*given, **named)
     except Exception as error:  # an engine may raise anything
         raise EngineFailure(describe_exception(error)) from error
+
+
+def ask_ratios(
+    evaluate: Evaluate, model: Model, states: list[State], quantities: Iterable[str]
+) -> dict[str, float]:
+    """Call an engine; return by quantity the largest error in bounds, inf of what it does not give."""
+    answers, right = ask(evaluate, model, states), Predictor(model, states, View()).right
+    bounds = rounding_bounds(model, states)
+    return {
+        q: error_ratio(values_of(answers, q) - right[q], tolerances(bounds, q))
+        if all(getattr(answer, q) is not None for answer in answers)
+        else np.inf
+        for q in quantities
+    }
 
 
 def scatter_cause(quantities: Sequence[str], scatter: float) -> Cause:
@@ -127,7 +140,8 @@ def measure_scatter(problem: Difference, evaluate: Evaluate) -> float | None:
             ask(evaluate, model, [state])  # what an engine keeps is then of this problem
             return problem.values
         turned, at = _turned(model, state, turns)
-        values = _values(ask(evaluate, turned, [at]), problem.names)
+        answers = ask(evaluate, turned, [at])
+        values = {q: values_of(answers, q) for q in problem.names}
         return problem.off(unrotate(unrotate(values, WORLD_VECTORS, turns[0]), BODY_VECTORS, turns[1]))
 
     return _scatter(error)
@@ -187,19 +201,13 @@ def _tiny_rotation(rng: np.random.Generator) -> Array:
     return np.array([np.cos(TURN / 2), *(np.sin(TURN / 2) * axis / np.linalg.norm(axis))])
 
 
-def _values(answers: Sequence[StateQuantities], names: Sequence[str]) -> Answers:
-    return {q: values_of(answers, q) for q in names}
-
-
 def _ratios(problem: Difference, evaluate: Evaluate) -> dict[int, float]:
     """Worst error, in rounding bounds, of the whole mechanism and of its first half and quarter."""
     model, (state,), ratios = problem.model, problem.predictor.states, dict[int, float]()
     for n in sorted({model.n, -(-model.n // 2), -(-model.n // 4)}, reverse=True):
         short, at = bodies_between(model, state, 0, n)
         try:
-            right = Predictor(short, [at], View()).right
-            answers, bounds = _values(ask(evaluate, short, [at]), problem.names), rounding_bounds(short, [at])
+            ratios[n] = max(ask_ratios(evaluate, short, [at], problem.names).values())
         except REFUSALS:  # of a part of the mechanism
             continue
-        ratios[n] = max(error_ratio(x - right[q], tolerances(bounds, q)) for q, x in answers.items())
     return ratios

@@ -16,6 +16,7 @@ from plumbline.diagnosis.cause import Cause, CauseKind
 from plumbline.diagnosis.prediction import Case
 from plumbline.model.datatypes import JOINT_ELEMENTS, SPRING_FIELDS, VALUE_AXES, Array, Model
 from plumbline.model.kinematics import quaternion_exponential, quaternion_product, rotation_matrix
+from plumbline.truth import parameters
 
 AXES: tuple[tuple[Any, str], ...] = ((0, " x"), (1, " y"), (2, " z"), (slice(None), ""))  # and all three
 ASKEW = 1e-6  # of a direction: it lies along an axis but for rounding
@@ -27,8 +28,7 @@ WORDS = {"rest": "rest position", "force": "applied force", "moment": "applied m
          "udot": "rod rate u̇", "xdot": "rates", "spring_point": "point", "spring_length": "length",
          "spring_stiffness": "stiffness", "spring_damping": "damping"}  # fmt: skip
 OF_SPRINGS = {name: f"{WORDS[name]} of springs between points" for name in SPRING_FIELDS[2:]}
-UNITS = {"mass": " kg", "inertia": " kg m²", "force": " N", "moment": " N m", "drag_force": " N s/m",
-         "drag_moment": " N m s", "gravity": " m/s²", "length": " m", "point": " m"}  # fmt: skip
+UNITS = {name: f" {unit}" for name, unit in parameters.UNITS.items()}
 
 
 @dataclass(frozen=True, eq=False)

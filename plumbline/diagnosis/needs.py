@@ -13,11 +13,10 @@ from itertools import combinations, islice
 
 import numpy as np
 
-from plumbline.diagnosis.digit_loss import REFUSALS, Evaluate, ask
-from plumbline.diagnosis.prediction import Predictor, View, error_ratio, is_closed, tolerances, values_of
+from plumbline.diagnosis.digit_loss import REFUSALS, Evaluate, ask_ratios
+from plumbline.diagnosis.prediction import is_closed
 from plumbline.model.datatypes import BODY_FIELDS, JOINT_ELEMENTS, JOINT_FIELDS, KINDS, Flags, Model, State
 from plumbline.model.kinematics import complete_state
-from plumbline.truth.rounding_bound import rounding_bounds
 
 VANISHED = 2.0  # in bounds: the engine's rounding and that of the expected number
 MAX_CHOICES, MAX_TRIALS = 100, 3  # of as many bodies, from either end: looked at, and tried
@@ -207,12 +206,6 @@ def _reduced(model: Model, states: list[State], kept: list[int]) -> Problem:
 
 
 def _wrong(model: Model, states: list[State], quantities: Collection[str], evaluate: Evaluate) -> set[str]:
-    """Those of the quantities that differ from what is right at one of the states."""
-    answers, right = ask(evaluate, model, states), Predictor(model, states, View()).right
-    bounds = rounding_bounds(model, states)
-    is_right = {  # what is not given shows nothing
-        q: all(getattr(answer, q) is not None for answer in answers)
-        and error_ratio(values_of(answers, q) - right[q], tolerances(bounds, q)) <= VANISHED
-        for q in quantities
-    }
-    return {q for q, one in is_right.items() if not one}
+    """Those of the quantities that differ from what is right at one of the states, or are not given."""
+    ratios = ask_ratios(evaluate, model, states, quantities)
+    return {q for q, ratio in ratios.items() if not ratio <= VANISHED}
