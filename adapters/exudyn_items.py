@@ -620,10 +620,11 @@ def _pose(turn: Array, place: Array) -> Array:
 
 
 def _add_robots(s: _Items) -> None:
-    """Robots of one link on a base at the anchor, with the probe frame as their tool."""
+    """Robots of one link on a base half way to the body, with the probe frame as their tool."""
     angle, poses = 0.4, []
-    base, back = _pose(PROBE_TURN, s.anchor), _pose(about(2, -angle), np.zeros(3))
+    back = _pose(about(2, -angle), np.zeros(3))
     for one in s.bodies:
+        base = _pose(PROBE_TURN, one.place / 2)  # no farther than the body, by whose size places are rounded
         tool = robots.RobotTool(HT=_pose(PROBE_TURN, one.arm))
         robot = robots.Robot(base=robots.RobotBase(HT=base), tool=tool)
         before = np.linalg.inv(base) @ _pose(one.turn, one.place) @ back

@@ -125,6 +125,16 @@ def test_free_bodies_at_high_speeds_and_rates_are_within_the_bound(engine, speed
     assert verdicts(state_truth(model, [state]), answers) == {quantity: Verdict.AGREES}
 
 
+@pytest.mark.parametrize("engine", SURFACES)
+def test_places_near_the_origin_of_a_long_mechanism_are_within_their_bounds(engine):
+    model, _ = mechanism(("ball",), bodies=2)
+    model = replace(model, point=model.point * np.array([[[1e-3], [1e-3]], [[1e-3], [1e3]]]))
+    states = random_states(model, 3, 1)
+    found = verdicts(state_truth(model, states), answers_of(engine, model, states))
+    wrong = {name for name, verdict in found.items() if verdict == Verdict.DISAGREES}
+    assert wrong == WRONG.get(engine, set()) & set(found), wrong
+
+
 @pytest.mark.parametrize("engine", ["pinocchio", "exudyn"])
 def test_bodies_of_a_loop_are_compared_and_a_relative_change_of_1e_6_is_seen(engine):
     (s,) = load_scenarios(["slider-crank"])
