@@ -100,13 +100,7 @@ class CutMechanism:
             The tree's state; the parts go by the closing joints' own coordinates.
 
         """
-        if not self.ends:
-            return state
-        fields = {name: value[..., self.source.body[:, 1], :] for name, value in vars(state).items()}
-        fields |= zip(("u", "udot", "x", "xdot"), joint_coordinates(self.source, state), strict=True)
-        order = np.argsort(self.place)
-        ordered = {name: value[..., order, :] for name, value in fields.items()}
-        return complete_state(self.model, State(**ordered))
+        return _state_of_tree(self, state) if self.ends else state
 
     def source_state(self, state: State) -> State:
         """Describe a state of the tree as one of the mechanism.
@@ -191,6 +185,15 @@ class CutMechanism:
         w = velocity_jacobian(self.model, state)
         w = w.reshape(*w.shape[:-2], self.model.n, 6, -1)
         return np.concatenate([w[..., b, :, :] - w[..., c, :, :] for b, c in self.ends], -2)
+
+
+@lru_cache(maxsize=64)  # engines are asked for the same states in many ways
+def _state_of_tree(cut: CutMechanism, state: State) -> State:
+    source = cut.source
+    fields = {name: value[..., source.body[:, 1], :] for name, value in vars(state).items()}
+    fields |= zip(("u", "udot", "x", "xdot"), joint_coordinates(source, state), strict=True)
+    order = np.argsort(cut.place)
+    return complete_state(cut.model, State(**{name: value[..., order, :] for name, value in fields.items()}))
 
 
 @lru_cache(maxsize=64)  # mechanisms are never changed
