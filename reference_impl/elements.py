@@ -104,6 +104,7 @@ class Elements:
         self._points = np.moveaxis(points, 1, 0)
         self.turns = np.moveaxis(m.turn[self.joint, ::-1], 1, 0)
         self._axes, self._numbers = A(self.turns), np.arange(len(self.joint))
+        self._in_turn = (self.axis + np.arange(3)[:, None]) % 3  # the axis of each and the two after it
         self.has_winding_angles = bool(np.any((self.stiffness != 0) & ~self.is_slide & ~self.is_ball))
 
     def coordinates(
@@ -146,7 +147,7 @@ class Elements:
         slide_bias += 2 * vecdot(w_rate, d_rate) + vecdot(cross(wa, w_rate), d)
         stretch = np.where(self.is_slide, vecdot(w, d), self._angles(*at.axes, at.p, x)) - self.rest
         torque = self.effort - self.stiffness * stretch - self.damping * rate
-        wrench = torque[:, None] * np.stack([np.hstack([push, n_near]), -np.hstack([push, n_far])])
+        wrench = torque[:, None] * np.concatenate([[push, -push], [n_near, -n_far]], axis=2)
         potential = lost = 0.0
         # force, and moment about the centre of mass; the world last
         total = np.zeros((len(motion[0]) + 1, 6))
@@ -193,7 +194,7 @@ class Elements:
         at, is_slide = (self._numbers, self.axis), self.is_slide[:, None]
         w = np.where(self.is_far[:, None], f[at], h[at])
         push, spin = w * is_slide, spin[:, :e]
-        levers = np.stack([arm[0, :e], arm[1, :e] + d[:e]])
+        levers = np.array([arm[0, :e], arm[1, :e] + d[:e]])
         n_near, n_far = np.where(is_slide, cross(levers, w), w)
         rate = vecdot(push, v[0, :e] - v[1, :e]) + vecdot(n_near, spin[0]) - vecdot(n_far, spin[1])
         return _Motion(
@@ -211,7 +212,7 @@ class Elements:
 
     def _angles(self, f: Array, h: Array, p: Array, x: Array | None) -> Array:
         """Angles (e,) of turns, and of balls the components of the rotation vector."""
-        e, (i, j, k) = self._numbers, (self.axis + np.arange(3)[:, None]) % 3
+        e, (i, j, k) = self._numbers, self._in_turn
         cosine = np.where(self.is_far, vecdot(f[e, j], h[e, j]), vecdot(f[e, k], h[e, k]))
         angle = np.arctan2(vecdot(f[e, k], h[e, j]), cosine)
         if x is not None:

@@ -18,6 +18,7 @@ from reference_impl.arrays import AnyArray as AnyArray
 from reference_impl.arrays import Shaped
 
 I3 = np.eye(3, dtype=int)  # integers: exact in every field
+_NEXT = np.array([1, 2, 0])  # of each axis the next one
 
 
 def _linear(size: int) -> Callable[[Callable[[AnyArray], AnyArray]], Callable[[AnyArray], AnyArray]]:
@@ -61,8 +62,7 @@ def dot(a: Shaped[AnyArray, "... i"], b: Shaped[AnyArray, "... i"]) -> Shaped[An
 
 def cross(a: Shaped[AnyArray, "... 3"], b: Shaped[AnyArray, "... 3"]) -> Shaped[AnyArray, "... 3"]:
     """Return a × b, in a fifth of the time that `numpy.cross` takes on a few vectors."""
-    i, j = (1, 2, 0), (2, 0, 1)
-    return np.asarray(a.take(i, -1) * b.take(j, -1) - a.take(j, -1) * b.take(i, -1))
+    return np.asarray((a * b.take(_NEXT, -1) - a.take(_NEXT, -1) * b).take(_NEXT, -1))
 
 
 def A(p: Shaped[AnyArray, "... 4"]) -> Shaped[AnyArray, "... 3 3"]:

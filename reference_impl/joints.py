@@ -266,7 +266,7 @@ def _turning_vectors(
         and of the axes their values (a, 3), ∂/∂p of their bodies, rates and ũ.
 
     """
-    p, pdot = both = np.stack([p, pdot])[:, fixed.vector_body]
+    p, pdot = both = np.array([p, pdot])[:, fixed.vector_body]
     H = (both[..., None, :] @ fixed.H_of_units).reshape(*both.shape[:-1], 3, 4)  # H(p, ·), H(ṗ, ·)
     value = _matrix_vector(H[0], p) - fixed.vectors
     rate, bias = 2 * _matrix_vector(H, pdot)
