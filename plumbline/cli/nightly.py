@@ -140,7 +140,7 @@ def run_nightly(
     )
     plan = replace(plan, random_scenarios=random_scenarios, random_level="random", result_cache=result_cache)
     proofs = (
-        prove_changed_motions(plan.scenarios, plan.jobs, plan.limits, proof_cpu_seconds, log)
+        prove_changed_motions(plan.scenarios, plan.jobs, plan.limits, proof_cpu_seconds, log, progress)
         if proof_cpu_seconds
         else None
     )

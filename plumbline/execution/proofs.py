@@ -61,19 +61,21 @@ def prove_changed_motions(
     limits: Limits,
     max_cpu_seconds: float,
     log: Callable[[str], None] = lambda _: None,
+    progress: Callable[[int, int, str], None] = lambda done, total, name: None,
 ) -> ProofSummary:
     """Prove the motions that have no proof yet, short chains first, and judge the usual truth by them.
 
     Args:
         limits: limits of each proof.
         max_cpu_seconds: when so much has been used, no further proof is begun.
-        log: called with a sentence about each proof that fails.
+        log: called with a sentence about what is to be proved, and about each proof that fails.
+        progress: called after each proof with the numbers of those done and of all, and the scenario's name.
 
     Returns:
         What was proved; each proof is kept for later runs, where the user's cache can be written.
 
     """
-    found, used, logged = ProofSummary(), 0.0, set[str]()
+    found, used, number, logged = ProofSummary(), 0.0, 0, set[str]()
     if absent := [module for module in TRUTH_TOOLS if find_spec(module) is None]:
         log(f"no motions are proved: {', '.join(absent)} not installed")
         return ProofSummary(left_out=[s.name for s in scenarios])
@@ -85,6 +87,8 @@ def prove_changed_motions(
             found.left_out.append(s.name)
         else:
             missing[s.name] = s
+    if missing:
+        log(f"proving motions, {len(missing)} of {len(scenarios)}, for at most {max_cpu_seconds:g} CPU s")
 
     def tasks() -> Iterator[Task]:
         for s in missing.values():
@@ -97,7 +101,8 @@ def prove_changed_motions(
     with WorkerPool(jobs, limits) as workers:
         for outcome in workers.run(tasks()):
             used += outcome.cpu_time
-            s = missing[outcome.key]
+            s, number = missing[outcome.key], number + 1
+            progress(number, len(missing), s.name)
             if outcome.failure:
                 found.failed[s.name] = outcome.failure
                 log(f"{s.name}: not proved: {outcome.failure}")

@@ -43,10 +43,14 @@ def test_a_proof_that_fails_is_reported():
     wild = short("tumbling-ball")
     without_inertia = replace(wild.model, inertia=0 * wild.model.inertia)
     wild = replace(wild, model=without_inertia, duration=wild.sample_interval)
-    sentences = []
-    found = prove_changed_motions([wild], 1, LIMITS, 100.0, sentences.append)
+    sentences, calls = [], []
+    found = prove_changed_motions(
+        [wild], 1, LIMITS, 100.0, sentences.append, lambda *call: calls.append(call)
+    )
     assert list(found.failed) == ["tumbling-ball"] and "1 could not be proved" in found.sentence
-    assert sentences[0].startswith("tumbling-ball: not proved: ")
+    begun, failed = sentences
+    assert begun == "proving motions, 1 of 1, for at most 100 CPU s" and calls == [(1, 1, "tumbling-ball")]
+    assert failed.startswith("tumbling-ball: not proved: ")
 
 
 @pytest.mark.parametrize("name", ["tumbling-ball", "lagrange-top", "rest", "drag-rod", "free-top"])
