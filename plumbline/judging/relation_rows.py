@@ -32,7 +32,7 @@ def _relation_row(context: RowContext, result: RelationResult) -> Row:
     if result.ratio is None:
         return context.make_row(
             "relations", result.integrator, result.relation, REFUSALS[result.refusal], result.refusal_reason,
-            gap=result.gap,
+            gap=result.gap, place=result.place,
         )  # fmt: skip
     extra = {"states": float(result.state_count), "state": float(result.worst_state)}
     if result.unexplained is not None:

@@ -34,3 +34,4 @@ class RelationResult:
     end_time: float = 0.0  # [s] of a run, one way
     unexplained: float | None = None  # the ratio without the effect of a term that the engine leaves out
     gap: str = ""  # the declared gap that the refusal follows from
+    place: str = ""  # `place_of` the refusal or failure

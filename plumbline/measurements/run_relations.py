@@ -28,7 +28,7 @@ from plumbline.model.datatypes import (
 )
 from plumbline.model.invariants import attitude_error, position_error
 from plumbline.model.kinematics import angular_velocity, stretched_length
-from plumbline.processes.exceptions import describe_exception
+from plumbline.processes.exceptions import describe_exception, place_of
 from plumbline.truth.ground_truth import RUN_ROUNDING
 from plumbline.truth.predictability_horizon import perturbation_growth
 from plumbline.truth.rounding_bound import remembered_rounding_bound
@@ -227,8 +227,8 @@ def refused_result(name: str, integrator: Integrator, refusal: Unsupported | Eng
     """
     kind: Refusal = "unsupported" if isinstance(refusal, Unsupported) else "failed"
     gap = refusal.gap if isinstance(refusal, Unsupported) else ""
-    reason = describe_exception(refusal)
-    return RelationResult(name, None, "", 0, 0, reason, kind, integrator.name, gap=gap)
+    reason, place = describe_exception(refusal), place_of(refusal)
+    return RelationResult(name, None, "", 0, 0, reason, kind, integrator.name, gap=gap, place=place)
 
 
 def run_tolerance(

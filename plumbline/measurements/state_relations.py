@@ -48,7 +48,7 @@ from plumbline.model.redescription import (
     state_of_balls,
 )
 from plumbline.model.welding import split_bodies
-from plumbline.processes.exceptions import describe_exception
+from plumbline.processes.exceptions import describe_exception, place_of
 from plumbline.truth.rounding_bound import RoundingBound, rounding_bounds, state_rounding_bound
 
 WELDED_HALVES = "two welded halves"
@@ -406,7 +406,8 @@ def check_state_relation(
     except MemoryError:
         raise
     except Exception as error:  # an engine may raise anything, and other relations are to be checked
-        return RelationResult(relation.name, None, "", 0, 0, describe_exception(error), "failed")
+        reason, place = describe_exception(error), place_of(error)
+        return RelationResult(relation.name, None, "", 0, 0, reason, "failed", place=place)
     for index, (state, other) in enumerate(zip(states, answered, strict=True)):
         here = answers[index]
         if isinstance(here, Unsupported):
@@ -432,6 +433,7 @@ def check_state_relation(
     return RelationResult(
         relation.name, worst[0] if count else None, worst[1], worst[2], count,
         str(refused or ""), unexplained=left, gap=refused.gap if refused else "",
+        place=place_of(refused) if refused else "",
     )  # fmt: skip
 
 

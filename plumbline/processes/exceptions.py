@@ -52,4 +52,4 @@ def place_of(error: BaseException) -> str:
     while error.__context__ is not None:
         error = error.__context__
     calls = dict.fromkeys(frame.f_code.co_name for frame, _ in traceback.walk_tb(error.__traceback__))
-    return one_line(f"{type(error).__name__} in {' > '.join(calls)}")
+    return one_line(f"{type(error).__name__}{' in ' * bool(calls)}{' > '.join(calls)}")

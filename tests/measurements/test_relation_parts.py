@@ -113,6 +113,7 @@ def test_an_option_by_which_the_engine_fails_is_a_failure_of_its_own_row():
     assert (found.relation, found.ratio, found.refusal) == ("by it", None, "failed")
     (row,) = judge_relations(WHO, [found]).rows
     assert row.verdict == "failed" and "no such option" in row.reason
+    assert row.extra["place"].startswith("AttributeError in ") and row.extra["place"].endswith(" > failing")
 
 
 def test_runs_are_measured_by_length_turn_and_speed():
@@ -210,7 +211,7 @@ def test_rows_say_what_held_what_did_not_and_what_was_refused():
     lost = refused_result("by sparse", METHOD, EngineFailure("it stopped"))
     never = refused_result("by sparse", METHOD, Unsupported("no such solver"))
     assert lost == RelationResult(
-        "by sparse", None, "", 0, 0, "it stopped", "failed", "trapezoidal", 0, 0.0, 0.0
+        "by sparse", None, "", 0, 0, "it stopped", "failed", "trapezoidal", 0, 0.0, 0.0, place="EngineFailure"
     )
     assert (one.refusal_reason, one.integrator, one.steps) == ("", "-", 0)
     rows = judge_relations(
