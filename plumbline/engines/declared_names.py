@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import ast
-from collections.abc import Sequence
+import re
 from functools import cache
-from pathlib import Path
 
 from plumbline.layout import ROOT
-from plumbline.processes.user_cache import content_key, recall, remember
 
 
 @cache
@@ -19,43 +16,15 @@ def declared_integrators() -> frozenset[str]:
         The first arguments of all `Integrator`s that are built in the folder of the adapters.
 
     """
-    return _declared_names()[0]
+    return frozenset(re.findall(r'\bIntegrator\(\s*"([^"]+)"', _sources()))
 
 
 @cache
 def declared_texts() -> frozenset[str]:
     """Collect the texts in the adapters' source: names of algorithms and solvers are among them."""
-    return _declared_names()[1]
+    return frozenset(re.findall(r'"([^"\\\n]+)"', _sources()))
 
 
 @cache
-def _declared_names() -> tuple[frozenset[str], frozenset[str]]:
-    """Names of integrators, and all texts; remembered, because parsing all adapters takes a while."""
-    sources = [path.read_bytes() for path in sorted((ROOT / "adapters").glob("*.py"))]
-    key = content_key("adapters", Path(__file__).read_bytes(), *sources)
-    found: tuple[frozenset[str], frozenset[str]] | None = recall(
-        key, lambda names: all(isinstance(one, frozenset) for one in names) and len(names) == 2
-    )
-    if found is None:
-        nodes = [node for source in sources for node in ast.walk(ast.parse(source))]
-        found = _integrators(nodes), _texts(nodes)
-        remember(key, found)
-    return found
-
-
-def _integrators(nodes: Sequence[ast.AST]) -> frozenset[str]:
-    return frozenset(
-        str(node.args[0].value)
-        for node in nodes
-        if isinstance(node, ast.Call)
-        and isinstance(node.func, ast.Name)
-        and node.func.id == "Integrator"
-        and node.args
-        and isinstance(node.args[0], ast.Constant)
-    )
-
-
-def _texts(nodes: Sequence[ast.AST]) -> frozenset[str]:
-    return frozenset(
-        node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)
-    )
+def _sources() -> str:
+    return "\n".join(path.read_text(encoding="utf-8") for path in sorted((ROOT / "adapters").glob("*.py")))

@@ -711,7 +711,7 @@ class _MovingTree(Tree):
         inverse = floats().solve(np.asarray(K + PROXIMAL_DAMPING * unit, float), unit).astype(LongDouble)
         push = np.zeros_like(missing)
         for _ in range(PROXIMAL_STEPS):
-            push = push + rotate_vectors(inverse, missing - rotate_vectors(K, push))
+            push = push + np.matvec(inverse, missing - np.matvec(K, push))
         return np.concatenate([np.ones_like(push[..., :1]), scale * push], -1)[..., None]
 
     def _twist_rows(self, pair: tuple[int, int], *motions: Sequence[Array]) -> Array:
