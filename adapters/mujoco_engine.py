@@ -274,8 +274,7 @@ class Mujoco(MetamorphicHooks):
         with _raise_on_warnings(chain.d):
             for state in states:
                 rates = chain.evaluate_forward(state)
-                elastic = kinematics.elastic_energy(model, state)
-                s = Probed(chain.m, chain.d, chain.link_ids, rates, elastic)
+                s = Probed(chain.m, chain.d, chain.link_ids, rates)
                 add_surface(s)
                 found.append(s.found)
         add_pose_answers(found, states, "mujoco", pose_function)

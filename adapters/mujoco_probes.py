@@ -15,13 +15,11 @@ ANCHOR = "anchor"  # site of the world, with the attitude of probe frames
 
 
 class Probed(SurfaceRecord):
-    """Model and data after the forward dynamics; ``links``: the bodies, ``elastic``: the springs' energy."""
+    """Model and data after the forward dynamics; ``links``: the bodies."""
 
-    def __init__(
-        self, m: Any, d: Any, links: Sequence[int], rates: Float[Array, "nv nu"], elastic: float
-    ) -> None:
+    def __init__(self, m: Any, d: Any, links: Sequence[int], rates: Float[Array, "nv nu"]) -> None:
         super().__init__(rates)
-        self.m, self.d, self.links, self.elastic = m, d, list(links), elastic
+        self.m, self.d, self.links = m, d, list(links)
         self.sites = self.ids("site")
 
     def ids(self, kind: str, end: str = "") -> Int[Indices, "bodies"]:

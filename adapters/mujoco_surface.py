@@ -226,12 +226,9 @@ def _add_sensors(s: Probed) -> None:
 
 
 def _add_energies(s: Probed) -> None:
-    for name, quantity, of_springs in (
-        ("E_KINETIC", "kinetic_energy", 0.0),
-        ("E_POTENTIAL", "gravity_energy", s.elastic),
-    ):
+    for name, quantity in (("E_KINETIC", "kinetic_energy"), ("E_POTENTIAL", "potential_energy")):
         _ = member(f"mjtSensor.mjSENS_{name}")
-        s.add(quantity, (f"mjtSensor.mjSENS_{name}",), s.d.sensor(name).data - of_springs)
+        s.add(quantity, (f"mjtSensor.mjSENS_{name}",), s.d.sensor(name).data)
 
 
 def _add_frames(s: Probed) -> None:
@@ -353,7 +350,7 @@ def _add_asleep(s: Probed) -> None:
     for _ in range(MAX_AWAKE):
         mujoco.mj_step(own, other)
     call = "mj_energyPos", "mjtSleepPolicy"
-    s.add("gravity_energy", call, other.energy[0] - s.elastic)
+    s.add("potential_energy", call, other.energy[0])
 
 
 def _add_jacobians(s: Probed) -> None:
@@ -512,7 +509,7 @@ def _add_implicit_steps(s: Probed) -> None:
         if name == "EULER":
             mujoco.mj_Euler(own, other)
             L = dense_rows(other.qH, m, other, "M")
-            pivots, added = L @ v + (1 - np.diag(L)) * v, h * m.dof_damping @ v**2
+            pivots, added = v + (L - np.diag(np.diag(L))) @ v, h * m.dof_damping @ v**2
             s.add("kinetic_energy", ("MjData.qH",), (np.diag(L) @ pivots**2 - added) / 2)
             s.add("kinetic_energy", ("MjData.qHDiagInv",), ((pivots / other.qHDiagInv) @ pivots - added) / 2)
             continue

@@ -104,6 +104,8 @@ class Motion:
         proximal = model.proximal[: model.n]
         near = norm(proximal, axis=-1)
         self.near = given(rotate_vectors(A, proximal), self.of_turn * near, near)
+        whole = ([quantities.potential_energy], bound.potential_energy, scale["potential_energy"])
+        self.potential_energy = Rounded(np.array([whole[0]]), *(np.array([x], float) for x in whole[1:]))
         none, names = np.zeros((model.n, 3)), ("joint_reaction", "joint_moment")
         if quantities.mass_matrix is not None:  # of mechanisms without loops
             values = (getattr(quantities, name) for name in names)
@@ -380,6 +382,7 @@ _FORMULAS: Mapping[str, tuple[str, Callable[[Motion], Rounded]]] = {
     "subtree_mass": ("kg", _subtree_mass),
     "kinetic_energy": ("J", _kinetic_energy),
     "gravity_energy": ("J", lambda m: _gravity_energy(m, m.r)),
+    "potential_energy": ("J", lambda m: m.potential_energy),
     "gravity_energy_second_rate": ("W/s", lambda m: _gravity_energy(m, m.a)),
     "mechanical_energy": ("J", lambda m: _kinetic_energy(m).plus(_gravity_energy(m, m.r))),
     "body_force_local": ("N", lambda m: m.local(_force_of_probe(m))),

@@ -218,7 +218,7 @@ MENDED = [
     ("sprung-universal", "mujoco@3.17.0", "mjtSensor.mjSENS_ACCELEROMETER", ["frame_acceleration"]),
     ("sprung-hinge", "mujoco@3.4.0", "mjtGain.mjGAIN_AFFINE, mjtDyn.mjDYN_INTEGRATOR", ["inverse_dynamics"]),
     ("sprung-hinge", "mujoco@3.17.0", "mjtBias.mjBIAS_AFFINE, mjtTrn.mjTRN_JOINT", ["inverse_dynamics"]),
-    ("sprung-hinge", "mujoco@3.17.0", "mj_energyPos, mjtSleepPolicy", ["gravity_energy"]),
+    ("sprung-hinge", "mujoco@3.17.0", "mj_energyPos, mjtSleepPolicy", ["potential_energy"]),
     ("tumbling-ball", "pinocchio@4.0.0", "by Model: RuntimeError", ["all_by_option"]),
     ("tumbling-ball", "pinocchio@2.7.0", "getFrameJacobian", ["frame_acceleration_by_jacobian_rate"]),
     ("tumbling-ball", "pinocchio@2.7.0", "appendModel, FrameType.BODY",

@@ -135,6 +135,18 @@ def test_places_near_the_origin_of_a_long_mechanism_are_within_their_bounds(engi
     assert wrong == WRONG.get(engine, set()) & set(found), wrong
 
 
+def test_energies_of_heavy_bodies_on_springs_and_dampers_in_weak_gravity_are_within_their_bounds():
+    model = random_tree(np.random.default_rng(0), 2, ("hinge",), elements=("stiffness", "damping"))
+    model = replace(model, mass=1e5 * model.mass, inertia=1e5 * model.inertia, gravity=1e-12 * model.gravity)
+    states = random_states(model, 3, 1)
+    answers = answers_of("mujoco", model, states)
+    energies = {name: answers[name] for name in ("kinetic_energy", "potential_energy")}
+    calls = {name for by_call in energies.values() for call in by_call for name in call}
+    assert calls >= {"MjData.qH", "mjtSensor.mjSENS_E_POTENTIAL"}
+    found = verdicts(state_truth(model, states), energies)
+    assert found == dict.fromkeys(energies, Verdict.AGREES)
+
+
 @pytest.mark.parametrize("engine", ["pinocchio", "exudyn"])
 def test_bodies_of_a_loop_are_compared_and_a_relative_change_of_1e_6_is_seen(engine):
     (s,) = load_scenarios(["slider-crank"])
