@@ -120,10 +120,25 @@ class Motion:
             self.mass_matrix, self.mass_matrix_error = quantities.mass_matrix, bound.mass_matrix
         self.axes = A @ rotation_matrix(PROBE_ATTITUDE)  # of the probe frames
         self.point = self.r.plus(self.arm)
-        self.point_velocity = self.v.plus(self.w.cross(self.arm))
+        self.below = bodies_beyond(model).astype(float)
+        self.velocity = self.v._replace(size=self.v.size + self._moved_velocities())
+        self.point_velocity = self.velocity.plus(self.w.cross(self.arm))
         self.swing = swing = self.alpha.cross(self.arm).plus(self.w.cross(self.w.cross(self.arm)))
         self.point_acceleration = self.a.plus(swing)
-        self.below = bodies_beyond(model).astype(float)
+
+    def _moved_velocities(self) -> Float[Array, "bodies"]:
+        """Size of what cancels [m/s] where velocities are added up at the centre of mass of the tree."""
+        far, place, spin = self.model.body[: self.model.n, 0], self.r.value, self.w.value
+        path = self.below.T
+        first = np.argmax(path, axis=1)  # of the tree: bodies come after those that carry them
+        weights = self.below[first] * self.mass
+        centre = weights @ place / np.sum(weights, axis=1, keepdims=True)
+        relative = spin - np.where(far[:, None] >= 0, spin[far], 0.0)
+        arms = (np.linalg.norm(x - centre, axis=1) for x in (place + self.near.value, place))
+        of_joints, of_bodies = (
+            np.linalg.norm(w, axis=1) * arm for w, arm in zip((relative, spin), arms, strict=True)
+        )
+        return np.asarray(path @ of_joints + of_bodies)
 
     def local(self, vectors: Rounded) -> Rounded:
         """Vectors in the axes of the probe frames."""
@@ -332,7 +347,7 @@ def _probe_moment(m: Motion) -> Rounded:
 # By name the unit and the formula: vectors of bodies, of the whole mechanism, or one number per entry of ν.
 _FORMULAS: Mapping[str, tuple[str, Callable[[Motion], Rounded]]] = {
     "body_position": ("m", lambda m: m.r),
-    "body_velocity": ("m/s", lambda m: m.v),
+    "body_velocity": ("m/s", lambda m: m.velocity),
     "body_acceleration": ("m/s²", lambda m: m.a),
     "frame_position": ("m", lambda m: m.point),
     "frame_axes": ("1", _frame_axes),

@@ -135,6 +135,18 @@ def test_places_near_the_origin_of_a_long_mechanism_are_within_their_bounds(engi
     assert wrong == WRONG.get(engine, set()) & set(found), wrong
 
 
+@pytest.mark.parametrize("engine", SURFACES)
+def test_the_velocity_of_a_body_that_turns_about_its_centre_is_zero_within_its_bound(engine):
+    model, _ = mechanism(("ball",), seed=1, bodies=3)
+    model = replace(model, point=model.point * np.array([0.0, 1.0, 1.0])[:, None, None])
+    states = random_states(model, 3, 1)
+    truth, answers = state_truth(model, states), answers_of(engine, model, states)
+    names = {name for name in ("body_velocity", "frame_velocity") if name in answers}
+    found = verdicts(truth, {name: answers[name] for name in names})
+    assert names and found == dict.fromkeys(names, Verdict.AGREES)
+    assert not np.any([state.v[0] for state in states])
+
+
 def test_energies_of_heavy_bodies_on_springs_and_dampers_in_weak_gravity_are_within_their_bounds():
     model = random_tree(np.random.default_rng(0), 2, ("hinge",), elements=("stiffness", "damping"))
     model = replace(model, mass=1e5 * model.mass, inertia=1e5 * model.inertia, gravity=1e-12 * model.gravity)
