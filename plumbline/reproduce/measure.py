@@ -301,7 +301,7 @@ class StepMeasure:
             ratio = max(max(c.ratios.ravel()) for c in steps.compare([run]).values())
         except Exception:
             return None
-        true = steps.true[0][count]
+        true = steps.true[count][0]
         names = {"step_position": "r", "step_attitude": "p", "step_velocity": "v", "step_rate": "omega"}
         return StepEvidence(
             case, ratio, self.engine.name,

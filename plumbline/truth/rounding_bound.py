@@ -39,6 +39,7 @@ from functools import lru_cache
 from typing import Any, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from plumbline.equations.responses import Responses
 from plumbline.model.datatypes import JOINT_ELEMENTS, ZERO_INERTIA, Array, Model, State
@@ -96,8 +97,8 @@ class RoundingBound:
     joint_terms: Array | float  # N m about the origin, of the terms of all joints
     joint_power: Array | float  # W, of the same with the joints' rates
 
-    def __getitem__(self, s: int) -> RoundingBound:
-        """Take those at one of many states."""
+    def __getitem__(self, s: int | NDArray[np.intp]) -> RoundingBound:
+        """Take those at one of many states, or at some."""
 
         def at(x: Array | float) -> Any:
             one = np.asarray(x)[s]

@@ -200,21 +200,20 @@ class FormulaSteps:
         self.method, self.model, self.places = method, model, [(index, h) for index, h, _ in starts]
         self.starts, sizes = [states[index] for index, *_ in starts], [h for _, h, _ in starts]
         axes = [angle_axes for *_, angle_axes in starts]
-        used = dict.fromkeys(index for index, *_ in starts)
+        used = list(dict.fromkeys(index for index, *_ in starts))
         bounds = acceleration_bounds(method, model, stack_states([states[index] for index in used]))
-        self.bounds = {index: bounds[i] for i, index in enumerate(used)}
-        nearby = {index: _disturbed(model, states[index], self.bounds[index]) for index in used}
+        nearby = {index: _disturbed(model, states[index], bounds[i]) for i, index in enumerate(used)}
+        self.bounds = bounds[np.array([used.index(index) for index, *_ in starts])]
         disturbed = [nearby[index] for index, *_ in starts]
         self.counts = tuple(counts) or step_counts(method)
         self._end_bounds: dict[tuple[int, int], _EndBounds] = {}
-        count = max(self.counts)
+        count, every = max(self.counts), np.arange(len(starts))
         both = joint_space_steps(model, self.starts + disturbed, sizes + sizes, method, count, axes + axes)
-        self.true = [[links[i] for links in both] for i in range(len(starts))]
-        self.growth = np.empty((len(starts), count + 1))  # of perturbations, running maximum
-        for i, (index, h, _) in enumerate(starts):
-            weights = self.step_bound((self.starts[i],), (self.bounds[index],), h, 1)
-            apart = [_separation(links, i, len(starts), weights) for links in both]
-            self.growth[i] = np.maximum.accumulate(np.array(apart) / apart[0])
+        self.true = [links[every] for links in both]  # by number of steps
+        weights = self._step_bounds(every, 1, (stack_states(self.starts), self.bounds))
+        apart = np.array([_separations(links, len(starts), weights) for links in both])
+        # (starts, steps) of perturbations, running maximum
+        self.growth = np.maximum.accumulate(apart / apart[0], axis=0).T
 
     def is_stable(self, i: int) -> bool:
         """Find out whether the method itself goes through.
@@ -262,7 +261,7 @@ class FormulaSteps:
             if count >= len(motion.t):
                 continue
             place, soft = Place(*self.places[i], count), _limit_errors(runs[i])
-            off = _differences(_reported(motion, count), self.true[i][count])
+            off = _differences(_reported(motion, count), self.true[count][i])
             for quantity, error in _norms(off).items():
                 lacking = count * float(np.max(soft[quantity][:count]))
                 allowed = limit[quantity] + self.growth[i, count] * lacking
@@ -294,32 +293,24 @@ class FormulaSteps:
     def _bounds_after(self, i: int, count: int) -> _EndBounds:
         """Rounding bounds at both ends of a run's first steps, and those of the steps; computed once."""
         if (i, count) not in self._end_bounds:  # of all runs that go through at once
-            runs = [j for j in range(len(self.places)) if j == i or self.growth[j, count] < MAX_GROWTH]
-            states = [self.true[j][count].rounded() for j in runs]
-            bounds = acceleration_bounds(self.method, self.model, stack_states(states))
-            for at, (j, end) in enumerate(zip(runs, states, strict=True)):
-                index, h = self.places[j]
-                ends = self.bounds[index], bounds[at]
-                self._end_bounds[j, count] = ends, self.step_bound((self.starts[j], end), ends, h, count)
+            passes = self.growth[:, count] < MAX_GROWTH
+            runs = np.flatnonzero(passes | (np.arange(len(passes)) == i))
+            states, first = self.true[count][runs].rounded(), self.bounds[runs]
+            bounds = acceleration_bounds(self.method, self.model, states)
+            ends = (stack_states([self.starts[j] for j in runs]), first), (states, bounds)
+            limits = self._step_bounds(runs, count, *ends)
+            for at, j in enumerate(runs.tolist()):
+                limit = {name: x[at] for name, x in limits.items()}
+                self._end_bounds[j, count] = (first[at], bounds[at]), limit
         return self._end_bounds[i, count]
 
-    def step_bound(
-        self, ends: tuple[State, ...], bounds: tuple[RoundingBound, ...], h: float, count: int
+    def _step_bounds(
+        self, runs: NDArray[np.intp], count: int, *ends: tuple[State, RoundingBound]
     ) -> dict[str, Array]:
-        """Compute the bounds of one of several steps.
-
-        Args:
-            ends: the states at the ends of the steps.
-            bounds: rounding bounds at ``ends``.
-            h: step [s].
-
-        Returns:
-            By quantity the bounds (N,), in its unit of `STEP_QUANTITIES`.
-
-        """
-        of_ends = {name: np.array([getattr(b, name) for b in bounds]) for name in ACCELERATIONS}
-        sizes = _sizes(stack_states(ends), of_ends)
-        largest = {name: np.max(size, axis=0) for name, size in sizes.items()}
+        """Bounds (runs, N) of one of the first steps by quantity, from the states at their ends."""
+        sizes = [_sizes(states, vars(bounds)) for states, bounds in ends]
+        largest = {name: np.max([one[name] for one in sizes], axis=0) for name in sizes[0]}
+        h = np.array([h for _, h in self.places])[runs, None]
         return step_bound(self.method, self.model, largest, h, count)
 
 
@@ -356,13 +347,13 @@ def _sizes(states: State, bounds: Mapping[str, Array]) -> dict[str, Array]:
 
 
 def step_bound(
-    method: JointSpaceMethod, model: Model, sizes: dict[str, Array], h: float, count: int
+    method: JointSpaceMethod, model: Model, sizes: dict[str, Array], h: float | Array, count: int
 ) -> dict[str, Array]:
     """Compute the bounds of one of several steps.
 
     Args:
         sizes: of `_sizes`, (..., N): the largest at the ends of the steps.
-        h: step [s].
+        h: step [s], or (..., 1).
 
     Returns:
         By quantity the bounds (..., N), in its unit of `STEP_QUANTITIES`.
@@ -410,7 +401,7 @@ def _arms(model: Model, sizes: dict[str, Array]) -> Array:
 
 
 def _passed_on(
-    method: JointSpaceMethod, model: Model, sizes: dict[str, Array], h: float, count: int
+    method: JointSpaceMethod, model: Model, sizes: dict[str, Array], h: float | Array, count: int
 ) -> dict[str, Array]:
     """Bound the errors of accelerations (..., N) that relative rates pass on to the bodies beyond.
 
@@ -527,15 +518,15 @@ def _disturbed(model: Model, state: State, bound: RoundingBound) -> State:
     return complete_state(model, replace(state, omega=omega, xdot=xdot, v=v))
 
 
-def _separation(links: BodyStates, i: int, count: int, weights: dict[str, Array]) -> float:
-    """How far the motion nearby is from motion i of ``count``, in units of the bounds of a step."""
+def _separations(links: BodyStates, count: int, weights: dict[str, Array]) -> Array:
+    """How far the motions nearby are from the first ``count``, (count,) in units of the bounds of a step."""
     found = []
     for name, quantity in (("omega", "step_rate"), ("v", "step_velocity")):
         motions = getattr(links, name)
         with np.errstate(all="ignore"):
-            apart = np.asarray(motions[i] - motions[i + count], float)
+            apart = np.asarray(motions[:count] - motions[count:], float)
             found.append(np.linalg.norm(apart, axis=-1) / weights[quantity])
-    return float(np.max(found))
+    return np.asarray(np.max(found, axis=(0, 2)))
 
 
 def _reported(t: Trajectory, at: int | slice | NDArray[np.intp]) -> State:
