@@ -51,8 +51,9 @@ from plumbline.model.step_methods import JointSpaceMethod
 Array = NDArray[Any]  # in this module of extended precision, where nothing else is stated
 LongDouble: Any = np.longdouble
 Forces = Literal["all", "applied", "joint dampers"]
-# quaternions of the bodies and of the rods by joint, and those that turns of the charts lead to, as matrices
-_Attitudes = tuple[list[Array], dict[int, Array], dict[int, Array], dict[int, Array]]
+# quaternions of the bodies and of the rods by joint, those that turns of the charts lead to, as matrices, and
+# by chart the axes of its angles
+_Attitudes = tuple[list[Array], dict[int, Array], dict[int, Array], dict[int, Array], dict[int, list[Array]]]
 UNIT: Array = np.array([1, 0, 0, 0], LongDouble)
 PROXIMAL_DAMPING = LongDouble(1e-10)  # of rows scaled to a unit diagonal of J M⁻¹ Jᵀ
 PROXIMAL_STEPS = 10
@@ -456,22 +457,24 @@ class StepCharts:
 
     # -- bodies --------------------------------------------------------------------------------------
 
-    def quaternions(self, q: list[Array]) -> tuple[list[Array], dict[int, Array]]:
+    def quaternions(self, q: list[Array]) -> tuple[list[Array], dict[int, Array], dict[int, list[Array]]]:
         """Compute attitudes.
 
         Returns:
-            (..., 4) of the bodies, and of the rods by joint.
+            (..., 4) of the bodies, and of the rods by joint; by chart the axes (..., 3, 1) of its angles.
 
         """
-        bodies, rods = list[Array](), dict[int, Array]()
+        bodies, rods, axes = list[Array](), dict[int, Array](), dict[int, list[Array]]()
         for k, name in enumerate(self.model.kind):
             far, own = int(self.model.body[k, 0]), q[self.of_body[k]]
             here = bodies[far] if far >= 0 else UNIT
             if k in self.of_rod:
                 at = self.of_rod[k]
-                here = rods[k] = _turned_by(here, self.charts[at], q[at])
+                here, axes[at] = _turned_by(here, self.charts[at], q[at])
+                rods[k] = here
             if KINDS[name].has_attitude:
-                here = _turned_by(here, self.charts[self.of_body[k]], own)
+                at = self.of_body[k]
+                here, axes[at] = _turned_by(here, self.charts[at], own)
             else:
                 first, last = normalised(self.model.turn[k].astype(LongDouble))
                 here = quaternion_product(here, first)
@@ -481,7 +484,7 @@ class StepCharts:
                         here = quaternion_product(here, quaternion_exponential(half))
                 here = quaternion_product(here, quaternion_conjugate(last))
             bodies.append(np.broadcast_to(here, (*own.shape[:-1], 4)))
-        return bodies, rods
+        return bodies, rods, axes
 
     def tree(self, q: list[Array], v: Array) -> _MovingTree:
         """The mechanism at coordinates and velocities; asked for in turn for the same arrays, it is one."""
@@ -492,10 +495,10 @@ class StepCharts:
     def attitudes(self, q: list[Array]) -> _Attitudes:
         """The attitudes at coordinates; asked for in turn for the same list, they are found once."""
         if self._attitudes is None or self._attitudes[0] is not q:
-            p, rod_p = self.quaternions(q)
+            p, rod_p, axes = self.quaternions(q)
             turned = {k: rotation_matrix(one) for k, one in enumerate(p) if self.model.kinds[k].has_attitude}
             rod_turned = {k: rotation_matrix(one) for k, one in rod_p.items()}
-            self._attitudes = q, (p, rod_p, turned, rod_turned)
+            self._attitudes = q, (p, rod_p, turned, rod_turned, axes)
         return self._attitudes[1]
 
     def bodies(self, q: list[Array], v: Array) -> BodyStates:
@@ -548,7 +551,7 @@ class _MovingTree(Tree):
     def __init__(self, charts: StepCharts, q: list[Array], v: Array, model: Model | None = None) -> None:
         self.charts, self.q = charts, q
         self.rates = [v[..., own] for own in charts.own]
-        self.p, self.rod_p, self.turned, self.rod_turned = charts.attitudes(q)
+        self.p, self.rod_p, self.turned, self.rod_turned, self.turned_axes = charts.attitudes(q)
         self.rod_w: dict[int, Array] = {}
         self.rods: dict[int, tuple[Array, Array]] = {}  # u and u̇
         self.axes: dict[int, tuple[list[Array], Array]] = {}  # by chart: of its angles; α at q̈ = 0 of them
@@ -566,26 +569,22 @@ class _MovingTree(Tree):
 
     def attitude(self, k: int) -> tuple[Any, Any]:
         w = self.w[self.far[k]] if self.far[k] >= 0 else self.zero
-        before = self.p[self.far[k]] if self.far[k] >= 0 else UNIT
         if k in self.charts.of_rod:
-            w = self.rod_w[k] = self._spin_after(self.charts.of_rod[k], before, self.rod_turned[k], w)
-            before, u = self.rod_p[k], self.rod_turned[k][..., 2:]
+            w = self.rod_w[k] = self._spin_after(self.charts.of_rod[k], self.rod_turned[k], w)
+            u = self.rod_turned[k][..., 2:]
             self.rods[k] = u, self.num.cross(w, u)
         here = self.turned[k]
-        return here, self._spin_after(self.charts.of_body[k], before, here, w)
+        return here, self._spin_after(self.charts.of_body[k], here, w)
 
-    def _spin_after(self, at: int, before: Array, here: Array, w: Array) -> Array:
+    def _spin_after(self, at: int, here: Array, w: Array) -> Array:
         """The angular velocity after a turn, w before it."""
-        chart, rates = self.charts.charts[at], self.rates[at]
-        if not chart.axes:
+        turned, rates, bias = self.turned_axes[at], self.rates[at], self.zero
+        if not turned:
             return np.asarray(w + here @ rates[..., -3:, None])
-        turned, bias, count = list[Array](), self.zero, len(chart.axes)
-        for i, axis in enumerate(chart.axes):
-            angle, rate = self.q[at][..., i - count, None], rates[..., i - count, None, None]
-            turned.append(rotation_matrix(before) @ axis[..., None])
-            bias = bias + self.num.cross(w, turned[-1]) * rate
-            w = w + turned[-1] * rate
-            before = quaternion_product(before, quaternion_exponential(axis * angle / 2))
+        for i, axis in enumerate(turned):
+            rate = rates[..., i - len(turned), None, None]
+            bias = bias + self.num.cross(w, axis) * rate
+            w = w + axis * rate
         self.axes[at] = turned, bias
         return w
 
@@ -783,14 +782,16 @@ def _joined(parts: Sequence[Array]) -> Array:
     return np.concatenate([np.broadcast_to(x, (*lead, x.shape[-1])) for x in parts], -1)
 
 
-def _turned_by(before: Array, chart: _Chart, q: Array) -> Array:
-    """The attitude (..., 4) after a turn."""
+def _turned_by(before: Array, chart: _Chart, q: Array) -> tuple[Array, list[Array]]:
+    """The attitude (..., 4) after a turn, and the axes (..., 3, 1) of its angles."""
     if not chart.axes:
-        return quaternion_product(before, q[..., :4])
+        return quaternion_product(before, q[..., :4]), []
+    turned = list[Array]()
     for i, axis in enumerate(chart.axes):
+        turned.append(rotation_matrix(before) @ axis[..., None])
         half = axis * q[..., i - len(chart.axes), None] / 2
         before = quaternion_product(before, quaternion_exponential(half))
-    return quaternion_product(before, chart.rest)
+    return quaternion_product(before, chart.rest), turned
 
 
 def _twist_cross(a: Array, b: Array) -> Array:
