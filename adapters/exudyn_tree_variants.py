@@ -34,7 +34,7 @@ robots: Any = robotics
 # To make the shapes of links, which nothing here draws, takes longer than the tree. One shape replaces all.
 _SHAPE = graphics.Lines([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
 _UNDRAWN = robots.VRobotLink(showMBSjoint=False, showCOM=False, graphicsData=[_SHAPE])
-LONG_STEP = 1.0  # s: of one step of Euler's method, in which v₁ = v₀ + h a to rounding
+LONG_STEP = 2.0**20  # s: of one step of Euler's method, in which v₁ = v₀ + h a to the rounding of h a
 
 
 def pose_of(link: Any) -> Float[Array, "4 4"]:

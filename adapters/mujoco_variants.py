@@ -48,6 +48,7 @@ HINGES, SLIDES = (
 
 
 FEW_JOINTS = 4
+LONG_STEP = 2.0**20  # s: of one step of Euler's method, in which v₁ = v₀ + h a to the rounding of h a
 # Of what rows of constraints demand, what a solver may leave: 1e-15 was measured where PGS had converged, and
 # 1e-10 to 1e-7 where it had not.
 MAX_LEFT = 1e-12
@@ -216,24 +217,24 @@ def _forward_from_reference(m: Any, d: Any) -> None:
 
 
 @contextmanager
-def _one_second(m: Any) -> Iterator[None]:
-    """Set a step of 1 s, semi-implicit with explicit dampers, by which velocities change by accelerations."""
+def _long_step(m: Any) -> Iterator[None]:
+    """Set a step of `LONG_STEP`, semi-implicit with explicit dampers, by which velocities change."""
     flags = m.opt.disableflags
-    m.opt.integrator, m.opt.timestep = mujoco.mjtIntegrator.mjINT_EULER, 1.0
+    m.opt.integrator, m.opt.timestep = mujoco.mjtIntegrator.mjINT_EULER, LONG_STEP
     m.opt.disableflags = flags | int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
     yield
     m.opt.disableflags = flags
 
 
 def _forward_by_step(*functions: str) -> Callable[[Any, Any], None]:
-    """Take the acceleration from the velocity after a step of 1 s."""
+    """Take the acceleration from the velocity after a step."""
 
     def forward(m: Any, d: Any) -> None:
         q, v, t = d.qpos.copy(), d.qvel.copy(), d.time
-        with _one_second(m):
+        with _long_step(m):
             for function in functions:
                 getattr(mujoco, function)(m, d)
-        a = d.qvel - v
+        a = (d.qvel - v) / LONG_STEP
         d.qpos[:], d.qvel[:], d.time = q, v, t
         mujoco.mj_forward(m, d)
         d.qacc[:] = a
@@ -265,11 +266,11 @@ def _forward_by_rollout(m: Any, d: Any) -> None:
     loads = int(loads) | int(mujoco.mjtState.mjSTATE_XFRC_APPLIED)
     state, control = _state_of(m, d, full), _state_of(m, d, loads)
     other = mujoco.MjData(m)
-    with _one_second(m):
+    with _long_step(m):
         after, _ = mujoco.rollout.rollout(m, other, state[None], control[None, None], control_spec=loads)
         mujoco.mj_setState(m, other, np.ravel(after), full)
     mujoco.mj_forward(m, d)
-    d.qacc[:] = other.qvel - d.qvel
+    d.qacc[:] = (other.qvel - d.qvel) / LONG_STEP
 
 
 def _forward_with_checks(m: Any, d: Any) -> None:

@@ -198,6 +198,20 @@ def test_exudyns_ways_for_trees_agree_and_its_tree_of_vectors_gives_slides_the_l
     assert len(names) > 15 and "kinematicTree.KinematicTree33" in names
 
 
+@pytest.mark.parametrize("engine", ["mujoco", "exudyn-tree"])
+def test_slow_motions_without_loads_agree_by_steps(engine):
+    model = random_tree(np.random.default_rng(6), 3, ("hinge",), loads=False)
+    model = replace(model, gravity=np.zeros(3))
+    slow = [
+        replace(s, v=1e-6 * s.v, omega=1e-6 * s.omega, xdot=1e-6 * s.xdot) for s in random_states(model, 3, 6)
+    ]
+    states = [complete_state(model, state) for state in slow]
+    variants = evaluate_variants(load_adapter(engine), model, states)
+    assert any({"SolveDynamic", "mj_step"} & set(names) for names in variants["option"])
+    rows = rows_of_variants(state_truth(model, states), {"option": variants["option"]})
+    assert {row.verdict for row in rows} == {Verdict.AGREES}, [row.reason for row in rows]
+
+
 def test_variants_of_flat_bodies_and_of_frames_turned_by_quarters_agree():
     model, _ = mechanism(("hinge",))
     about_x, about_y = np.array([0.8, 0.6, 0.0, 0.0]), np.array([1.0, 0.0, 1.0, 0.0]) / np.sqrt(2)
