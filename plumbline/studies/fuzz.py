@@ -174,16 +174,19 @@ def _shrink(
 
     Args:
         compare: adds what engines return on scenarios to a result.
-        smallest: gets the smallest scenario so far, by the finding's name.
+        smallest: gets the smallest scenario so far, by the finding's name; it has that name, and the seed of
+            the states that showed the finding.
 
     """
-    smallest[finding.name] = scenario
-    tried = 0
+    own, tried = finding.name.lstrip("."), 0  # no scenario has a name with a dot at its start
+    about = {"name": own, "title": f"Made smaller from {scenario.name}", "seed": scenario.seed}
+    file = f"{own}.yaml"
+    smallest[finding.name] = start = scenario_from_dict(scenario.document | about, file)
 
     def shows(document: Document) -> bool:
         nonlocal tried
         try:
-            candidate = scenario_from_dict(document, f"{scenario.name}.yaml")
+            candidate = scenario_from_dict(document, file)
         except PlumblineError:
             return False  # no mechanism, or loops that do not close
         tried += 1
@@ -194,7 +197,7 @@ def _shrink(
         return is_shown
 
     passes = [_fewer_bodies, _smaller, _smaller]
-    shrink(scenario.document, passes, shows, lambda: tried >= MAX_SHRINKINGS)
+    shrink(start.document, passes, shows, lambda: tried >= MAX_SHRINKINGS)
 
 
 def _fewer_bodies(document: Document) -> Iterator[Document]:
@@ -299,7 +302,7 @@ def write_scenario(scenario: Scenario, path: Path) -> None:
 def write_findings(result: FuzzResult, folder: Path, command: str) -> Iterable[Path]:
     """Write the results as those of a run, and a scenario file of each new finding."""
     save(result.as_run(), folder, command)
-    for name, scenario in result.smallest.items():
-        path = folder / f"{name[:120]}.yaml"
+    for scenario in result.smallest.values():
+        path = folder / f"{scenario.name}.yaml"
         write_scenario(scenario, path)
         yield path

@@ -2,11 +2,25 @@
 
 import json
 
+import pytest
+
 from plumbline.execution.exit_codes import ExitCode
+from plumbline.judging.findings import Finding
+from plumbline.judging.rows import Row, Verdict
 from plumbline.processes.exceptions import PlumblineError
 from plumbline.scenario.generator import random_mechanism
 from plumbline.scenario.loader import load_scenarios, scenario_from_dict
-from plumbline.studies.fuzz import BATCH, Corpus, _fewer_bodies, _smaller, scenario_of
+from plumbline.storage.results_store import read_results
+from plumbline.studies.fuzz import (
+    BATCH,
+    Corpus,
+    FuzzResult,
+    _fewer_bodies,
+    _shrink,
+    _smaller,
+    scenario_of,
+    write_findings,
+)
 from tests.helpers.commands import invoke
 
 PLANTED = """
@@ -71,6 +85,24 @@ def test_few_bodies_are_tried_first_from_either_end():
     assert [model.mass[-1] for model in models[1::2]] == [whole.mass[-1]] * (len(models) // 2)
 
 
+@pytest.mark.parametrize("name", ["planted-wrong-energies", "..-planted.py-wrong-energies"])
+def test_what_is_made_smaller_has_the_name_of_its_finding_and_the_states_that_showed_it(name, tmp_path):
+    start, smallest, compared = scenario_of(3, 5), {}, []
+
+    def compare(scenarios, result, engines):
+        """Nothing shows the finding."""
+        compared.extend(scenarios)
+
+    row = Row("s", "f", "planted", "0", "state", "-", "q", "J", 1.0, 0.1, Verdict.DISAGREES, "wrong")
+    finding = Finding(name, "planted", Verdict.DISAGREES, "wrong", "wrong", None, (row,))
+    _shrink(compare, start, finding, smallest)
+    assert {(s.name, s.seed) for s in (*compared, smallest[name])} == {(name.lstrip("."), start.seed)}
+    result = FuzzResult(3, smallest=smallest)
+    (path,) = write_findings(result, tmp_path, "fuzz")
+    (stored,) = load_scenarios([path])
+    assert stored.seed == start.seed and stored.model.n == start.model.n
+
+
 def test_a_corpus_keeps_new_combinations_up_to_its_size_and_where_a_search_ended(tmp_path):
     corpus = Corpus(tmp_path / "corpus", 2)
     kept = [corpus.add(scenario_of(7, k)) for k in (1, 1, 3, 5)]
@@ -93,6 +125,7 @@ def test_a_batch_that_is_not_finished_in_time_does_not_count_and_explain_reads_t
     assert (explained.exit_code, explained.stderr) == (0, "no finding\n"), explained.output
 
 
+@pytest.mark.timeout(1800)
 def test_a_planted_defect_is_found_named_and_shown_by_the_smallest_mechanism(tmp_path):
     """Five of them, each active under a rare condition."""
     planted, out = tmp_path / "planted.py", tmp_path / "out"
@@ -103,5 +136,9 @@ def test_a_planted_defect_is_found_named_and_shown_by_the_smallest_mechanism(tmp
     assert {found["name"] for found in json.loads(done.stdout)} == FIVE
     smallest = load_scenarios([str(path) for path in out.glob("*.yaml")])
     assert len(smallest) == 5 and all(scenario.model.n <= 3 for scenario in smallest)
+    again = invoke("run", *(str(path) for path in out.glob("*.yaml")), *words[:2], "--engine", "planted",
+                   "--level", "state", "--out", str(tmp_path / "again"))  # fmt: skip
+    assert again.exit_code == ExitCode.DISAGREEMENT, again.output
+    assert {found["name"] for found in read_results(tmp_path / "again")["findings"]} == FIVE
     explained = invoke("explain", "--results", str(out))
     assert {line.split(":")[0] for line in explained.stdout.splitlines()} == FIVE
