@@ -147,12 +147,14 @@ def _largest_difference(
         name = field.name.replace("_", " ")
         if a is None or b is None:
             return np.inf, f"the {name}, which one of two answers lacks,"
-        x, y = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
-        if x.shape == y.shape and x.tobytes() == y.tobytes():
-            continue
-        size = _relative_size(x, y)
-        if not worst[1] or size > worst[0]:
-            worst = size, f"the {name}"
+        if isinstance(b, Trajectory):
+            found = _largest_difference(a, b)
+        else:
+            x, y = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
+            is_same = x.shape == y.shape and x.tobytes() == y.tobytes()
+            found = (0.0, "") if is_same else (_relative_size(x, y), f"the {name}")
+        if found[1] and (not worst[1] or found[0] > worst[0]):
+            worst = found
     return worst
 
 

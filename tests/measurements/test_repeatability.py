@@ -13,6 +13,8 @@ from plumbline.judging.relation_rows import judge_relations
 from plumbline.judging.rows import RowContext
 from plumbline.measurements.repeatability import check_repeatability
 from plumbline.model.datatypes import EngineFailure, Unsupported
+from plumbline.model.sampling import compared_states
+from plumbline.scenario.loader import load_scenarios
 from tests.helpers import pendulums
 from tests.helpers.pendulums import JOINT_PATTERNS
 from tests.helpers.relation_checks import check_relations
@@ -40,6 +42,16 @@ def test_every_engine_gives_the_same_bits_again(engine):
     assert {row.verdict for row in found.values()} == {"agrees"}, [row.reason for row in found.values()]
     assert all(row.value == row.tolerance == 0 for row in found.values())
     assert found["-"].reason == "repeatability of Engine: 4 states gave the same bits each time"
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "pinocchio", "exudyn", "reference"])
+def test_every_engine_gives_the_same_bits_of_a_loop_again(engine):
+    """MuJoCo's are limits of softer runs, which are compared as well."""
+    (s,) = load_scenarios(["slider-crank"])
+    adapter = load_adapter(engine)
+    found = rows(adapter, s.model, compared_states(s.model, s.state, s.seed, 2))
+    assert set(found) == {"-", *(one.name for one in adapter.integrators if one.has_motions)}
+    assert {row.verdict for row in found.values()} == {"agrees"}, [row.reason for row in found.values()]
 
 
 def planted(change=None, run=None, engine="mujoco"):
@@ -121,7 +133,14 @@ def noise(_, arguments, done):
     return replace(done, r=done.r * (1 + ULP * np.random.default_rng().random(done.r.shape)))
 
 
-@pytest.mark.parametrize(("run", "wrong"), [(warm_start, {"Euler", "RK4"}), (noise, {"RK4"})])
+def noise_of_the_softer_run(memory, arguments, done):
+    return replace(done, softer=noise(memory, arguments, done))
+
+
+@pytest.mark.parametrize(
+    ("run", "wrong"),
+    [(warm_start, {"Euler", "RK4"}), (noise, {"RK4"}), (noise_of_the_softer_run, {"RK4"})],
+)
 def test_runs_that_depend_on_the_run_before_or_on_chance_disagree(run, wrong):
     found = rows(planted(run=run))
     assert {name for name, row in found.items() if row.verdict == "disagrees"} == wrong
