@@ -131,7 +131,7 @@ class _DriftJudge:
         if self.integrator.kind == "tolerance":
             cause = f"the error that the tolerance {self.finest.resolution:g} accepts in every step"
         elif drift.max_drift > floor - drift.uncertainty:
-            cause = f"rounding, or by {UNCERTAIN}, ± {drift.uncertainty:.2g}"
+            cause = f"rounding, or the uncertainty of {UNCERTAIN}, ± {drift.uncertainty:.2g}"
         steps = f"{self.finest.steps} steps in {self.finest.reached_time:g} s"
         derivation = f"{steps}, a scale of {with_unit(drift.scale, self.unit, 3)}"
         if floor <= DETECTABLE_PARAMETER_ERROR * drift.scale:

@@ -99,8 +99,8 @@ def _single_step_rows(
     method, verdict, reason, gap, place = integrator.method, Verdict.UNSUPPORTED, "", "", ""
     attempts = [attempt for attempt in answer.attempts if attempt.run is not None]
     runs = [(attempt.state, attempt.step, attempt.run) for attempt in attempts if attempt.run is not None]
-    is_short = isinstance(method, ConstrainedMethod)
-    failed = [one for one in answer.attempts if one.failure and (is_short or one.run is None)]
+    is_constrained = isinstance(method, ConstrainedMethod)  # where fewer steps than asked for have failed
+    failed = [one for one in answer.attempts if one.failure and (is_constrained or one.run is None)]
     if failed:
         verdict, reason, place = Verdict.FAILED, failed[0].failure, failed[0].place
     elif not runs:

@@ -163,7 +163,8 @@ class Trajectory:
     steps: int  # steps the integrator took
     # rad or m: joint coordinates at t[0], angles unwrapped; None: angles are principal values there
     initial_x: Float[Array, "bodies coordinates"] | None = None
-    # where the run is the limit of softer ones, that by an order less: their difference is the uncertainty
+    # of a run that is extrapolated from softer ones, the same by an order less: their difference is how
+    # uncertain it is
     softer: Trajectory | None = None
     # the engine's own configuration and velocity, joint by joint as `JointSpaceMethod` orders them
     coordinates: Float[Array, "samples entries"] | None = None
