@@ -21,6 +21,7 @@ body on its last, and outputs of the body are read at the point on its first hal
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import exudyn
@@ -28,6 +29,7 @@ import numpy as np
 import scipy.linalg
 
 from adapters.exudyn_common import (
+    MAX_NEWTON_TOLERANCE,
     NEWTON_TOLERANCE,
     ExudynAdapter,
     Output,
@@ -52,6 +54,7 @@ from plumbline.engines.variants import names_of_column, names_of_steps
 from plumbline.model.datatypes import (
     Array,
     Call,
+    EngineFailure,
     Float,
     Integrator,
     JointKind,
@@ -375,10 +378,23 @@ class Exudyn(ExudynAdapter):
     def _simulate(
         self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
     ) -> Trajectory:
+        settings = self._settings(integrator)
+        newton = settings.timeIntegration.newton
         with silence_engine():
-            chain = _chain_that_moves(model, state)
-            samples, clock = self._run_samples(chain, times, self._settings(integrator), resolution)
-        return _trajectory(model, state, clock, samples, resolution)
+            while True:
+                chain = _chain_that_moves(model, state)
+                try:
+                    samples, clock = self._run_samples(chain, times, settings, resolution)
+                    break
+                except EngineFailure:
+                    # A body that is kilometres away is rounded more coarsely than Newton's iteration may end.
+                    far = float(np.max(np.abs(chain.mbs.systemData.GetODE2Coordinates())))
+                    is_rounding = np.finfo(float).eps * far > 0.1 * newton.relativeTolerance
+                    if not is_rounding or newton.relativeTolerance > MAX_NEWTON_TOLERANCE / 2:
+                        raise
+                    newton.absoluteTolerance = newton.relativeTolerance = 10 * newton.relativeTolerance
+        run = _trajectory(model, state, clock, samples, resolution)
+        return replace(run, solver_rtol=newton.relativeTolerance)
 
     def _step(self, model: Model, state: State, times: Array, integrator: Integrator, step: float) -> StepRun:
         settings = self._settings(integrator)

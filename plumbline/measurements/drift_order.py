@@ -45,6 +45,7 @@ class LongRun:
     invariant_scales: dict[float, dict[str, float]]  # by window and invariant
     windows: dict[str, dict[float, DriftWindow]]  # by invariant and window
     cpu_time: float  # s, failed runs included
+    solver_rtol: float = 0.0  # see `Trajectory`
 
 
 @dataclass(frozen=True)
@@ -135,7 +136,8 @@ class InvariantDrift:
         """Drift in a part of the window by rounding and by the steps' solver, and its uncertainty."""
         steps = max(self.steps / parts, 64.0)
         # The solver's errors are independent from step to step: they add up like a random walk.
-        relative = steps * ROUNDING_PER_STEP + np.sqrt(steps) * self.integrator.solver_rtol
+        solved = max(self.integrator.solver_rtol, self.finest.solver_rtol)
+        relative = steps * ROUNDING_PER_STEP + np.sqrt(steps) * solved
         return float(relative * self.scale) + self.uncertainty
 
     @property

@@ -169,6 +169,8 @@ class Trajectory:
     # the engine's own configuration and velocity, joint by joint as `JointSpaceMethod` orders them
     coordinates: Float[Array, "samples entries"] | None = None
     velocities: Float[Array, "samples rates"] | None = None
+    # to which its implicit steps were solved, where that is more than the integrator's
+    solver_rtol: float = 0.0
 
     def at(self, samples: Any) -> Trajectory:
         """Take some samples of the motion; the engine's own coordinates stay as they are."""

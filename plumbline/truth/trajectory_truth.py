@@ -408,6 +408,7 @@ def _simulate_batch(motion: AccurateMotion, cases: Sequence[tuple[Model, State]]
 REGULARITY_RTOL = 1e-9
 STRIDE_PARTS = 4  # of a stride, at which singular values are taken
 SHORTEST_STRIDE = 1e-3  # of the time between samples
+STEPS_PER_STRIDE = 64  # of the shortest stride; more than those whose length depends on the first guess
 
 
 class RegularMotion(NamedTuple):
@@ -464,6 +465,41 @@ def regular_motion(model: Model, state: State, times: Array) -> RegularMotion:
         else:
             stride /= 2
     return RegularMotion(t, value < MIN_MOTION_SINGULAR_VALUE, value)
+
+
+def resolved_motion_end(model: Model, state: State, last: float, step: float) -> float:
+    """Follow a motion until step control needs more steps than a fixed step would take.
+
+    The steps of collocation are ten and more times as long as those of methods of order 4 that are as
+    accurate; where it takes more, the motion is too fast for the others, as when a light body is thrown back
+    within microseconds.
+
+    Args:
+        model: without loops.
+        state: initial state.
+        last: how long the motion is followed at most [s].
+        step: the fixed step [s].
+
+    Returns:
+        The time [s] from which on the next `STEPS_PER_STRIDE` steps do not suffice, or ``last``.
+
+    """
+    t, stride = 0.0, STEPS_PER_STRIDE * step
+    system, here = side_by_side([(model, state)])
+    while t < last * (1 - 1e-12):
+        end = min(t + stride, last)
+        try:
+            run = integrate_collocation(
+                system, *here, np.array([t, end]), REGULARITY_RTOL, max_steps=stride / step
+            )
+        except ArithmeticError:
+            if stride <= STEPS_PER_STRIDE * step:
+                return t
+            stride /= 2
+            continue
+        t, stride, system = end, 2 * stride, eliminated_system([model], run.x[-1])
+        here = run.r[-1], run.p[-1], run.v[-1], run.pdot[-1]
+    return last
 
 
 def first_doubt(model: Model, state: State, run: Trajectory) -> float | None:
