@@ -271,10 +271,10 @@ def _window_ends(seconds: float, plan: LongRunPlan) -> list[float]:
 
 
 def _sample_spacing(integrator: Integrator, model: Model, sample_interval: float, plan: LongRunPlan) -> float:
-    """Time between samples [s]: longer with step control, unless the work's quadrature needs them all."""
-    if integrator.kind == "step":
-        return max(sample_interval, plan.resolutions[0])  # every run samples at the ends of steps
+    """Time between samples [s]: the quadrature of work needs them close, others may be as long as steps."""
     has_power = model.is_dissipative or np.any(model.moment) or np.any(model.effort)
+    if integrator.kind == "step":  # every run samples at the ends of steps
+        return plan.resolutions[0] if has_power else max(sample_interval, plan.resolutions[0])
     if not has_power:
         sample_interval *= max(1, round(ADAPTIVE_SAMPLE_SPACING / sample_interval))
     return sample_interval
