@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cached_property
@@ -15,7 +15,7 @@ from plumbline.engines.registry import REFERENCE_ENGINES
 from plumbline.judging.known_issues import KnownIssue, project_known_issues
 from plumbline.judging.rows import Row
 from plumbline.processes.worker_pool import Limits, ResultCache
-from plumbline.scenario.loader import Scenario
+from plumbline.scenario.loader import FAMILIES, Scenario
 
 RANDOM_STATES = 50  # random states per scenario, besides the initial one
 STATES_PER_RANDOM_SCENARIO = 9  # the same for a random scenario, or one that asks for states only
@@ -69,23 +69,36 @@ class Plan:
     # decide, and on one scenario of each family.
     has_all_studies: bool = True
 
-    @cached_property
-    def studied(self) -> dict[str, str]:
-        """By family the scenario whose refinement studies always run.
+    def studied(self, scenario: Scenario) -> str:
+        """Return the scenario of its family whose refinement studies always run.
 
-        Of the scenarios of this run with motions, the one with the fewest bodies, without elements and with
-        inertia, that has the most numbers that are not zero: the plainest that every engine can move, in the
-        most general motion.
+        In the catalogue it is the same in every run, so that a scenario has the same rows in each; of others
+        it is the plainest of the run.
         """
-        found: dict[str, Scenario] = {}
-        for s in sorted(self.scenarios, key=_plainness):
-            if s.level == "all":
-                found.setdefault(s.family, s)
-        return {family: s.name for family, s in found.items()}
+        if scenario.is_in_catalogue:
+            return FAMILIES[scenario.family]
+        return self._studied_others.get(scenario.family, scenario.name)
+
+    @cached_property
+    def _studied_others(self) -> dict[str, str]:
+        return plainest([s for s in self.scenarios if not s.is_in_catalogue])
 
     def has_other_steps(self, scenario: Scenario) -> bool:
-        """Whether steps of integrators without motions are compared: of all scenarios, or of the plainest."""
-        return self.has_all_studies or scenario.name in self.studied.values()
+        """Whether steps of integrators without motions are compared: of all scenarios, or of the studied."""
+        return self.has_all_studies or self.studied(scenario) == scenario.name
+
+
+def plainest(scenarios: Iterable[Scenario]) -> dict[str, str]:
+    """Return by family the scenario that every engine can move, in the most general motion.
+
+    Of those with motions it is the one with the fewest bodies, without elements and with inertia, that has
+    the most numbers that are not zero.
+    """
+    found: dict[str, Scenario] = {}
+    for s in sorted(scenarios, key=_plainness):
+        if s.level == "all":
+            found.setdefault(s.family, s)
+    return {family: s.name for family, s in found.items()}
 
 
 def _plainness(scenario: Scenario) -> tuple[bool, int, int, str]:

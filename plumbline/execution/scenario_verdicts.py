@@ -317,7 +317,7 @@ class ScenarioRun:
         """The steps that decide whether a refinement study runs; None where it always does."""
         if key.kind != TaskKind.TRAJECTORY or self._plan.has_all_studies:
             return None
-        steps, is_studied = replace(key, kind=TaskKind.STEP), self._studied in (None, self.scenario.name)
+        steps, is_studied = replace(key, kind=TaskKind.STEP), self._studied == self.scenario.name
         return steps if self._sharper(key) and not is_studied and steps in self._keys else None
 
     def _sharper(self, key: TaskKey) -> str | None:
@@ -328,9 +328,9 @@ class ScenarioRun:
         return first.name if is_low and first.name != own.name else None
 
     @property
-    def _studied(self) -> str | None:
+    def _studied(self) -> str:
         """The scenario of this family whose studies always run."""
-        return self._plan.studied.get(self.scenario.family)
+        return self._plan.studied(self.scenario)
 
     def _is_due(self, key: TaskKey) -> bool:
         """Whether a cell need not wait for steps, and is not left to the night."""

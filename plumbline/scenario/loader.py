@@ -59,7 +59,16 @@ CATALOGUE_FOLDER = ROOT / "scenarios"
 LOOP_TOLERANCE = 1e-9  # of a loop's gap at t = 0 [m, rad], and of its rate over the largest speed
 MAX_MAGNITUDE = 1e30  # beyond it squares and products leave the range where engines can compute
 MODEL_FILE_SUFFIXES = (".urdf", ".xml", ".mjcf")  # of robots, which other modules read
-FAMILIES = ("single", "double", "chain", "joint", "tree", "loop", "classic")
+# Of the catalogue; beside each its plainest scenario, whose refinement studies all run by day.
+FAMILIES = {
+    "single": "drag-rod",
+    "double": "double-loaded-rods",
+    "chain": "chain-3-rods",
+    "joint": "long-hinge",
+    "tree": "loaded-tree",
+    "loop": "four-bar",
+    "classic": "a01-simple-pendulum",
+}
 
 
 @dataclass(frozen=True, eq=False)

@@ -535,6 +535,21 @@ def test_detects_in_a_trajectory(engine, integrator, tampering, message):
         worker.call_adapter(engine, "simulate", *args, overrides={"_simulate": tampering})
 
 
+def comes_to_rest(real, *args):
+    """As dampers leave a motion: the last steps change no digit."""
+    run = real(*args)
+    rows = {k: repeat_sample(getattr(run, k)) for k in ("r", "p", "v", "pdot")}
+    for rate in (rows["v"], rows["pdot"]):
+        rate[-3:] = 1e-17
+    return replace(run, **rows)
+
+
+@every_integrator
+def test_a_motion_may_come_to_rest(engine, integrator):
+    args = run_arguments(engine, integrator)
+    worker.call_adapter(engine, "simulate", *args, overrides={"_simulate": comes_to_rest})
+
+
 def one_step_more(real, *args):
     run = real(*args)
     return replace(run, steps=run.steps + 1)

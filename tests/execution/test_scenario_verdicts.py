@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from plumbline.execution.plan import Plan, TaskKind
+from plumbline.execution.plan import Plan, TaskKind, plainest
 from plumbline.execution.runner import describe_engines, run_plan
 from plumbline.execution.scenario_verdicts import ScenarioRun
 from plumbline.processes.worker_pool import Limits, Outcome, WorkerPool, run_task
@@ -209,17 +209,14 @@ def test_steps_are_not_searched_where_the_accelerations_they_are_made_of_disagre
     assert ["step" if x.key.integrator else "state" for x in following] == searched
 
 
-def two_of_a_family(has_all_studies, name="double-tumbling-rods", plainer="double-loaded-balls"):
-    """A scenario whose family has a plainer one in the same run."""
-    chosen, other = loader.load_scenarios([name, plainer])
-    plan = Plan([chosen, other], ["mujoco"], random_state_count=1, has_all_studies=has_all_studies)
-    return plan, chosen
+def plan_of(name, has_all_studies=False):
+    (chosen,) = loader.load_scenarios([name])
+    return Plan([chosen], ["mujoco"], random_state_count=1, has_all_studies=has_all_studies), chosen
 
 
 @pytest.mark.parametrize("is_truth_first", [True, False])
 def test_a_study_of_low_order_is_left_to_the_night_where_steps_decide(engines, is_truth_first):
-    plan, chosen = two_of_a_family(has_all_studies=False)
-    assert plan.studied == {"double": "double-loaded-balls"}
+    plan, chosen = plan_of("double-tumbling-rods")
     bench = ScenarioRun(plan, chosen, {"mujoco": engines["mujoco"]})
     truth = truth_of(bench, TaskKind.MOTION_TRUTH)
     euler, rk4 = (outcome_of(steps_of(bench, "mujoco", name)) for name in ("Euler", "RK4"))
@@ -229,11 +226,11 @@ def test_a_study_of_low_order_is_left_to_the_night_where_steps_decide(engines, i
     assert studies == ["RK4"] and bench.left_to_the_night == 1
     (row,) = [r for r in bench.findings().rows if (r.level, r.integrator) == ("trajectory", "Euler")]
     assert row.verdict == "information" and "the study of RK4 runs" in row.reason
-    assert "of this family all run on double-loaded-balls" in row.reason
+    assert "of this family all run on double-loaded-rods" in row.reason
 
 
 def test_a_study_of_low_order_runs_where_steps_do_not_decide(engines):
-    plan, chosen = two_of_a_family(has_all_studies=False)
+    plan, chosen = plan_of("double-tumbling-rods")
     bench = ScenarioRun(plan, chosen, {"mujoco": engines["mujoco"]})
     bench.on_outcome(outcome_of(truth_of(bench, TaskKind.MOTION_TRUTH)))
     lost = Outcome(steps_of(bench, "mujoco", "Euler").key, failure="crashed")
@@ -242,26 +239,30 @@ def test_a_study_of_low_order_runs_where_steps_do_not_decide(engines):
 
 
 def test_every_study_runs_at_night_and_on_the_plainest_scenario(engines):
-    for has_all_studies, name in ((True, "double-tumbling-rods"), (False, "double-loaded-balls")):
-        plan, _ = two_of_a_family(has_all_studies)
-        (chosen,) = [s for s in plan.scenarios if s.name == name]
+    for has_all_studies, name in ((True, "double-tumbling-rods"), (False, "double-loaded-rods")):
+        plan, chosen = plan_of(name, has_all_studies)
         bench = ScenarioRun(plan, chosen, {"mujoco": engines["mujoco"]})
         truth = outcome_of(truth_of(bench, TaskKind.MOTION_TRUTH))
         following = [x.key.integrator for x in bench.on_outcome(truth)]
         assert following == ["Euler", "implicit", "implicitfast", "RK4"]
 
 
+def test_of_each_family_the_plainest_scenario_is_studied_and_of_others_the_plainest_of_the_run(tmp_path):
+    every = loader.load_scenarios(list(loader.catalogue()))
+    assert plainest(every) == loader.FAMILIES
+    names = ["double-tumbling-rods", "double-loaded-balls"]
+    own = [replace(s, path=tmp_path / s.path.name) for s in loader.load_scenarios(names)]
+    plan = Plan([*own, every[0]], ["mujoco"])
+    assert [plan.studied(s) for s in own] == ["double-loaded-balls"] * 2
+    assert plan.studied(every[0]) == loader.FAMILIES[every[0].family]
+
+
 @pytest.mark.parametrize(
-    ("name", "plainer", "left"),
-    [
-        ("double-tumbling-rods", "double-loaded-balls", 1),
-        ("double-hinge-skew", "hinge-pendulum", 1),
-        ("spring-pendulum", "hinge-pendulum", 0),
-    ],
+    ("name", "left"), [("double-tumbling-rods", 1), ("double-hinge-skew", 1), ("spring-pendulum", 0)]
 )
-def test_of_methods_of_one_order_the_first_ones_study_runs(name, plainer, left):
+def test_of_methods_of_one_order_the_first_ones_study_runs(name, left):
     """Of trees the equations of Exudyn's steps are compared, with springs they are not."""
-    plan, chosen = two_of_a_family(False, name, plainer)
+    plan, chosen = plan_of(name)
     with WorkerPool(1) as workers:
         bench = ScenarioRun(plan, chosen, describe_engines(workers, ["exudyn"]))
     truth = outcome_of(truth_of(bench, TaskKind.MOTION_TRUTH))

@@ -1,5 +1,7 @@
 """Long runs: what is conserved is judged by its fall from step to step, and planted leaks are seen."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -169,6 +171,52 @@ def test_runs_end_before_a_singular_pose():
     assert "from t = 0.7129 s on" in singular.reason and "compared up to t = 0.6875 s" in singular.reason
     assert {row.verdict for row in rows.values()} == {"agrees"}
     assert {row.compared_until for row in rows.values()} == {0.6875}
+
+
+def test_shorter_steps_show_whether_the_steps_were_why_a_run_stopped():
+    """Newton's iteration in Exudyn converges to about 21 s with steps of 2⁻⁸ s, to 44 s with half of that."""
+    s, method = load("furuta"), load_adapter("exudyn").integrator("generalized-alpha")
+    plan = LongRunPlan(24.0, (2.0**-7, 2.0**-8), 24.0)
+    study = run_long_run_study("exudyn", method.name, s.model, s.state, s.sample_interval, plan)
+    assert [run.failure is None for run in study.runs] == [False, False, True]
+    assert study.runs[-1].reached_time == 24.0 and study.plan == plan
+
+
+def test_runs_that_stop_at_any_step_have_failed(monkeypatch):
+    class Stops(type(load_adapter("mujoco"))):
+        def _simulate(self, model, state, times, integrator, resolution):
+            if times[-1] > 1.0:
+                raise RuntimeError("it stops")
+            return super()._simulate(model, state, times, integrator, resolution)
+
+    monkeypatch.setattr(long_run_study, "load_adapter", lambda _: Stops())
+    rows = run_long("tumbling-ball", Stops(), "RK4", 8.0)
+    assert [row.verdict for row in rows.values()] == ["failed"] and "it stops" in rows["all_long"].reason
+
+
+def test_long_runs_end_where_the_motion_is_too_fast_for_every_step():
+    """The bob falls free for 0.4515 s; then the cart, a millionth of its mass, is thrown aside."""
+    rows = run_long("light-cart-pole", "pinocchio", "rkmk4", 2.0)
+    assert {row.verdict for row in rows.values()} == {"agrees"}
+    assert {row.compared_until for row in rows.values()} == {0.375}
+    for row in rows.values():
+        assert row.derivation.endswith("resolve 0.375 s of 2 s, then the motion is too fast")
+
+
+def test_a_body_that_is_kilometres_away_is_solved_as_its_rounding_allows(tmp_path):
+    text = load("slider-on-arm").path.read_text()
+    file = tmp_path / "far.yaml"
+    file.write_text(text.replace("rates: [1.4]", "rates: [1000.0]"))
+    s, method = load(file), load_adapter("exudyn").integrator("generalized-alpha")
+    plan = LongRunPlan(16.0, (2.0**-9,), 16.0)
+    (run,) = run_long_run_study("exudyn", method.name, s.model, s.state, s.sample_interval, plan).runs
+    assert run.failure is None and run.solver_rtol == 10 * method.solver_rtol
+    quantity, end = "momentum_drift", 16.0
+    floors = [
+        InvariantDrift([one], method, quantity, end).rounding_floor()
+        for one in (run, replace(run, solver_rtol=0.0))
+    ]
+    assert floors[0] > 2 * floors[1]
 
 
 # --- lengths, and the statistic -----------------------------------------------------------------
