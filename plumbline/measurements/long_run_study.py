@@ -34,6 +34,7 @@ MAX_BODY_SECONDS = 100.0
 WINDOW_ENDS = (0.1, 1.0, 10.0, 100.0, 1000.0)
 MAX_HALVINGS = 2  # of the finest step, where a run stops although its energy is in range
 MIN_WINDOW = 1.0  # of `time_unit`: shortest run that is tried, decade by decade, where longer ones fail
+MAX_SPACING_OF_WORK = 0.03125  # s between samples where work is integrated: its rule has degree 15
 ADAPTIVE_SAMPLE_SPACING = 0.125  # s between samples of a method with step control, which ends a step at each
 
 
@@ -271,13 +272,15 @@ def _window_ends(seconds: float, plan: LongRunPlan) -> list[float]:
 
 
 def _sample_spacing(integrator: Integrator, model: Model, sample_interval: float, plan: LongRunPlan) -> float:
-    """Time between samples [s]: the quadrature of work needs them close, others may be as long as steps."""
+    """Time between samples [s]: longer with step control, unless the work's quadrature needs them close."""
     has_power = model.is_dissipative or np.any(model.moment) or np.any(model.effort)
-    if integrator.kind == "step":  # every run samples at the ends of steps
-        return plan.resolutions[0] if has_power else max(sample_interval, plan.resolutions[0])
-    if not has_power:
+    if has_power:
+        sample_interval = min(sample_interval, MAX_SPACING_OF_WORK)
+    elif integrator.kind == "tolerance":
         sample_interval *= max(1, round(ADAPTIVE_SAMPLE_SPACING / sample_interval))
-    return sample_interval
+    if integrator.kind == "tolerance":
+        return sample_interval
+    return max(sample_interval, plan.resolutions[0])  # every run samples at the ends of steps
 
 
 def _reduce_run(
