@@ -113,6 +113,12 @@ class _DriftJudge:
         """Ends of the windows that are long enough to decide [s], longest first."""
         return decisive_windows(self.finest, self.quantity, self.study.plan)
 
+    @property
+    def solver_note(self) -> str:
+        """The end of a derivation where steps were solved less closely than the integrator declares."""
+        solved = self.finest.solver_rtol
+        return f"; steps solved to {solved:g}" if solved > self.integrator.solver_rtol else ""
+
     def drift(self, end: float) -> InvariantDrift:
         """The drift in the window up to ``end``."""
         return InvariantDrift(self.study.runs, self.integrator, self.quantity, end)
@@ -235,7 +241,7 @@ class _DriftJudge:
             self.unit,
             value=drift.max_drift,
             tolerance=tolerance,
-            derivation=derivation + self.study.plan.shortening_note,
+            derivation=derivation + self.solver_note + self.study.plan.shortening_note,
             compared_until=end,
             order=order,
             declared_order=self.integrator.order if order else None,

@@ -216,7 +216,11 @@ def test_a_body_that_is_kilometres_away_is_solved_as_its_rounding_allows(tmp_pat
     file.write_text(text.replace("rates: [1.4]", "rates: [1000.0]"))
     s, method = load(file), load_adapter("exudyn").integrator("generalized-alpha")
     plan = LongRunPlan(16.0, (2.0**-9,), 16.0)
-    (run,) = run_long_run_study("exudyn", method.name, s.model, s.state, s.sample_interval, plan).runs
+    study = run_long_run_study("exudyn", method.name, s.model, s.state, s.sample_interval, plan)
+    (run,) = study.runs
+    context = RowContext("far", s.family, "exudyn", "Exudyn", "1")
+    for row in judge_long_runs(context, s.model, method, False, study).rows:
+        assert row.derivation.endswith("; steps solved to 1e-11")
     assert run.failure is None and run.solver_rtol == 10 * method.solver_rtol
     quantity, end = "momentum_drift", 16.0
     floors = [
