@@ -39,7 +39,7 @@ def changed_item(item: Mapping[str, Any], **given: Any) -> dict[str, Any]:
 
 LOADS = ("LoadForceVector", "LoadTorqueVector", "Force", "Torque")
 NEWTON_TOLERANCE = 1e-12  # relative and absolute; at the engine's defaults extrapolation stops at 2e-9
-MAX_NEWTON_TOLERANCE = 1e-10  # for bodies that are so far away that their places are rounded more coarsely
+MAX_NEWTON_TOLERANCE = 1e-10  # where positions of bodies far away are rounded more coarsely than the other
 
 NO_TOLERANCE = 1e30
 

@@ -387,7 +387,7 @@ class Exudyn(ExudynAdapter):
                     samples, clock = self._run_samples(chain, times, settings, resolution)
                     break
                 except EngineFailure:
-                    # A body that is kilometres away is rounded more coarsely than Newton's iteration may end.
+                    # The position of a body kilometres away is rounded more coarsely than Newton's tolerance.
                     far = float(np.max(np.abs(chain.mbs.systemData.GetODE2Coordinates())))
                     is_rounding = np.finfo(float).eps * far > 0.1 * newton.relativeTolerance
                     if not is_rounding or newton.relativeTolerance > MAX_NEWTON_TOLERANCE / 2:

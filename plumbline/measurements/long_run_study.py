@@ -46,7 +46,7 @@ class LongRunPlan:
     resolutions: tuple[float, ...]  # steps [s] or relative tolerances, coarse to fine
     requested_seconds: float  # s
     time_unit: float = 1.0  # s, less for a motion faster than steps of seconds resolve
-    is_too_fast: bool = False  # whether the motion goes on from there with shorter steps than these
+    is_too_fast: bool = False  # whether the runs end there because the motion after it asks for shorter steps
 
     @property
     def shortening_note(self) -> str:

@@ -470,9 +470,9 @@ def regular_motion(model: Model, state: State, times: Array) -> RegularMotion:
 def resolved_motion_end(model: Model, state: State, last: float, step: float) -> float:
     """Follow a motion until step control needs more steps than a fixed step would take.
 
-    The steps of collocation are ten and more times as long as those of methods of order 4 that are as
-    accurate; where it takes more, the motion is too fast for the others, as when a light body is thrown back
-    within microseconds.
+    Collocation has a high order, and its steps are long where a motion is smooth: at least 0.014 s on a
+    Furuta pendulum in its first second.  Where it needs more than the fixed steps, the motion is too fast for
+    these, as when a light body is thrown back within microseconds (steps of 2e-7 s on light-cart-pole).
 
     Args:
         model: without loops.
