@@ -285,8 +285,16 @@ class Adapter(ABC):
                 f"{resolution:g} s lead to t = {times[-1]:g} s"
             )
         softer = trajectory.softer and replace(trajectory.softer, initial_x=state.x)
+        solved = max(method.solver_rtol, trajectory.solver_rtol)
         # Only steps are judged by coordinates and velocities, runs by their poses.
-        return replace(trajectory, initial_x=state.x, coordinates=None, velocities=None, softer=softer)
+        return replace(
+            trajectory,
+            initial_x=state.x,
+            coordinates=None,
+            velocities=None,
+            softer=softer,
+            solver_rtol=solved,
+        )
 
     def step(self, model: Model, state: State, integrator: str, step: float, count: int) -> StepRun:
         """Take a few steps from a state and sample after each; errors are those of `evaluate`.

@@ -77,7 +77,7 @@ class RefinementAnalysis:
         ]
         # The equations of an implicit step are solved to a tolerance: independent errors of so many steps add
         # up like a random walk.
-        solved = self.solver_rtol * np.sqrt(self.finest.steps)
+        solved = self.finest.solver_rtol * np.sqrt(self.finest.steps)
         self.rounding = (RUN_ROUNDING + solved) * self.truth.growth
         self.observed, self.observed_until = self._observe_order()
 
@@ -98,11 +98,6 @@ class RefinementAnalysis:
         return {"alias_of": alias, "cpu_time": sum(run.cpu_time for run in self.runs)}
 
     @property
-    def solver_rtol(self) -> float:
-        """Relative tolerance to which the steps of the finest run were solved."""
-        return max(self.integrator.solver_rtol, self.finest.solver_rtol)
-
-    @property
     def limit_error(self) -> dict[str, Array]:
         """Of each name of `MOTION_UNITS` (T,), in its unit: of the finest run, where it is itself a limit."""
         return motion_errors(self.finest, self.finest.softer or self.finest)
@@ -110,9 +105,9 @@ class RefinementAnalysis:
     @property
     def rounding_description(self) -> str:
         """The formula of `rounding`, for derivations."""
-        if not self.solver_rtol:
+        if not self.finest.solver_rtol:
             return "10³ ε G(t)"
-        return f"(10³ ε + {self.solver_rtol:g} of the step's solver × √{self.finest.steps}) G(t)"
+        return f"(10³ ε + {self.finest.solver_rtol:g} of the step's solver × √{self.finest.steps}) G(t)"
 
     def extrapolated_limit(
         self, samples: Sequence[Float[Array, "samples bodies width"]]

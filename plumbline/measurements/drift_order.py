@@ -136,8 +136,7 @@ class InvariantDrift:
         """Drift in a part of the window by rounding and by the steps' solver, and its uncertainty."""
         steps = max(self.steps / parts, 64.0)
         # The solver's errors are independent from step to step: they add up like a random walk.
-        solved = max(self.integrator.solver_rtol, self.finest.solver_rtol)
-        relative = steps * ROUNDING_PER_STEP + np.sqrt(steps) * solved
+        relative = steps * ROUNDING_PER_STEP + np.sqrt(steps) * self.finest.solver_rtol
         return float(relative * self.scale) + self.uncertainty
 
     @property

@@ -82,8 +82,7 @@ def is_resolved(model: Model, integrator: Integrator, runs: Sequence[RefinementR
     is_declared = order.is_asymptotic and abs((order.value or 0.0) - integrator.order) <= ORDER_MARGIN
     if not (is_declared or order.is_at_rounding_floor):
         return False
-    solved = max(integrator.solver_rtol, finest.solver_rtol)
-    rounding = RUN_ROUNDING + solved * np.sqrt(finest.steps)
+    rounding = RUN_ROUNDING + finest.solver_rtol * np.sqrt(finest.steps)
     for samples, scale in ((r, length), (p, 1.0)):  # |δp| is half an angle, whose scale is 2
         limit = romberg(samples, integrator.error_exponents)
         if limit.uncertainty[-1] > STOP_MARGIN * rounding * scale:

@@ -169,8 +169,7 @@ class Trajectory:
     # the engine's own configuration and velocity, joint by joint as `JointSpaceMethod` orders them
     coordinates: Float[Array, "samples entries"] | None = None
     velocities: Float[Array, "samples rates"] | None = None
-    # to which its implicit steps were solved, where that is more than the integrator's
-    solver_rtol: float = 0.0
+    solver_rtol: float = 0.0  # relative tolerance to which its implicit steps were solved
 
     def at(self, samples: Any) -> Trajectory:
         """Take some samples of the motion; the engine's own coordinates stay as they are."""

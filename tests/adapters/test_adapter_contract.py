@@ -563,6 +563,17 @@ def test_detects_another_number_of_steps(engine, integrator):
         worker.call_adapter(engine, "simulate", *args, overrides={"_simulate": one_step_more})
 
 
+def without_tolerance(real, *args):
+    return replace(real(*args), solver_rtol=0.0)
+
+
+@every_integrator
+def test_a_run_says_how_closely_its_steps_were_solved(engine, integrator):
+    args = run_arguments(engine, integrator)
+    run = worker.call_adapter(engine, "simulate", *args, overrides={"_simulate": without_tolerance})
+    assert run.solver_rtol == integrator.solver_rtol
+
+
 def nan_acceleration(real, *args):
     first, *rest = real(*args)
     return [replace(first, acceleration=np.full_like(first.acceleration, np.nan)), *rest]
