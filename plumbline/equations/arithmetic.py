@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from plumbline.model.datatypes import Array
 from plumbline.model.kinematics import cross_matrix
 
-_NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])  # of each axis the next and the one after
+_NEXT = np.array([1, 2, 0])  # of each axis
 
 
 class Arithmetic:
@@ -114,9 +114,21 @@ class _Floats(Arithmetic):
         return cross_matrix(a[..., 0])
 
     def inverse(self, a: Any) -> Any:
-        cofactors = self.cross(a.take(_NEXT, -1), a.take(_LAST, -1))
+        # By a = L D Lᵀ, which loses the digits of the condition number once; cofactors lose them twice.
+        # Where a heavy body hangs by a rod below light ones, what these need is 1e-8 of the largest entry.
+        first, y, z = a[..., 0, 0], a[..., 1, 0], a[..., 2, 0]
+        out = np.empty_like(a)
         with np.errstate(divide="ignore", invalid="ignore"):
-            return self.symmetric(cofactors / self.dot(a[..., :1], cofactors[..., :1]))
+            k, m = y / first, z / first  # L = [[1, 0, 0], [k, 1, 0], [m, n, 1]]
+            second, s = a[..., 1, 1] - k * y, a[..., 2, 1] - m * y
+            n = s / second
+            last = 1 / (a[..., 2, 2] - m * z - n * s)
+            j = k * n - m  # L⁻¹ = [[1, 0, 0], [−k, 1, 0], [j, −n, 1]]
+            aside, below, beside = j * last, -n * last, -k / second - n * j * last
+            out[..., 0, 0], out[..., 1, 1] = 1 / first + k * k / second + j * aside, 1 / second - n * below
+            out[..., 2, 2], out[..., 0, 1], out[..., 1, 0] = last, beside, beside
+            out[..., 0, 2], out[..., 2, 0], out[..., 1, 2], out[..., 2, 1] = aside, aside, below, below
+        return out
 
     def solve(self, a: Any, b: Any) -> Any:
         is_singular = np.linalg.slogdet(a).sign == 0  # of which the others of a batch must not fail

@@ -14,7 +14,7 @@ from plumbline.model.kinematics import minimal_rates, stack_states
 from plumbline.model.loops import motion_without_inertia
 from plumbline.model.random_mechanisms import ELEMENTS, random_tree
 from plumbline.model.sampling import compared_states, random_states
-from plumbline.scenario.generator import random_mechanism
+from plumbline.scenario.generator import random_mechanism, random_scenario
 from plumbline.truth.certified_state import certify_state, enclose_quantities
 from plumbline.truth.parameter_effects import evaluate_models
 from plumbline.truth.rounding_bound import EPS, state_rounding_bound
@@ -77,6 +77,18 @@ def test_of_a_batch_only_a_singular_system_has_no_solution():
     np.testing.assert_array_equal(floats().solve(a, b), [np.ones((2, 1)), np.full((2, 1), np.nan)])
 
 
+@pytest.mark.parametrize("dtype", [float, np.longdouble])
+def test_an_inverse_loses_the_digits_of_the_condition_number_once(dtype):
+    """A heavy body below a rod: cofactors lose them twice."""
+    u = np.linalg.qr(np.random.default_rng(3).normal(size=(20, 3, 3)))[0][:, :1].astype(dtype)
+    light = np.random.default_rng(4).normal(size=(20, 3, 3)).astype(dtype)
+    a = 431 * u.mT * u + 1e-5 * (light @ light.mT + np.eye(3))
+    x = floats(dtype).inverse(a)
+    lost = 431 / 1e-5 * float(np.finfo(dtype).eps)
+    assert np.max(np.abs(a @ x - np.eye(3))) < 10 * lost
+    np.testing.assert_array_equal(x, x.mT)
+
+
 def batch(states):
     """Many states as one, of arrays with a leading axis."""
     return State(**{name: np.stack([getattr(state, name) for state in states]) for name in vars(states[0])})
@@ -135,6 +147,15 @@ def test_long_doubles_have_their_digits(name):
                 for x, y in zip(np.ravel(values), true, strict=True)
             ]
             assert max(errors) <= 3e-18 * balls["scale"].get(quantity, 1.0), quantity
+
+
+def test_long_doubles_have_their_digits_where_masses_differ():
+    """Bodies of 3, 0.003 and 0.001 kg with one of 432 kg on a rod below them."""
+    scenario = random_scenario(5, 11)
+    model, state = scenario.model, scenario.state
+    true = certify_state(model, state).quantities.acceleration
+    found = evaluated(floats(np.longdouble), model, state)["acceleration"].astype(float)
+    assert np.max(np.abs(found - true)) < 1e-9 * np.max(np.abs(true))
 
 
 @pytest.mark.parametrize("seed", range(4))
