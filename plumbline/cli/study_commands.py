@@ -18,10 +18,11 @@ from plumbline.cli.help_texts import command, examples
 from plumbline.cli.terminal_output import ProgressDisplay, count_noun, log, print_json, print_table
 from plumbline.engines.registry import ENGINES
 from plumbline.execution.exit_codes import ExitCode
-from plumbline.execution.plan import RANDOM_STATES, Plan
+from plumbline.execution.plan import Plan
 from plumbline.execution.runner import run_plan
 from plumbline.judging.rows import Level, Verdict
 from plumbline.judging.smallest_detectable_mistake import COVERED_LEVELS
+from plumbline.model.sampling import RANDOM_STATES
 from plumbline.processes.worker_pool import Limits, WorkerPool
 from plumbline.scenario.line_and_column_errors import ScenarioError
 from plumbline.scenario.loader import Scenario

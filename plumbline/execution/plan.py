@@ -14,10 +14,10 @@ from plumbline.engines.adapter import EngineInfo
 from plumbline.engines.registry import REFERENCE_ENGINES
 from plumbline.judging.known_issues import KnownIssue, project_known_issues
 from plumbline.judging.rows import Row
+from plumbline.model.sampling import RANDOM_STATES
 from plumbline.processes.worker_pool import Limits, ResultCache
 from plumbline.scenario.loader import FAMILIES, Scenario
 
-RANDOM_STATES = 50  # random states per scenario, besides the initial one
 STATES_PER_RANDOM_SCENARIO = 9  # the same for a random scenario, or one that asks for states only
 
 LevelSelection = Literal["state", "step", "trajectory", "all"]

@@ -21,6 +21,7 @@ from plumbline.model.loops import (
     with_rates,
 )
 
+RANDOM_STATES = 50  # per scenario of a run, besides the initial one
 MIN_SAMPLED_SINGULAR_VALUE = 1e-2  # of a loop's rows: nearer to a singular pose bounds are loose
 STEPS_BETWEEN, STEP_SIZE = 2, 0.5  # random steps between two states of a loop [rad, m]
 MAX_DRAWS = 10  # draws per state that is wanted
@@ -74,6 +75,9 @@ def random_states(model: Model, count: int, seed: int) -> list[State]:
 
     """
     rng, own_rate = np.random.default_rng(seed), _own_rate(model)
+    wanted, has_coordinates = count, not all(kind.holds_no_turn for kind in model.kinds)
+    if has_coordinates:  # drawn after all attitudes: else they would depend on how many states are wanted
+        count = max(count, RANDOM_STATES)
     p, omega, u, udot = (np.zeros((count, model.n, size)) for size in (4, 3, 3, 3))
     for k in range(count):
         p[k] = rng.normal(size=(model.n, 4))
@@ -86,13 +90,14 @@ def random_states(model: Model, count: int, seed: int) -> list[State]:
     u, udot = (np.where(model.rods[:, None], x, 0.0) for x in (u, cross(udot, u)))
     free = model.free[:, None]
     x, xdot, r, v = (np.zeros((count, model.n, size)) for size in (model.columns, model.columns, 3, 3))
-    for k in range(count if not all(kind.holds_no_turn for kind in model.kinds) else 0):
+    for k in range(wanted if has_coordinates else 0):
         for i, kind in enumerate(model.kinds):
             for j, (motion, _) in enumerate(kind.motions):
                 x[k, i, j] = rng.uniform(-3, 3) if motion == "turn" else rng.normal()
         spread = own_rate * 10 ** rng.uniform(-1.0, np.log10(4.0))
         xdot[k] = spread * rng.normal(size=xdot[k].shape)
         r[k], v[k] = (np.where(free, size * rng.normal(size=r[k].shape), 0.0) for size in (1.0, spread))
+    p, omega, u, udot, r, v, x, xdot = (part[:wanted] for part in (p, omega, u, udot, r, v, x, xdot))
     p, omega, r, v = forward_kinematics(model, p, omega, u, udot, r, v, x, xdot)
     return [State(*parts) for parts in zip(p, omega, u, udot, r, v, x, xdot, strict=True)]
 

@@ -11,12 +11,12 @@ import pytest
 
 from plumbline.engines.engine_calls import Evaluation
 from plumbline.engines.registry import load_adapter
-from plumbline.execution.plan import RANDOM_STATES, STATES_PER_RANDOM_SCENARIO
+from plumbline.execution.plan import STATES_PER_RANDOM_SCENARIO
 from plumbline.judging.rows import RowContext
 from plumbline.judging.state_level import judge_states
 from plumbline.measurements.single_steps import STEP_STATES
 from plumbline.model.datatypes import Unsupported
-from plumbline.model.sampling import compared_states
+from plumbline.model.sampling import RANDOM_STATES, compared_states
 from plumbline.scenario.generator import RandomScenarios
 from plumbline.truth import step_formulas
 from plumbline.truth.ground_truth import state_truth
