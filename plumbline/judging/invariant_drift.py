@@ -38,11 +38,10 @@ def invariant_rows(study: RefinementAnalysis) -> list[Row]:
 def _invariant_row(study: RefinementAnalysis, quantity: str, unit: str, samples: Sequence[Array]) -> Row:
     """The limit of a drift is zero, within its uncertainty and the rounding of all steps."""
     name, scale, times = quantity.replace("_", " "), study.invariant_scales[quantity], study.times
-    last, steps = study.invariant_drifts[-1], study.finest.steps
-    assert last is not None
+    steps = study.finest.steps
     accepted = 0.0 if study.has_steps else study.runs[-1].resolution  # by step control in every step
     floor, per_step = rounding_floor(steps, scale, accepted), ROUNDING_PER_STEP + accepted
-    uncertainty = last.uncertainty[quantity]
+    uncertainty = study.invariant_uncertainty(quantity)
     drift = np.maximum.accumulate(np.max(np.linalg.norm(samples[-1], axis=-1), axis=1))
     rounding = f"{steps} steps, {per_step:.1g} × {with_unit(scale, unit, 3)} each: {floor:.2g}"
 

@@ -14,6 +14,7 @@ from plumbline.measurements.order_and_limit import (
     ORDER_MARGIN,
     ExtrapolatedLimit,
     ObservedOrder,
+    max_norm,
     observed_order,
     romberg,
     tightest_tolerance_limit,
@@ -108,6 +109,19 @@ class RefinementAnalysis:
         if not self.finest.solver_rtol:
             return "10³ ε G(t)"
         return f"(10³ ε + {self.finest.solver_rtol:g} of the step's solver × √{self.finest.steps}) G(t)"
+
+    def invariant_uncertainty(self, quantity: str) -> float:
+        """Return the uncertainty of an invariant of the finest run, in its unit.
+
+        The work of loads is a quadrature over the samples.  By how much it is off at least, the true motion
+        shows, whose energy with its work over the same samples should not drift.
+        """
+        finest = self.invariant_drifts[-1]
+        assert finest is not None
+        uncertainty = finest.uncertainty[quantity]
+        if quantity != "energy_drift" or not uncertainty:
+            return uncertainty
+        return max(uncertainty, max_norm(compute_invariants(self.model, self.truth.trajectory).energy_drift))
 
     def extrapolated_limit(
         self, samples: Sequence[Float[Array, "samples bodies width"]]

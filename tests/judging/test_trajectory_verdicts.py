@@ -318,6 +318,16 @@ def test_an_implicit_solver_walks_at_random():
     assert analysis().rounding_description == "10³ ε G(t)"
 
 
+def test_the_true_motion_shows_how_uncertain_the_work_is():
+    dragged = replace(MODEL, drag_moment=np.array([0.1]))  # the motion is that without drag
+    off = np.max(np.abs(compute_invariants(dragged, TRUE_TRAJECTORY).energy_drift))
+    held = analysis(model=dragged)
+    assert held.invariant_uncertainty("energy_drift") == off > 0
+    assert held.invariant_drifts[-1].uncertainty["energy_drift"] < off / 10
+    assert judged_rows(model=dragged)["energy_drift"].verdict == "unresolved"
+    assert held.invariant_uncertainty("joint_gap") == analysis().invariant_uncertainty("energy_drift") == 0
+
+
 def test_an_alias_is_reported_and_differs_with_drag():
     method = replace(METHOD, alias_of="Euler")
     assert {row.alias_of for row in judged_rows(method=method).values()} == {"Euler"}
