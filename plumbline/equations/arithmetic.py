@@ -19,6 +19,27 @@ from plumbline.model.datatypes import Array
 from plumbline.model.kinematics import cross_matrix
 
 _NEXT = np.array([1, 2, 0])  # of each axis
+_LOWER = ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2))  # triangle of a symmetric matrix, by rows
+
+
+def _inverse_rows(a: Any, b: Any, c: Any, d: Any, e: Any, f: Any) -> list[list[Any]]:
+    """Invert a symmetric 3×3 matrix, given by its lower triangle, by L D Lᵀ.
+
+    That loses the digits of the condition number once, and cofactors lose them twice: where a heavy body
+    hangs by a rod below light ones, what these need is 1e-8 of the largest entry.
+    """
+    first = 1 / a  # of D⁻¹
+    k, m = b * first, d * first  # L = [[1, 0, 0], [k, 1, 0], [m, n, 1]]
+    second, s = 1 / (c - k * b), e - m * b
+    n = s * second
+    last, j = 1 / (f - m * d - n * s), k * n - m  # L⁻¹ = [[1, 0, 0], [−k, 1, 0], [j, −n, 1]]
+    aside, below = j * last, -(n * last)
+    beside = -(k * second) - n * aside
+    return [
+        [first + k * k * second + j * aside, beside, aside],
+        [beside, second - n * below, below],
+        [aside, below, last],
+    ]
 
 
 class Arithmetic:
@@ -43,10 +64,6 @@ class Arithmetic:
     sqrt: Callable[[Any], Any]  # of a scalar that is not negative, but for rounding
     sin_cos: Callable[[Any], tuple[Any, Any]]  # of a scalar
     turn_over_sine: Callable[[Any, Any], Any]  # θ/sin θ by sin θ and cos θ, 0 ≤ θ < π
-
-    def inverse_parts(self, a: Any) -> tuple[Any, Any]:
-        """Return a matrix X and a scalar d with X/d the inverse."""
-        return self.inverse(a), self.scalar(1.0)
 
 
 class _Floats(Arithmetic):
@@ -114,20 +131,12 @@ class _Floats(Arithmetic):
         return cross_matrix(a[..., 0])
 
     def inverse(self, a: Any) -> Any:
-        # By a = L D Lᵀ, which loses the digits of the condition number once; cofactors lose them twice.
-        # Where a heavy body hangs by a rod below light ones, what these need is 1e-8 of the largest entry.
-        first, y, z = a[..., 0, 0], a[..., 1, 0], a[..., 2, 0]
         out = np.empty_like(a)
         with np.errstate(divide="ignore", invalid="ignore"):
-            k, m = y / first, z / first  # L = [[1, 0, 0], [k, 1, 0], [m, n, 1]]
-            second, s = a[..., 1, 1] - k * y, a[..., 2, 1] - m * y
-            n = s / second
-            last = 1 / (a[..., 2, 2] - m * z - n * s)
-            j = k * n - m  # L⁻¹ = [[1, 0, 0], [−k, 1, 0], [j, −n, 1]]
-            aside, below, beside = j * last, -n * last, -k / second - n * j * last
-            out[..., 0, 0], out[..., 1, 1] = 1 / first + k * k / second + j * aside, 1 / second - n * below
-            out[..., 2, 2], out[..., 0, 1], out[..., 1, 0] = last, beside, beside
-            out[..., 0, 2], out[..., 2, 0], out[..., 1, 2], out[..., 2, 1] = aside, aside, below, below
+            rows = _inverse_rows(*(a[..., i, j] for i, j in _LOWER))
+        for i, row in enumerate(rows):
+            for j, x in enumerate(row):
+                out[..., i, j] = x
         return out
 
     def solve(self, a: Any, b: Any) -> Any:
@@ -209,13 +218,8 @@ class _Objects(Arithmetic):
         x, y, z = a[:, 0]
         return self.from_rows([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
-    def inverse_parts(self, a: Any) -> tuple[Any, Any]:
-        cofactors = self.symmetric(np.cross(np.roll(a, -1, 1), np.roll(a, -2, 1), axis=0))
-        return cofactors, self.dot(a[:, :1], cofactors[:, :1])
-
     def inverse(self, a: Any) -> Any:
-        cofactors, determinant = self.inverse_parts(a)
-        return cofactors * (1 / determinant)
+        return self.from_rows(_inverse_rows(*(a[i, j] for i, j in _LOWER)))
 
     def sin_cos(self, x: Any) -> tuple[Any, Any]:
         return self.functions.sin(x), self.functions.cos(x)

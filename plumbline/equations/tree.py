@@ -81,11 +81,10 @@ class _Swing:
         num = self.num
         across = None if self.across is None else num.widened(self.across, x.f)
         self.f = x.f if across is None else x.f - across
-        self.adjugate, self.determinant = num.inverse_parts(x.c)
-        w = num.mul(self.adjugate, self.u)
-        share = 1 / num.dot(self.u, w)
-        self.size = self.determinant * share
-        self.push = num.widened(self.pull * self.size, x.f) + num.mul(num.transpose(w), self.f) * share
+        self.inverse = num.inverse(x.c)
+        w = num.mul(self.inverse, self.u)
+        self.size = 1 / num.dot(self.u, w)
+        self.push = num.widened(self.pull * self.size, x.f) + num.mul(num.transpose(w), self.f) * self.size
         c = num.symmetric(num.mul(self.u * self.size, num.transpose(self.u)))
         f = num.mul(self.u, self.push)
         return Articulated(c, None, None, f if across is None else f + across, None)
@@ -93,7 +92,7 @@ class _Swing:
     def advance(self, a: Any, alpha: Any) -> tuple[Any, Any, Any]:
         num = self.num
         tension = num.mul(num.transpose(self.u), a) * self.size + self.push
-        near = num.mul(self.adjugate, num.mul(self.u, tension) - self.f) * (1 / self.determinant)
+        near = num.mul(self.inverse, num.mul(self.u, tension) - self.f)
         return near, alpha, near - a
 
 
