@@ -120,7 +120,8 @@ def _by_robot(tree: Any, _: Matrices) -> Matrices:
 
 def _of_python(own: Any, tree: Any) -> Matrices:
     M, bias = own.ComputeMassMatrixAndForceTerms(np.zeros(own.Size()), tree.initial_angle_rates)
-    return np.array(M), -np.linalg.solve(M, bias)
+    # The matrix of a tree that leaves masses out may be singular: the smallest accelerations are its own.
+    return np.array(M), -np.linalg.lstsq(M, bias, rcond=None)[0]
 
 
 def _by_step(run: Callable[[Any, Any], bool]) -> Callable[[Any, Matrices], Matrices]:

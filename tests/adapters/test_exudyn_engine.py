@@ -16,12 +16,22 @@ from plumbline.model.kinematics import complete_state, joint_vectors
 from plumbline.reproduce.engine_client import EngineClient
 from plumbline.reproduce.measure import StepMeasure
 from plumbline.reproduce.shrink import ReproductionCase
+from plumbline.scenario.generator import random_mechanism
 from plumbline.scenario.loader import find_scenario_file, load_scenario
 from plumbline.truth.certified_state import certify_state
 from tests.helpers import pendulums
 from tests.helpers.true_answers import true_trajectory
 
 TIMES = np.linspace(0.0, 2.0, 9)
+
+
+def test_a_tree_that_leaves_masses_out_answers_with_a_singular_matrix_too():
+    scenario = random_mechanism(3201, 112)
+    variant = next(one for one in ExudynTree.variants if one.kind == "vectors")
+    (found,) = ExudynTree().with_variant(variant).evaluate(scenario.model, [scenario.state])
+    true = certify_state(scenario.model, scenario.state, mass_matrix=True).quantities
+    assert np.max(np.abs(found.mass_matrix - true.mass_matrix)) > 1
+    assert np.linalg.matrix_rank(found.mass_matrix) < len(found.mass_matrix)
 
 
 def swinging_pendulum(joints):
