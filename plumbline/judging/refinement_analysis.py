@@ -113,8 +113,8 @@ class RefinementAnalysis:
     def invariant_uncertainty(self, quantity: str) -> float:
         """Return the uncertainty of an invariant of the finest run, in its unit.
 
-        The work of loads is a quadrature over the samples.  By how much it is off at least, the true motion
-        shows, whose energy with its work over the same samples should not drift.
+        The work of loads is a quadrature over the samples.  The energy of the true motion, with its work over
+        the same samples, should not drift: where it does, the quadrature is off by so much at least.
         """
         finest = self.invariant_drifts[-1]
         assert finest is not None
