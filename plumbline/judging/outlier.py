@@ -12,12 +12,14 @@ from itertools import combinations
 
 from plumbline.judging.rows import Deviation, Level, Row, Verdict
 from plumbline.judging.state_level import STATE_UNITS, VARIANT_QUANTITIES
-from plumbline.model.invariants import LIMITS
+from plumbline.model.invariants import INVARIANT_UNITS, LIMITS, LONG_RUN_QUANTITIES
 
 # What is compared with the truth; steps are with each method's formula, relations with the engine itself.
+# The true drift of an invariant is 0; energies and work of all engines' motions are computed here.
 COMPARED_WITH_TRUTH: Mapping[Level, frozenset[str]] = {
     "state": frozenset(STATE_UNITS),
     "trajectory": frozenset(LIMITS),
+    "invariants": frozenset(INVARIANT_UNITS) | LONG_RUN_QUANTITIES,
 }
 MIN_FAMILIES = 2  # independent engines against the truth, whose answers agree with each other
 ENOUGH_FAMILIES = 3  # the same, whether they agree with each other or not
@@ -37,7 +39,7 @@ def doubt_truth(
 
     Args:
         rows: all rows of one scenario, known issues marked.
-        deviations: of rows that disagree, by their keys.
+        deviations: of rows that disagree at state and trajectory level, by their keys.
         family_of: what an engine is a formulation or version of; those of one family may share a mistake.
         defines_truth: the family whose answers are the truth where nothing is certified, which is no witness.
 
@@ -63,7 +65,7 @@ def doubt_truth(
             if len(against) < MIN_FAMILIES or any(row.verdict == Verdict.AGREES for row in decided):
                 continue
             are_alike = all(
-                deviations[one.key].is_like(deviations[other.key])
+                one.key in deviations and deviations[one.key].is_like(deviations[other.key])
                 for one, other in combinations(decided, 2)
                 if families[one.engine] != families[other.engine]
             )

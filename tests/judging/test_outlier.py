@@ -87,6 +87,31 @@ def test_others_that_disagree_leave_the_truth_alone(engines, factors, options):
     ]
 
 
+def drifting_rows(quantity, verdicts):
+    return [
+        RowContext("s", "f", name, name, "0").make_row(
+            "invariants", "method", quantity, verdict, "drifts", "J", value=2e-3, tolerance=1e-3, ratio=2.0
+        )
+        for name, verdict in verdicts.items()
+    ]
+
+
+@pytest.mark.parametrize("quantity", ["energy_drift", "energy_drift_long"])
+def test_a_drift_of_all_engines_is_the_harness_s_own_first(quantity):
+    """Their energies and work are computed by one function."""
+    wrong = dict.fromkeys(("reference", "mujoco", "pinocchio", "exudyn"), "disagrees")
+
+    def judged(**changes):
+        rows = drifting_rows(quantity, {**wrong, **changes})
+        return {row.engine: row.verdict for row in doubt_truth(rows, {}, lambda name: name)}
+
+    assert set(judged().values()) == {"harness failed"}
+    assert judged(exudyn="information") == {**dict.fromkeys(wrong, "harness failed"), "exudyn": "information"}
+    assert judged(exudyn="agrees") == {**wrong, "exudyn": "agrees"}
+    two = doubt_truth(drifting_rows(quantity, {"reference": "disagrees", "mujoco": "disagrees"}), {}, str)
+    assert {row.verdict for row in two} == {"disagrees"}
+
+
 def rows_of_engines(*defective_engines, defect="mass-1-1e-5", leave_out=()):
     """State-level rows of the real engines, some with a defect planted in them."""
     model, right = model_and_truth()
