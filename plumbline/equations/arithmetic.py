@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from plumbline.model.datatypes import Array
 from plumbline.model.kinematics import cross_matrix
 
-_NEXT = np.array([1, 2, 0])  # of each axis
+_NEXT = np.array([1, 2, 0])  # of each axis the one that follows it
 _LOWER = ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2))  # triangle of a symmetric matrix, by rows
 
 
