@@ -75,6 +75,8 @@ MAX_DISTANCE = 10.0  # of bodies from the origin, over the mechanism's size
 MAX_COSINE_CHANGE = 1 / 2  # of that cosine in a step, over itself
 MAX_TURN = 1.0  # rad, step × fastest rate: beyond it explicit methods become unstable, and bounds do not hold
 SAMPLE_STRIDE = 8  # of the samples at which what changes slowly is estimated: rates, the formula's own errors
+# rad, of a stage: below it Pinocchio takes the first terms of series instead of closed forms of rigid motions
+MIN_CLOSED_TURN = float(np.finfo(float).eps) ** (1 / 4)
 LOST_DIGITS = 4.0  # by how much errors of one size may differ by chance
 # Roundings that are alike in all steps, of those in a bound: see `RunSteps._mean`.
 CONSTANT_ROUNDINGS, CONSTANT_FACTORS = 16 / STEP_ROUNDINGS, 12 / ROUNDING_FACTOR / ACCELERATION_FACTOR
@@ -311,7 +313,8 @@ class FormulaSteps:
         sizes = [_sizes(states, vars(bounds)) for states, bounds in ends]
         largest = {name: np.max([one[name] for one in sizes], axis=0) for name in sizes[0]}
         h = np.array([h for _, h in self.places])[runs, None]
-        return step_bound(self.method, self.model, largest, h, count)
+        rates = np.array([links.omega[runs] for links in self.true[: count + 1]], float)
+        return step_bound(self.method, self.model, largest, h, count, _stage_rates(rates))
 
 
 def acceleration_bounds(method: JointSpaceMethod, model: Model, states: State) -> RoundingBound:
@@ -346,14 +349,29 @@ def _sizes(states: State, bounds: Mapping[str, Array]) -> dict[str, Array]:
     }
 
 
+def _stage_rates(rates: Array) -> Array:
+    """Rates (2, ..., N) of bodies at the stages of explicit steps: the start's, and about those midway.
+
+    Of several steps the stages of all: (2 × steps, ..., N).
+
+    Args:
+        rates: (steps + 1, ..., N, 3) rad/s at the ends of the steps.
+
+    """
+    stages = np.concatenate([rates[:-1], (rates[:-1] + rates[1:]) / 2])
+    return np.asarray(np.linalg.norm(stages, axis=-1))
+
+
 def step_bound(
-    method: JointSpaceMethod, model: Model, sizes: dict[str, Array], h: float | Array, count: int
-) -> dict[str, Array]:
+    method: JointSpaceMethod, model: Model, sizes: dict[str, Array], h: float | Array, count: int,
+    stage_rates: Array | None = None,
+) -> dict[str, Array]:  # fmt: skip
     """Compute the bounds of one of several steps.
 
     Args:
         sizes: of `_sizes`, (..., N): the largest at the ends of the steps.
         h: step [s], or (..., 1).
+        stage_rates: of `_stage_rates`; None where no step is taken.
 
     Returns:
         By quantity the bounds (..., N), in its unit of `STEP_QUANTITIES`.
@@ -380,17 +398,34 @@ def step_bound(
     velocity += rounding * np.maximum(V, W * arm)
     free = np.array([KINDS[kind].holds_nothing for kind in kinds])
     if method.free_coordinates == "rigid motion":  # ṙ is kept in the body's axes, which turn
-        velocity += np.where(free, count * h * omega * speed, 0.0) @ path.T
-    if method.free_coordinates == "rigid motion" and method.formula == "Runge-Kutta" and count:
-        # closed forms of dexp⁻¹ of a rigid motion divide differences by the square of the turn
-        turn = np.clip(h * rate, 1e-4, 1.0)  # rad
-        velocity += np.where(free, STEP_ROUNDINGS * EPS * speed / turn**2, 0.0) @ path.T
+        lost = count * h * omega * speed
+        if method.formula == "Runge-Kutta" and stage_rates is not None:
+            lost = lost + _lost_in_closed_forms(h, stage_rates) * rate * speed
+        velocity += np.where(free, lost, 0.0) @ path.T
     return {
         "step_rate": omega,
         "step_velocity": velocity,
         "step_attitude": count * h * omega + rounding + turned,
         "step_position": count * h * velocity + (rounding + turned) * arm,
     }
+
+
+def _lost_in_closed_forms(h: float | Array, stage_rates: Array) -> Array:
+    """What Pinocchio's dexp of a rigid motion loses in a step (..., N), over speed and rate [s].
+
+    Its Jexp6 has β = 1/t² − sin t / (2 t (1 − cos t)) of the turn t = t n.  A cosine that is off by its last
+    place, ε, makes 1 − cos t off by 2 ε / t² of itself, β by 2 ε / t⁴ and β′/t by −2/t² of that.  With a
+    translation p and a rate ω these add up to a velocity that is off by
+
+        2 ε / t³ |(n·p) ω⊥ + (p⊥·ω⊥) n|  <=  2 ε p ω / t³,    where ⊥ is across n
+
+    (measured: half of it at most, as the cosine is rounded to ε/2).  Stages move by p = h V / 2 and turn by
+    t = h Ω / 2, where Ω is the rate of the stage before, not ω: a body that turns slowly at the start of a
+    step and fast in it loses most.
+    """
+    turn = h * stage_rates / 2
+    each = np.where(turn > MIN_CLOSED_TURN / 2, np.maximum(turn, MIN_CLOSED_TURN) ** -3.0, 0.0)
+    return np.asarray(EPS * h * np.max(each, axis=0))  # 2 ε h / 2
 
 
 def _arms(model: Model, sizes: dict[str, Array]) -> Array:
@@ -620,7 +655,8 @@ class StepsFromSamples:
         self.of_samples = {name: x * converted for name, x in of_samples.items()}
         between = {name: np.maximum(x[:count], x[-count:]) for name, x in sizes.items()}
         of_torques = np.maximum(converted[:count], converted[-count:]) ** 4
-        of_step = step_bound(method, model, between, h, 1)
+        rates = np.array([self.states.omega[:count], self.states.omega[-count:]])
+        of_step = step_bound(method, model, between, h, 1, _stage_rates(rates))
         self.of_step = {name: x * of_torques + self.uncertainty[name] for name, x in of_step.items()}
         self.is_of_one_pose = method.formula == "semi-implicit Euler" and method.implicit_forces != "all"
         self.of_totals = self._total_bounds(count, between)
