@@ -80,6 +80,7 @@ from plumbline.model.welding import BodyParts, RigidPart, undivided_bodies
 
 SECOND_AXIS = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # columns x, −z, y of the joint's axes
 SPECTRAL_RADIUS = 0.9
+NEWTON_ROUNDINGS = 32  # of the terms in a step's equations
 GENERIC_ROWS = 6  # of a generic joint, free axes included
 STEP_SETTINGS = {
     "solver_atol": NEWTON_TOLERANCE,
@@ -387,9 +388,12 @@ class Exudyn(ExudynAdapter):
                     samples, clock = self._run_samples(chain, times, settings, resolution)
                     break
                 except EngineFailure:
-                    # The position of a body kilometres away is rounded more coarsely than Newton's tolerance.
-                    far = float(np.max(np.abs(chain.mbs.systemData.GetODE2Coordinates())))
-                    is_rounding = np.finfo(float).eps * far > 0.1 * newton.relativeTolerance
+                    # The rounding of a step's equations can be above Newton's tolerance: of the positions of
+                    # bodies far away (140 m), of accelerations and joint forces in a whip (140 m/s², 140 N).
+                    data = chain.mbs.systemData
+                    parts = data.GetODE2Coordinates(), data.GetODE2Coordinates_tt(), data.GetAECoordinates()
+                    largest = max(float(np.max(np.abs(part), initial=0.0)) for part in parts)
+                    is_rounding = NEWTON_ROUNDINGS * np.finfo(float).eps * largest > newton.relativeTolerance
                     if not is_rounding or newton.relativeTolerance > MAX_NEWTON_TOLERANCE / 2:
                         raise
                     newton.absoluteTolerance = newton.relativeTolerance = 10 * newton.relativeTolerance
