@@ -97,8 +97,8 @@ def _describe_doubt(rows: Sequence[Row], are_alike: bool) -> str:
     ratios = [row.ratio or 0.0 for row in rows]
     alike = ", and agree with each other" if are_alike else ""
     return (
-        f"{rows[0].scenario}, {rows[0].level}: all engines that were compared ({names}) differ from the true "
-        f"{rows[0].quantity.replace('_', ' ')}, by {min(ratios):.2g} to {max(ratios):.2g} times the bound"
+        f"{rows[0].scenario}, {rows[0].level}: all engines that were compared ({names}) differ from the "
+        f"truth in {rows[0].quantity}, by {min(ratios):.2g} to {max(ratios):.2g} times the bound"
         f"{alike}: suspect the truth, its bound or what the adapters share first"
     )
 

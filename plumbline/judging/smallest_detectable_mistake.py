@@ -49,7 +49,7 @@ from plumbline.truth.trajectory_truth import (
     MOTION_MISTAKE,
     AccurateMotion,
     PerturbedMotion,
-    accurate_motion,
+    accurate_motions,
     accurate_runs,
     perturbed_motions,
     resolved_motions,
@@ -284,7 +284,7 @@ def _step_ratios(model: Model, states: Sequence[State], parameters: Sequence[Par
         index, h = steps.places[i]
         chosen = [k for k, one in enumerate(parameters) if index == 0 or one.kind not in STATE_KINDS]
         times = np.asarray(h * np.arange(max(counts) + 1), float)
-        accurate = accurate_motion(model, states[index], times, substeps=1)
+        (accurate,) = accurate_motions(model, states[index], times)
         motions = perturbed_motions(accurate, [parameters[k] for k in chosen])
         for k, motion in zip(chosen, motions, strict=True):
             for count, limit in counts.items():
@@ -309,7 +309,8 @@ def run_ratios(
     """
     h = RUN_STEP_SHARE * step_sizes(False, model, [state])[0][0]
     times = np.linspace(0, h * max(run_counts(model.n)), RUN_SAMPLES)
-    states = [state, *_visited_states(accurate_motion(model, state, times, substeps=1), RUN_SAMPLES)[1:]]
+    (motion,) = accurate_motions(model, state, times)
+    states = [state, *_visited_states(motion, RUN_SAMPLES)[1:]]
     charts = StepCharts(model, method, states)
     q, v = charts.start()
     coordinates, velocities = np.asarray(np.concatenate(q, -1), float), np.asarray(v, float)

@@ -233,7 +233,8 @@ MOTION_MISTAKE = 1e-5  # of a parameter's scale, in the runs that show its effec
 MOTION_STEP = 2.0**-6  # s, largest step of those runs
 MOTION_RTOL = 1e-13  # of the motion without mistakes
 MAX_DEVIATION_ERROR = 1e-3  # of the largest deviation, what finer steps may change
-MAX_HALVINGS = 4
+MAX_REFINEMENT = 16  # of the first steps
+DEVIATION_ORDER, REFINEMENT_MARGIN = 4, 1.1  # of the steps' number, where the error falls as the order says
 TRIED_PARAMETERS = 8  # with mistakes in which steps are chosen
 MAX_STEP_ANGLE = 0.25  # rad that the fastest mode turns in a step
 MAX_STIFFNESS = 1.5  # of a step times the fastest rate of springs and dampers; stable up to 2.78
@@ -266,24 +267,31 @@ class PerturbedMotion:
     true: Trajectory  # of the same object for all motions of a batch
 
 
-def accurate_motion(model: Model, state: State, times: Array, substeps: int) -> AccurateMotion:
+def accurate_motions(
+    model: Model, state: State, times: Array, substeps: Sequence[int] = (1,)
+) -> list[AccurateMotion]:
     """Simulate a motion by collocation.
 
     Args:
         model: the mechanism, without loops.
         times: (T,) sample times [s], equally spaced.
+        substeps: numbers of steps between two samples.
 
     Returns:
-        The motion. A steady motion stays as steady as it can.
+        The motion, for each number of steps. A steady motion stays as steady as it can.
 
     Raises:
         ArithmeticError: as `integrate_collocation`.
 
     """
-    stages = np.linspace(times[0], times[-1], 2 * substeps * (len(times) - 1) + 1)
-    run = integrate_batch([(model, state)], stages, MOTION_RTOL)
+    grids = [np.linspace(times[0], times[-1], 2 * count * (len(times) - 1) + 1) for count in substeps]
+    every = np.unique(np.concatenate(grids))
+    run = integrate_batch([(model, state)], every, MOTION_RTOL)
     y = np.stack([np.concatenate([run.r, run.p], axis=-1), np.concatenate([run.v, run.pdot], axis=-1)], 1)
-    return AccurateMotion(model, state, times, substeps, y.swapaxes(-1, -2))
+    stages = [y[np.searchsorted(every, grid)].swapaxes(-1, -2) for grid in grids]
+    return [
+        AccurateMotion(model, state, times, count, at) for count, at in zip(substeps, stages, strict=True)
+    ]
 
 
 def accurate_runs(
@@ -324,17 +332,18 @@ def resolved_motions(
     turning = max(TINY_RATE, *np.linalg.norm(state.omega, axis=1) / 2)
     stiffest = float(fastest_rates(model, [state])[0]) if model.has_elements else TINY_RATE
     step = min(MOTION_STEP, MAX_STEP_ANGLE / turning, MAX_STIFFNESS / max(stiffest, TINY_RATE))
-    pairs = max(1, int(np.ceil((times[1] - times[0]) / step / 2)))
+    first = pairs = max(1, int(np.ceil((times[1] - times[0]) / step / 2)))
     tried = parameters[:: -(-len(parameters) // TRIED_PARAMETERS)]
-    for halving in range(MAX_HALVINGS + 1):
-        coarse, fine = (accurate_motion(model, state, times, many * pairs) for many in (2, 3))
+    while True:
+        coarse, fine = accurate_motions(model, state, times, (2 * pairs, 3 * pairs))
         runs = [list(perturbed_motions(motion, tried)) for motion in (coarse, fine)]
-        errors = [np.max(attitude_error(a.run.p, b.run.p)) for a, b in zip(*runs, strict=True)]
-        sizes = [np.max(attitude_error(one.run.p, one.true.p)) for one in runs[1]]
-        if max(errors) <= MAX_DEVIATION_ERROR * max(sizes) or halving == MAX_HALVINGS:
-            break
-        pairs *= 2
-    return coarse, fine
+        error = max(np.max(attitude_error(a.run.p, b.run.p)) for a, b in zip(*runs, strict=True))
+        allowed = MAX_DEVIATION_ERROR * max(np.max(attitude_error(x.run.p, x.true.p)) for x in runs[1])
+        if error <= allowed or pairs == MAX_REFINEMENT * first:
+            return coarse, fine
+        ratio = error / allowed if allowed else np.inf
+        more = REFINEMENT_MARGIN * ratio ** (1 / DEVIATION_ORDER)
+        pairs = int(min(np.ceil(pairs * more), MAX_REFINEMENT * first))
 
 
 def perturbed_motions(

@@ -169,7 +169,7 @@ def test_engines_that_agree_against_an_accepted_truth_put_the_harness_in_doubt(
     shown = " ".join(result.stdout.split())
     assert shown.startswith(
         f"☒ the harness failed: tumbling-ball, {level}: all engines that were compared (reference and "
-        f"mujoco) differ from the true {quantity.replace('_', ' ')}, by "
+        f"mujoco) differ from the truth in {quantity}, by "
     )
     assert "and agree with each other: suspect the truth" in shown
     rows = json.loads((tmp_path / "results.json").read_text())["rows"]
