@@ -314,7 +314,8 @@ class FormulaSteps:
         largest = {name: np.max([one[name] for one in sizes], axis=0) for name in sizes[0]}
         h = np.array([h for _, h in self.places])[runs, None]
         rates = np.array([links.omega[runs] for links in self.true[: count + 1]], float)
-        return step_bound(self.method, self.model, largest, h, count, _stage_rates(rates))
+        lost = _lost_places(self.method, self.model, largest["speed"], h, rates)
+        return step_bound(self.method, self.model, largest, h, count, lost)
 
 
 def acceleration_bounds(method: JointSpaceMethod, model: Model, states: State) -> RoundingBound:
@@ -349,29 +350,16 @@ def _sizes(states: State, bounds: Mapping[str, Array]) -> dict[str, Array]:
     }
 
 
-def _stage_rates(rates: Array) -> Array:
-    """Rates (2, ..., N) of bodies at the stages of explicit steps: the start's, and about those midway.
-
-    Of several steps the stages of all: (2 × steps, ..., N).
-
-    Args:
-        rates: (steps + 1, ..., N, 3) rad/s at the ends of the steps.
-
-    """
-    stages = np.concatenate([rates[:-1], (rates[:-1] + rates[1:]) / 2])
-    return np.asarray(np.linalg.norm(stages, axis=-1))
-
-
 def step_bound(
     method: JointSpaceMethod, model: Model, sizes: dict[str, Array], h: float | Array, count: int,
-    stage_rates: Array | None = None,
+    lost: float | Array = 0.0,
 ) -> dict[str, Array]:  # fmt: skip
     """Compute the bounds of one of several steps.
 
     Args:
         sizes: of `_sizes`, (..., N): the largest at the ends of the steps.
         h: step [s], or (..., 1).
-        stage_rates: of `_stage_rates`; None where no step is taken.
+        lost: of `_lost_places`.
 
     Returns:
         By quantity the bounds (..., N), in its unit of `STEP_QUANTITIES`.
@@ -398,34 +386,56 @@ def step_bound(
     velocity += rounding * np.maximum(V, W * arm)
     free = np.array([KINDS[kind].holds_nothing for kind in kinds])
     if method.free_coordinates == "rigid motion":  # ṙ is kept in the body's axes, which turn
-        lost = count * h * omega * speed
-        if method.formula == "Runge-Kutta" and stage_rates is not None:
-            lost = lost + _lost_in_closed_forms(h, stage_rates) * rate * speed
-        velocity += np.where(free, lost, 0.0) @ path.T
+        velocity += np.where(free, count * h * omega * speed, 0.0) @ path.T
+    if (
+        len(model.spring_body) and count
+    ):  # springs feel the places of stages: (h ω)² <= 1 of what these are off
+        velocity += lost / h
     return {
         "step_rate": omega,
         "step_velocity": velocity,
         "step_attitude": count * h * omega + rounding + turned,
-        "step_position": count * h * velocity + (rounding + turned) * arm,
+        "step_position": count * h * velocity + (rounding + turned) * arm + lost,
     }
 
 
-def _lost_in_closed_forms(h: float | Array, stage_rates: Array) -> Array:
-    """What Pinocchio's dexp of a rigid motion loses in a step (..., N), over speed and rate [s].
+def _lost_places(
+    method: JointSpaceMethod, model: Model, speed: Array, h: float | Array, rates: Array
+) -> Array:
+    """How far off (..., N) [m] Pinocchio's closed forms of rigid motions put bodies in a step.
 
-    Its Jexp6 has β = 1/t² − sin t / (2 t (1 − cos t)) of the turn t = t n.  A cosine that is off by its last
-    place, ε, makes 1 − cos t off by 2 ε / t² of itself, β by 2 ε / t⁴ and β′/t by −2/t² of that.  With a
-    translation p and a rate ω these add up to a velocity that is off by
+    They divide 1 − cos t by the square of the turn t = t n.  A cosine that is off by its last place, ε, makes
+    the quotient off by ε / t², and a translation by ε / t of itself: in exp6 at the end of a step, and in
+    Jexp3 at the stages of Runge-Kutta.  There Jexp6 has β = 1/t² − sin t / (2 t (1 − cos t)), off by
+    2 ε / t⁴, and β′/t, by −2/t² of that.  Of a translation p and a rate ω they make a velocity, off by
 
-        2 ε / t³ |(n·p) ω⊥ + (p⊥·ω⊥) n|  <=  2 ε p ω / t³,    where ⊥ is across n
+        2 ε / t³ |(n·p) ω⊥ + (p⊥·ω⊥) n|  <=  2 ε p ω⊥ / t³,    where ⊥ is across n,
 
-    (measured: half of it at most, as the cosine is rounded to ε/2).  Stages move by p = h V / 2 and turn by
-    t = h Ω / 2, where Ω is the rate of the stage before, not ω: a body that turns slowly at the start of a
-    step and fast in it loses most.
+    and by 8 ε p ω / t, as the two are rounded each (measured: half of the first at most, as the cosine is
+    rounded to ε/2).  Stages move by p = h V / 2 and turn by t = h Ω / 2, where Ω is the rate of the stage
+    before, not ω: a body that turns slowly at the start of a step and fast in it loses most.
+
+    Args:
+        speed: (..., N) m/s, the largest at the ends of the steps.
+        h: step [s], or (..., 1).
+        rates: (steps + 1, ..., N, 3) rad/s at the ends of the steps.
+
     """
-    turn = h * stage_rates / 2
-    each = np.where(turn > MIN_CLOSED_TURN / 2, np.maximum(turn, MIN_CLOSED_TURN) ** -3.0, 0.0)
-    return np.asarray(EPS * h * np.max(each, axis=0))  # 2 ε h / 2
+    free = np.array([kind.holds_nothing for kind in model.kinds[: model.n]])
+    if method.free_coordinates != "rigid motion" or not np.any(free):
+        return np.zeros_like(speed)
+    norm, start, end = np.linalg.norm, rates[:-1], rates[1:]
+    if method.formula != "Runge-Kutta":
+        turn = h * norm(end, axis=-1)
+        lost = 1 / np.maximum(turn, MIN_CLOSED_TURN)
+    else:
+        turn = h / 2 * norm([start, (start + end) / 2], axis=-1)
+        t = np.maximum(turn, MIN_CLOSED_TURN)
+        fastest = np.maximum(norm(start, axis=-1), norm(end, axis=-1))
+        lost = h * norm(end - start, axis=-1) / t**3 + (2 + 4 * h * fastest) / t
+    used = np.where(free & (turn > MIN_CLOSED_TURN / 2), EPS * lost, 0.0)
+    largest = np.max(used.reshape(-1, *speed.shape), axis=0)
+    return np.asarray((h * speed * largest) @ _paths(model).T)
 
 
 def _arms(model: Model, sizes: dict[str, Array]) -> Array:
@@ -656,7 +666,8 @@ class StepsFromSamples:
         between = {name: np.maximum(x[:count], x[-count:]) for name, x in sizes.items()}
         of_torques = np.maximum(converted[:count], converted[-count:]) ** 4
         rates = np.array([self.states.omega[:count], self.states.omega[-count:]])
-        of_step = step_bound(method, model, between, h, 1, _stage_rates(rates))
+        self.lost = _lost_places(method, model, between["speed"], h, rates)
+        of_step = step_bound(method, model, between, h, 1, self.lost)
         self.of_step = {name: x * of_torques + self.uncertainty[name] for name, x in of_step.items()}
         self.is_of_one_pose = method.formula == "semi-implicit Euler" and method.implicit_forces != "all"
         self.of_totals = self._total_bounds(count, between)
@@ -693,11 +704,14 @@ class StepsFromSamples:
         unsure = {name: x + self.uncertainty[name] for name, x in passed_on.items()}
         energy += (model.mass * between["speed"] * unsure["step_velocity"]).sum(-1)
         energy += (between["rate"] * unsure["step_rate"]) @ inertia
+        accelerations = of_both_ends(np.asarray(self.bounds.scale["acceleration"]))
+        energy += (model.mass * accelerations * self.lost).sum(-1)
         rates, own = self.of_step, np.zeros(count)
         if _is_momentum_free(model):
             rates = {name: of_both_ends(self.of_samples[name]) + x for name, x in passed_on.items()}
             own = left
         off = (model.mass * reach * rates["step_velocity"]).sum(-1) + rates["step_rate"] @ inertia
+        off += (model.mass * between["speed"] * self.lost).sum(-1)
         return {"energy": energy, "momentum": of_both_ends(sums) + own + off}
 
     def mistake_ratios(self, model: Model, states: Sequence[State]) -> dict[str, float]:

@@ -15,7 +15,7 @@ from plumbline.execution.plan import Plan, TaskKind, task_keys
 from plumbline.judging.rows import RowContext, Verdict
 from plumbline.judging.step_level import judge_steps
 from plumbline.measurements.single_steps import STEP_STATES, run_step_study, step_sizes
-from plumbline.model.datatypes import BALL, KINDS, ROD, SPRING_FIELDS
+from plumbline.model.datatypes import BALL, FREE, KINDS, ROD, SPRING_FIELDS
 from plumbline.model.kinematics import complete_state, quaternion_exponential, quaternion_product
 from plumbline.model.loops import STABILISATION
 from plumbline.model.random_mechanisms import random_loop_mechanism, random_tree
@@ -117,6 +117,19 @@ def test_honest_engines_take_the_declared_step(engine, joints):
         rows = judged(load_adapter(engine), integrator, model, states)
         assert not disagreeing(rows), [row.reason for row in rows]
         assert all(row.level == "step" and row.ratio < 1 for row in rows)
+
+
+@pytest.mark.parametrize("name", ["semi-implicit-euler", "rkmk4"])
+def test_places_are_bounded_by_what_closed_forms_of_slow_turns_lose(name, monkeypatch):
+    """Pinocchio divides 1 − cos t by the square of a turn t; a moment makes a body turn faster within it."""
+    model = replace(random_tree(np.random.default_rng(2), 1, (FREE,)), moment=np.array([[0.3, 0, 0.03]]))
+    (state,), adapter = random_states(model, 1, seed=3), load_adapter("pinocchio")
+    slow = [replace(state, omega=state.omega * share, v=state.v / 60) for share in (0.02, 0.005, 0.0015)]
+    rows = judged(adapter, adapter.integrator(name), model, slow)
+    assert len(rows) == 4 and not disagreeing(rows), [row.reason for row in rows]
+    monkeypatch.setattr(step_comparison, "_lost_places", lambda *_: np.zeros(1))
+    wrong = disagreeing(judged(adapter, adapter.integrator(name), model, slow))
+    assert wrong.keys() == ({"step_position"} if name == "rkmk4" else set())
 
 
 def test_equations_of_a_branching_tree_of_rods_and_balls_are_compared():
