@@ -22,7 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -313,8 +313,8 @@ class FormulaSteps:
         sizes = [_sizes(states, vars(bounds)) for states, bounds in ends]
         largest = {name: np.max([one[name] for one in sizes], axis=0) for name in sizes[0]}
         h = np.array([h for _, h in self.places])[runs, None]
-        rates = np.array([links.omega[runs] for links in self.true[: count + 1]], float)
-        lost = _lost_places(self.method, self.model, largest["speed"], h, rates)
+        passed = [links[runs].rounded() for links in self.true[: count + 1]]
+        lost = _lost_in_closed_forms(self.method, self.model, passed, largest["speed"], h)
         return step_bound(self.method, self.model, largest, h, count, lost)
 
 
@@ -352,14 +352,14 @@ def _sizes(states: State, bounds: Mapping[str, Array]) -> dict[str, Array]:
 
 def step_bound(
     method: JointSpaceMethod, model: Model, sizes: dict[str, Array], h: float | Array, count: int,
-    lost: float | Array = 0.0,
+    lost: Lost | None = None,
 ) -> dict[str, Array]:  # fmt: skip
     """Compute the bounds of one of several steps.
 
     Args:
         sizes: of `_sizes`, (..., N): the largest at the ends of the steps.
         h: step [s], or (..., 1).
-        lost: of `_lost_places`.
+        lost: what closed forms lose in it.
 
     Returns:
         By quantity the bounds (..., N), in its unit of `STEP_QUANTITIES`.
@@ -371,6 +371,11 @@ def step_bound(
     kinds, path = model.kind[: model.n], _paths(model)  # of the joints of the tree
     # an angle of x rad is rounded to ε |x|
     turned = ANGLE_ROUNDINGS * EPS * (sizes.get("turned", np.zeros(model.n)) @ path.T)
+    if lost is not None:
+        turned = turned + lost.turn
+        # accelerations of stages that are turned by so much more than a rounding, by so much more
+        more = 1 + np.max(lost.turn, axis=-1, keepdims=True) / (ROUNDING_FACTOR * EPS)
+        turning, acceleration = turning * more, acceleration * more
     W, V = (np.max(np.where(path, x[..., None, :], 0.0), -1) for x in (rate, speed))
     arm = _arms(model, sizes)
     links = [
@@ -384,58 +389,84 @@ def step_bound(
     omega = ACCELERATION_FACTOR * h * (turning + passed_on["step_rate"]) + rounding * W
     velocity = ACCELERATION_FACTOR * h * (acceleration + passed_on["step_velocity"])
     velocity += rounding * np.maximum(V, W * arm)
+    if lost is not None and (len(model.spring_body) or model.has_loops):
+        # springs and corrections of gaps feel the places of stages: (h ω)² <= 1 of their errors, over a step
+        felt = np.max(lost.place, axis=-1, keepdims=True) / h
+        velocity += felt
+        gyration = np.sqrt(np.min(np.linalg.eigvalsh(model.inertia), axis=-1).clip(0) / model.mass)
+        omega += np.where(gyration > 0, felt / np.maximum(gyration, TINY), 0.0)
     free = np.array([KINDS[kind].holds_nothing for kind in kinds])
     if method.free_coordinates == "rigid motion":  # ṙ is kept in the body's axes, which turn
         velocity += np.where(free, count * h * omega * speed, 0.0) @ path.T
-    if (
-        len(model.spring_body) and count
-    ):  # springs feel the places of stages: (h ω)² <= 1 of what these are off
-        velocity += lost / h
     return {
         "step_rate": omega,
         "step_velocity": velocity,
         "step_attitude": count * h * omega + rounding + turned,
-        "step_position": count * h * velocity + (rounding + turned) * arm + lost,
+        "step_position": count * h * velocity + (rounding + turned) * arm + (lost.place if lost else 0.0),
     }
 
 
-def _lost_places(
-    method: JointSpaceMethod, model: Model, speed: Array, h: float | Array, rates: Array
-) -> Array:
-    """How far off (..., N) [m] Pinocchio's closed forms of rigid motions put bodies in a step.
+class Lost(NamedTuple):
+    """How far off Pinocchio's closed forms of slow turns put the bodies in a step."""
 
-    They divide 1 − cos t by the square of the turn t = t n.  A cosine that is off by its last place, ε, makes
-    the quotient off by ε / t², and a translation by ε / t of itself: in exp6 at the end of a step, and in
-    Jexp3 at the stages of Runge-Kutta.  There Jexp6 has β = 1/t² − sin t / (2 t (1 − cos t)), off by
-    2 ε / t⁴, and β′/t, by −2/t² of that.  Of a translation p and a rate ω they make a velocity, off by
+    place: Array  # (..., N) m
+    turn: Array  # (..., N) rad
 
-        2 ε / t³ |(n·p) ω⊥ + (p⊥·ω⊥) n|  <=  2 ε p ω⊥ / t³,    where ⊥ is across n,
+
+def _lost_in_closed_forms(
+    method: JointSpaceMethod, model: Model, states: Sequence[State], speed: Array, h: float | Array
+) -> Lost:
+    """Bound what is lost in a step; nothing by other engines.
+
+    The forms divide 1 − cos t by the square of the turn t = t n.  A cosine that is off by its last place, ε,
+    makes the quotient off by ε / t²: a translation by ε / t of itself, in exp6 at the end of a step and in
+    Jexp6 at the stages of Runge-Kutta; and Jexp3, there, the rate ω by ε ω⊥ / t, where ⊥ is across n.
+    Besides, Jexp6 has β = 1/t² − sin t / (2 t (1 − cos t)), off by 2 ε / t⁴, and β′/t, by −2/t² of that.
+    Of a translation p and a rate ω they make a velocity, off by
+
+        2 ε / t³ |(n·p) ω⊥ + (p⊥·ω⊥) n|  <=  2 ε p ω⊥ / t³
 
     and by 8 ε p ω / t, as the two are rounded each (measured: half of the first at most, as the cosine is
     rounded to ε/2).  Stages move by p = h V / 2 and turn by t = h Ω / 2, where Ω is the rate of the stage
     before, not ω: a body that turns slowly at the start of a step and fast in it loses most.
 
     Args:
-        speed: (..., N) m/s, the largest at the ends of the steps.
-        h: step [s], or (..., 1).
-        rates: (steps + 1, ..., N, 3) rad/s at the ends of the steps.
+        states: S each, at the ends of the steps.
+        speed: (S, N) m/s, the largest of them.
+        h: step [s], or (S, 1).
 
     """
-    free = np.array([kind.holds_nothing for kind in model.kinds[: model.n]])
-    if method.free_coordinates != "rigid motion" or not np.any(free):
-        return np.zeros_like(speed)
-    norm, start, end = np.linalg.norm, rates[:-1], rates[1:]
-    if method.formula != "Runge-Kutta":
-        turn = h * norm(end, axis=-1)
-        lost = 1 / np.maximum(turn, MIN_CLOSED_TURN)
-    else:
+    if method.free_coordinates != "rigid motion":
+        return Lost(np.zeros_like(speed), np.zeros_like(speed))
+    norm, rates = np.linalg.norm, np.array([_relative_rates(model, state) for state in states])
+    start, end = rates[:-1], rates[1:]
+    if method.formula == "Runge-Kutta":
         turn = h / 2 * norm([start, (start + end) / 2], axis=-1)
-        t = np.maximum(turn, MIN_CLOSED_TURN)
-        fastest = np.maximum(norm(start, axis=-1), norm(end, axis=-1))
-        lost = h * norm(end - start, axis=-1) / t**3 + (2 + 4 * h * fastest) / t
-    used = np.where(free & (turn > MIN_CLOSED_TURN / 2), EPS * lost, 0.0)
-    largest = np.max(used.reshape(-1, *speed.shape), axis=0)
-    return np.asarray((h * speed * largest) @ _paths(model).T)
+        fastest, change = np.maximum(norm(start, axis=-1), norm(end, axis=-1)), h * norm(end - start, axis=-1)
+    else:
+        turn = h * norm(end, axis=-1)[None]
+        fastest = change = np.zeros_like(turn[0])
+    t, is_closed = np.maximum(turn, MIN_CLOSED_TURN), turn > MIN_CLOSED_TURN / 2
+    place, turned = (
+        EPS * np.max(np.where(is_closed, lost, 0.0), axis=(0, 1, 2))
+        for lost in (change / t**3 + (2 + 4 * h * fastest) / t, change / t)
+    )
+    free, path = np.array([kind.holds_nothing for kind in model.kinds[: model.n]]), _paths(model)
+    return Lost(np.where(free, h * speed * place, 0.0) @ path.T, turned @ path.T)
+
+
+def _relative_rates(model: Model, states: State) -> Array:
+    """Rates (2, S, N, 3) [rad/s], world, of what is kept as a quaternion; 0 of other joints.
+
+    Of free bodies, balls and rods against the body before, and of bodies against their rods.
+    """
+    far, rod = model.body[: model.n, 0], model.rods[: model.n, None]
+    turning = np.array([kind.has_attitude for kind in model.kinds[: model.n]])[:, None]
+    bodies = rotate_vectors(rotation_matrix(states.p), states.omega)
+    of_rods = np.cross(states.u, states.udot)
+    before = np.where((far >= 0)[:, None], bodies[..., far, :], 0.0)
+    of_joints = np.where(rod, of_rods, bodies) - before
+    return np.where(turning, [of_joints, np.where(rod, bodies - of_rods, 0.0)], 0.0)
 
 
 def _arms(model: Model, sizes: dict[str, Array]) -> Array:
@@ -665,8 +696,8 @@ class StepsFromSamples:
         self.of_samples = {name: x * converted for name, x in of_samples.items()}
         between = {name: np.maximum(x[:count], x[-count:]) for name, x in sizes.items()}
         of_torques = np.maximum(converted[:count], converted[-count:]) ** 4
-        rates = np.array([self.states.omega[:count], self.states.omega[-count:]])
-        self.lost = _lost_places(method, model, between["speed"], h, rates)
+        passed = self.states[:count], self.states[-count:]
+        self.lost = _lost_in_closed_forms(method, model, passed, between["speed"], h)
         of_step = step_bound(method, model, between, h, 1, self.lost)
         self.of_step = {name: x * of_torques + self.uncertainty[name] for name, x in of_step.items()}
         self.is_of_one_pose = method.formula == "semi-implicit Euler" and method.implicit_forces != "all"
@@ -705,13 +736,13 @@ class StepsFromSamples:
         energy += (model.mass * between["speed"] * unsure["step_velocity"]).sum(-1)
         energy += (between["rate"] * unsure["step_rate"]) @ inertia
         accelerations = of_both_ends(np.asarray(self.bounds.scale["acceleration"]))
-        energy += (model.mass * accelerations * self.lost).sum(-1)
+        energy += (model.mass * accelerations * self.lost.place).sum(-1)
         rates, own = self.of_step, np.zeros(count)
         if _is_momentum_free(model):
             rates = {name: of_both_ends(self.of_samples[name]) + x for name, x in passed_on.items()}
             own = left
         off = (model.mass * reach * rates["step_velocity"]).sum(-1) + rates["step_rate"] @ inertia
-        off += (model.mass * between["speed"] * self.lost).sum(-1)
+        off += (model.mass * between["speed"] * self.lost.place).sum(-1)
         return {"energy": energy, "momentum": of_both_ends(sums) + own + off}
 
     def mistake_ratios(self, model: Model, states: Sequence[State]) -> dict[str, float]:
