@@ -71,7 +71,7 @@ DISTURBANCE = 1e-9  # of rates, to measure the growth of perturbations
 ANGLE_ROUNDINGS = 4
 MAX_STRETCH = 2e-15  # of a joint's quaternions
 MIN_MIDDLE_COSINE = 0.1  # of the second of two or three angles: at 0 two of their axes are one
-MAX_DISTANCE = 10.0  # of bodies from the origin, over the mechanism's size
+MAX_DISTANCE = 10.0  # of bodies from where their mechanism hangs, or from its free body, over its size
 MAX_COSINE_CHANGE = 1 / 2  # of that cosine in a step, over itself
 MAX_TURN = 1.0  # rad, step × fastest rate: beyond it explicit methods become unstable, and bounds do not hold
 SAMPLE_STRIDE = 8  # of the samples at which what changes slowly is estimated: rates, the formula's own errors
@@ -881,9 +881,10 @@ class RunSteps(StepsFromSamples):
     def _left_out_steps(self) -> NDArray[np.str_]:
         """Find the steps (steps,) for which no bound is given, and why; whether they agree plays no part.
 
-        The step does not resolve the motion there, or bodies are far away against the mechanism's size, whose
-        positions are rounded, or angles are near the pose in which two of their axes are one: at a cosine
-        below `MIN_MIDDLE_COSINE`, or that a step changes by `MAX_COSINE_CHANGE` of itself.
+        The step does not resolve the motion there, or slides have carried bodies far away against the
+        mechanism's size, or angles are near the pose in which two of their axes are one: at a cosine below
+        `MIN_MIDDLE_COSINE`, or that a step changes by `MAX_COSINE_CHANGE` of itself.  A free body may be
+        anywhere, and others count from it; but for loops, whose gaps are rounded as places are.
         The fastest rate is estimated at every `SAMPLE_STRIDE`-th sample and counts up to the next ones.
         """
         some = _every_few(len(self.velocities))
@@ -894,7 +895,10 @@ class RunSteps(StepsFromSamples):
         fast = _spread(rates, some)[1:] * self.h > most
         fast |= np.maximum(self.fastest[:-1], self.fastest[1:]) * self.h > most
         size = np.sum(stretched_length(self.model)) + np.max(np.linalg.norm(self.model.point, axis=2))
-        far = np.max(np.linalg.norm(self.states.r, axis=-1), axis=-1) > MAX_DISTANCE * size
+        first = np.argmax(_paths(self.model), axis=1)  # of the bodies between each and the world
+        free = np.array([kind.holds_nothing for kind in self.model.kinds])[first] & (not self.model.has_loops)
+        apart = self.states.r - np.where(free[:, None], self.states.r[:, first], 0.0)
+        far = np.max(np.linalg.norm(apart, axis=-1), axis=-1) > MAX_DISTANCE * size
         cosine = self.middle_cosine
         change = self.h * self.fastest / np.maximum(cosine, TINY)
         singular = (cosine < 1) & ((cosine < MIN_MIDDLE_COSINE) | (change > MAX_COSINE_CHANGE * cosine))
