@@ -12,6 +12,7 @@ import numpy as np
 
 from plumbline.engines.engine_calls import StepEvaluation
 from plumbline.judging.rows import JudgingResult, Row, RowContext, Verdict, with_unit
+from plumbline.measurements.single_steps import run_counts
 from plumbline.model.datatypes import EngineFailure, Integrator, Model, State, StepRun
 from plumbline.model.loops import keeps_dependent_rows
 from plumbline.model.step_methods import ConstrainedMethod, JointSpaceMethod
@@ -184,10 +185,11 @@ def _run_rows(
         ]
 
     run, h = attempt.run, attempt.step
-    if attempt.failure:
-        return one(Verdict.FAILED, f"in a run of {h:g} s per step: {attempt.failure}")
-    if run is None:
-        return one(Verdict.UNSUPPORTED, attempt.refusal, attempt.gap)
+    failed = (
+        one(Verdict.FAILED, f"in a run of {h:g} s per step: {attempt.failure}") if attempt.failure else []
+    )
+    if run is None or (failed and not isinstance(method, JointSpaceMethod)):
+        return failed or one(Verdict.UNSUPPORTED, attempt.refusal, attempt.gap)
     if not HAS_EXTENDED_PRECISION:
         return one(Verdict.UNSUPPORTED, NO_EXTENDED_PRECISION)
     if isinstance(method, ConstrainedMethod):
@@ -204,10 +206,12 @@ def _run_rows(
             steps = RunSteps(method, model, state, h, run)
         except EngineFailure as error:
             return one(Verdict.FAILED, str(error))
+        if failed and steps.is_stable(max(run_counts(model.n)) + 1 - len(run.trajectory.t)):
+            return failed
         found = steps.compare()
     alias = None if model.has_drag else integrator.alias_of
     return [
-        _run_row(context, integrator, quantity, deviations, h, run, alias, answer.cpu_time)
+        _run_row(context, integrator, quantity, deviations, h, run, alias, answer.cpu_time, bool(failed))
         for quantity, deviations in found.items()
     ]
 
@@ -231,9 +235,14 @@ def _left_out_words(found: StepDeviations, unit: str) -> tuple[str, float]:
 
 def _run_row(
     context: RowContext, integrator: Integrator, quantity: str, found: StepDeviations, h: float,
-    run: StepRun, alias: str | None, cpu_time: float,
+    run: StepRun, alias: str | None, cpu_time: float, is_cut: bool,
 ) -> Row:  # fmt: skip
-    """The row of one quantity at every step: the worst step decides, the first wrong one is named."""
+    """The row of one quantity at every step: the worst step decides, the first wrong one is named.
+
+    Args:
+        is_cut: whether the method itself does not go on after the last step.
+
+    """
     (name, unit), ratios = RUN_QUANTITIES[quantity], found.ratios
     ratios = np.where(np.isnan(ratios), np.inf, ratios)
     worst, column = (int(x) for x in np.unravel_index(np.argmax(ratios), ratios.shape))
@@ -275,6 +284,7 @@ def _run_row(
     if quantity != "run_mean" and (number := int(np.count_nonzero(left_out))):
         words, extra["left_out_steps"] = _left_out_words(found, unit), float(number)
         reason, extra["left_out_wrong_steps"] = reason + words[0], words[1]
+    reason += "; with this step the method itself does not go through the rest of the motion" * is_cut
     return context.make_row(
         "step", integrator.name, quantity, verdict, reason, unit,
         value=float(found.errors[worst, column]), tolerance=float(found.bounds[worst, column]), ratio=ratio,

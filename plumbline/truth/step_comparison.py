@@ -62,6 +62,7 @@ from plumbline.truth.step_formulas import (
     has_written_rows,
     joint_space_steps,
     projected_residual,
+    steps_in_charts,
 )
 
 STEP_ROUNDINGS = 32
@@ -877,6 +878,16 @@ class RunSteps(StepsFromSamples):
         found["run_mean"] = self._mean(off, found)
         found["run_samples"] = self._samples()
         return found
+
+    def is_stable(self, count: int) -> bool:
+        """Find out whether the declared formula itself takes so many steps more, from the last sample."""
+        coordinates, velocities = self.motion.coordinates, self.motion.velocities
+        assert coordinates is not None and velocities is not None
+        start = self.charts.divided(coordinates[-1:], velocities[-1:])
+        with np.errstate(all="ignore"):
+            passed = steps_in_charts(self.charts, *start, [self.h], count)
+            rates = np.array([np.linalg.norm(np.asarray(links.omega, float), axis=-1) for links in passed])
+            return bool(np.max(rates) * self.h <= MAX_TURN)
 
     def _left_out_steps(self) -> NDArray[np.str_]:
         """Find the steps (steps,) for which no bound is given, and why; whether they agree plays no part.

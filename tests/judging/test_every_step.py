@@ -14,6 +14,7 @@ from plumbline.engines.registry import load_adapter
 from plumbline.judging.rows import RowContext, Verdict
 from plumbline.judging.step_level import judge_steps
 from plumbline.measurements.single_steps import run_counts, run_step_study
+from plumbline.model.datatypes import EngineFailure
 from plumbline.model.kinematics import (
     angular_velocity,
     joint_vectors,
@@ -22,13 +23,14 @@ from plumbline.model.kinematics import (
     rotation_matrix,
 )
 from plumbline.model.sampling import compared_states
+from plumbline.scenario.generator import random_scenario
 from plumbline.studies.random_steps import mechanism_of
 from plumbline.truth import step_formulas
 from plumbline.truth.rounding_bound import EPS
 from plumbline.truth.step_charts import StepCharts
 from plumbline.truth.step_comparison import RUN_QUANTITIES, StepsFromSamples
 from tests.helpers.catalogue import catalogue_scenarios
-from tests.helpers.nightly_tests import SLOW, some_fast
+from tests.helpers.nightly_tests import SLOW, slow, some_fast
 from tests.helpers.pinocchio_by_crba import steps_by_crba
 from tests.helpers.planted_runs import RUN_MISTAKES
 from tests.helpers.planting import planted
@@ -71,6 +73,32 @@ def test_every_step_of_honest_engines_agrees(engine, name):
             assert {row.quantity for row in rows} == OF_JOINT_SPACE
         steps = max(run_counts(model.n))
         assert any(f" of {steps} steps " in row.reason for row in rows), [row.reason for row in rows]
+
+
+@slow
+def test_a_run_is_judged_as_far_as_the_method_itself_goes():
+    """Three bodies of 3 g to 20 kg become so fast at 0.16 s that RK4 is unstable."""
+    s, adapter = random_scenario(7, 60), load_adapter("mujoco")
+    rows = rows_of(adapter, adapter.integrator("RK4"), s.model, [s.state])
+    of_run = [row for row in rows if row.quantity in RUN_QUANTITIES]
+    assert {row.quantity for row in of_run} == OF_JOINT_SPACE
+    for row in of_run:
+        assert row.verdict == Verdict.AGREES
+        assert row.reason.endswith(
+            "with this step the method itself does not go through the rest of the motion"
+        )
+
+    def stops(self, model, state, integrator, step, count):
+        if count > 250:
+            raise EngineFailure("it stops")
+        return own(self, model, state, integrator, step, count)
+
+    own = type(adapter).step
+    monkeypatch.setattr(type(adapter), "step", stops)
+    (row,) = [
+        row for row in rows_of(adapter, adapter.integrator("RK4"), model, states) if row.quantity == "run"
+    ]
+    assert row.verdict == Verdict.FAILED and row.reason.endswith(": it stops")
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "pinocchio", "exudyn-tree"])
