@@ -88,6 +88,10 @@ def test_a_run_is_judged_as_far_as_the_method_itself_goes():
             "with this step the method itself does not go through the rest of the motion"
         )
 
+
+def test_a_run_that_stops_where_the_method_goes_on_has_failed(monkeypatch):
+    (model, states), adapter = subject("tumbling-ball"), load_adapter("mujoco")
+
     def stops(self, model, state, integrator, step, count):
         if count > 250:
             raise EngineFailure("it stops")
