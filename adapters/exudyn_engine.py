@@ -80,7 +80,7 @@ from plumbline.model.welding import BodyParts, RigidPart, undivided_bodies
 
 SECOND_AXIS = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # columns x, −z, y of the joint's axes
 SPECTRAL_RADIUS = 0.9
-NEWTON_ROUNDINGS = 32  # of the terms in a step's equations
+NEWTON_ROUNDINGS = 32  # of the terms in a step's equations, as in the bounds of steps
 GENERIC_ROWS = 6  # of a generic joint, free axes included
 STEP_SETTINGS = {
     "solver_atol": NEWTON_TOLERANCE,

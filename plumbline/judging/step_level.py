@@ -206,12 +206,12 @@ def _run_rows(
             steps = RunSteps(method, model, state, h, run)
         except EngineFailure as error:
             return one(Verdict.FAILED, str(error))
-        if failed and steps.is_stable(max(run_counts(model.n)) + 1 - len(run.trajectory.t)):
+        if failed and steps.resolves_rest(max(run_counts(model.n)) + 1 - len(run.trajectory.t)):
             return failed
         found = steps.compare()
     alias = None if model.has_drag else integrator.alias_of
     return [
-        _run_row(context, integrator, quantity, deviations, h, run, alias, answer.cpu_time, bool(failed))
+        _run_row(context, integrator, quantity, deviations, h, run, alias, answer.cpu_time, attempt.failure)
         for quantity, deviations in found.items()
     ]
 
@@ -235,12 +235,12 @@ def _left_out_words(found: StepDeviations, unit: str) -> tuple[str, float]:
 
 def _run_row(
     context: RowContext, integrator: Integrator, quantity: str, found: StepDeviations, h: float,
-    run: StepRun, alias: str | None, cpu_time: float, is_cut: bool,
+    run: StepRun, alias: str | None, cpu_time: float, failure: str | None,
 ) -> Row:  # fmt: skip
     """The row of one quantity at every step: the worst step decides, the first wrong one is named.
 
     Args:
-        is_cut: whether the method itself does not go on after the last step.
+        failure: of the engine after the last step, where the method itself does not resolve the motion.
 
     """
     (name, unit), ratios = RUN_QUANTITIES[quantity], found.ratios
@@ -284,7 +284,8 @@ def _run_row(
     if quantity != "run_mean" and (number := int(np.count_nonzero(left_out))):
         words, extra["left_out_steps"] = _left_out_words(found, unit), float(number)
         reason, extra["left_out_wrong_steps"] = reason + words[0], words[1]
-    reason += "; with this step the method itself does not go through the rest of the motion" * is_cut
+    if failure:
+        reason += f"; after these {failure}: with this step the method itself does not resolve the rest"
     return context.make_row(
         "step", integrator.name, quantity, verdict, reason, unit,
         value=float(found.errors[worst, column]), tolerance=float(found.bounds[worst, column]), ratio=ratio,

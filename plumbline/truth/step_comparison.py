@@ -14,6 +14,8 @@ Ten steps: the sum over the steps, times the growth of perturbations, as one.
 
 Of loops b is that of an engine that solves at joint coordinates of its own (`rounding_bounds`).
 
+Where a method keeps rigid motions, what closed forms lose of slow turns is added (`_lost_in_closed_forms`).
+
 Engines that solve a step iteratively are compared in parts that need no iteration: the quadrature of their
 own accelerations, the residual of their equations, and their first accelerations.
 """
@@ -34,6 +36,7 @@ from plumbline.model.kinematics import (
     angular_velocity,
     bodies_beyond,
     complete_state,
+    cross,
     rotate_vectors,
     rotation_matrix,
     stack_states,
@@ -314,7 +317,7 @@ class FormulaSteps:
         sizes = [_sizes(states, vars(bounds)) for states, bounds in ends]
         largest = {name: np.max([one[name] for one in sizes], axis=0) for name in sizes[0]}
         h = np.array([h for _, h in self.places])[runs, None]
-        passed = [links[runs].rounded() for links in self.true[: count + 1]]
+        passed = (links[runs].rounded() for links in self.true[: count + 1])
         lost = _lost_in_closed_forms(self.method, self.model, passed, largest["speed"], h)
         return step_bound(self.method, self.model, largest, h, count, lost)
 
@@ -396,9 +399,8 @@ def step_bound(
         velocity += felt
         gyration = np.sqrt(np.min(np.linalg.eigvalsh(model.inertia), axis=-1).clip(0) / model.mass)
         omega += np.where(gyration > 0, felt / np.maximum(gyration, TINY), 0.0)
-    free = np.array([KINDS[kind].holds_nothing for kind in kinds])
     if method.free_coordinates == "rigid motion":  # ṙ is kept in the body's axes, which turn
-        velocity += np.where(free, count * h * omega * speed, 0.0) @ path.T
+        velocity += np.where(_free(model), count * h * omega * speed, 0.0) @ path.T
     return {
         "step_rate": omega,
         "step_velocity": velocity,
@@ -415,7 +417,7 @@ class Lost(NamedTuple):
 
 
 def _lost_in_closed_forms(
-    method: JointSpaceMethod, model: Model, states: Sequence[State], speed: Array, h: float | Array
+    method: JointSpaceMethod, model: Model, states: Iterable[State], speed: Array, h: float | Array
 ) -> Lost:
     """Bound what is lost in a step; nothing by other engines.
 
@@ -452,8 +454,8 @@ def _lost_in_closed_forms(
         EPS * np.max(np.where(is_closed, lost, 0.0), axis=(0, 1, 2))
         for lost in (change / t**3 + (2 + 4 * h * fastest) / t, change / t)
     )
-    free, path = np.array([kind.holds_nothing for kind in model.kinds[: model.n]]), _paths(model)
-    return Lost(np.where(free, h * speed * place, 0.0) @ path.T, turned @ path.T)
+    path = _paths(model)
+    return Lost(np.where(_free(model), h * speed * place, 0.0) @ path.T, turned @ path.T)
 
 
 def _relative_rates(model: Model, states: State) -> Array:
@@ -464,7 +466,7 @@ def _relative_rates(model: Model, states: State) -> Array:
     far, rod = model.body[: model.n, 0], model.rods[: model.n, None]
     turning = np.array([kind.has_attitude for kind in model.kinds[: model.n]])[:, None]
     bodies = rotate_vectors(rotation_matrix(states.p), states.omega)
-    of_rods = np.cross(states.u, states.udot)
+    of_rods = cross(states.u, states.udot)
     before = np.where((far >= 0)[:, None], bodies[..., far, :], 0.0)
     of_joints = np.where(rod, of_rods, bodies) - before
     return np.where(turning, [of_joints, np.where(rod, bodies - of_rods, 0.0)], 0.0)
@@ -577,6 +579,11 @@ def _spread(values: Array, some: NDArray[np.intp]) -> Array:
     """Give each sample the larger of the two values around it, of those at some samples."""
     at = np.searchsorted(some, np.arange(some[-1] + 1))
     return np.maximum(values[at], values[np.maximum(at - 1, 0)])
+
+
+def _free(model: Model) -> NDArray[np.bool_]:
+    """Which bodies move freely."""
+    return np.array([kind.holds_nothing for kind in model.kinds[: model.n]])
 
 
 def _paths(model: Model) -> NDArray[np.bool_]:
@@ -879,8 +886,8 @@ class RunSteps(StepsFromSamples):
         found["run_samples"] = self._samples()
         return found
 
-    def is_stable(self, count: int) -> bool:
-        """Find out whether the declared formula itself takes so many steps more, from the last sample."""
+    def resolves_rest(self, count: int) -> bool:
+        """Find out whether the declared formula itself resolves so many steps more, from the last sample."""
         coordinates, velocities = self.motion.coordinates, self.motion.velocities
         assert coordinates is not None and velocities is not None
         start = self.charts.divided(coordinates[-1:], velocities[-1:])
@@ -907,7 +914,7 @@ class RunSteps(StepsFromSamples):
         fast |= np.maximum(self.fastest[:-1], self.fastest[1:]) * self.h > most
         size = np.sum(stretched_length(self.model)) + np.max(np.linalg.norm(self.model.point, axis=2))
         first = np.argmax(_paths(self.model), axis=1)  # of the bodies between each and the world
-        free = np.array([kind.holds_nothing for kind in self.model.kinds])[first] & (not self.model.has_loops)
+        free = _free(self.model)[first] & (not self.model.has_loops)
         apart = self.states.r - np.where(free[:, None], self.states.r[:, first], 0.0)
         far = np.max(np.linalg.norm(apart, axis=-1), axis=-1) > MAX_DISTANCE * size
         cosine = self.middle_cosine

@@ -119,18 +119,17 @@ def test_honest_engines_take_the_declared_step(engine, joints):
         assert all(row.level == "step" and row.ratio < 1 for row in rows)
 
 
-@pytest.mark.parametrize("name", ["semi-implicit-euler", "rkmk4"])
-def test_places_are_bounded_by_what_closed_forms_of_slow_turns_lose(name, monkeypatch):
-    """Pinocchio divides 1 − cos t by the square of a turn t; a moment makes a body turn faster within it."""
+def test_places_are_bounded_by_what_is_lost_where_a_slow_turn_becomes_fast(monkeypatch):
+    """Pinocchio divides 1 − cos t by the square of a stage's turn t; a moment makes the next rate larger."""
     model = replace(random_tree(np.random.default_rng(2), 1, (FREE,)), moment=np.array([[0.3, 0, 0.03]]))
     (state,), adapter = random_states(model, 1, seed=3), load_adapter("pinocchio")
     slow = [replace(state, omega=state.omega * share, v=state.v / 60) for share in (0.02, 0.005, 0.0015)]
-    rows = judged(adapter, adapter.integrator(name), model, slow)
+    rows = judged(adapter, adapter.integrator("rkmk4"), model, slow)
     assert len(rows) == 4 and not disagreeing(rows), [row.reason for row in rows]
     nothing = step_comparison.Lost(np.zeros(1), np.zeros(1))
     monkeypatch.setattr(step_comparison, "_lost_in_closed_forms", lambda *_: nothing)
-    wrong = disagreeing(judged(adapter, adapter.integrator(name), model, slow))
-    assert wrong.keys() == ({"step_position"} if name == "rkmk4" else set())
+    wrong = disagreeing(judged(adapter, adapter.integrator("rkmk4"), model, slow))
+    assert wrong.keys() == {"step_position"} and wrong["step_position"] > 100
 
 
 def test_equations_of_a_branching_tree_of_rods_and_balls_are_compared():
