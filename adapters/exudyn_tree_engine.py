@@ -378,13 +378,15 @@ def _perpendicular_unit(unit: Array) -> Array:
 
 def _alone(name: str, order: int, method: str | JointSpaceMethod, note: str) -> Any:
     """An integrator that is compared by single steps alone, of a method or one with a tableau."""
-    by = runge_kutta(method, "joint angles") if isinstance(method, str) else method
+    by = runge_kutta(method, **_SOLVED) if isinstance(method, str) else method
     names = f"DynamicSolverType.{name}", "TimeIntegrationSettings.absoluteTolerance"
     return {"order": order, "method": by, "note": note, "has_motions": False, "names": names}
 
 
-_EULER = JointSpaceMethod("Runge-Kutta", "joint angles", stages=((),), weights=(1.0,))
-_VERLET = JointSpaceMethod("velocity Verlet", "joint angles", reuses_acceleration=True)
+# EXUdense, Exudyn's usual solver, keeps the inverse of a matrix in place of its factors.
+_SOLVED: Any = {"coordinates": "joint angles", "inverts_mass_matrix": True}
+_EULER = JointSpaceMethod("Runge-Kutta", **_SOLVED, stages=((),), weights=(1.0,))
+_VERLET = JointSpaceMethod("velocity Verlet", **_SOLVED, reuses_acceleration=True)
 _MIDPOINT, _HEUN = "the explicit midpoint rule (order 2)", "Heun's method of order 3"
 _ODE23, _DOPRI5 = "Bogacki and Shampine's method of order 3", "Dormand and Prince's method of order 5"
 _TO_SECOND = "velocity Verlet; of order 2 without terms of velocities"
@@ -404,7 +406,7 @@ class ExudynTree(ExudynAdapter):
             4,
             (4, 5, 6, 7, 8),
             note="classical Runge-Kutta on joint angles",
-            method=classical_runge_kutta("joint angles"),
+            method=classical_runge_kutta(**_SOLVED),
             names=names_of_steps("exudyn-tree")["RK44"],
         ),
         Integrator("ExplicitEuler", "step", **_alone("ExplicitEuler", 1, _EULER, "explicit Euler")),

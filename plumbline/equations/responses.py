@@ -132,6 +132,22 @@ class Responses:
         found = self._respond(effort=units), self.to_gaps() * unit[:, None, None, None]
         return np.concatenate(found, -1), np.concatenate([rate[..., 0], multipliers], -1)
 
+    def errors_of_inverse(self) -> Array:
+        """Return what r̈ and α (S, N, 2) are off by, over ε, where ν̇ is a product of H⁻¹ and b, of a tree.
+
+        With H = RᵀR, each column x of H⁻¹ is off by R⁻¹ δ, |δ| <= ε |R| |x|, from its own back substitution
+        (Higham, Accuracy and Stability of Numerical Algorithms, 2002, theorem 8.5).  In H⁻¹ b the columns
+        cancel each other, and these errors do not; those of R cancel, as it is the same for all.
+        """
+        values, vectors = np.linalg.eigh(self._H)
+        roots = np.sqrt(np.maximum(values, np.finfo(float).eps))
+        R = np.linalg.qr(roots[:, :, None] * vectors.mT, mode="r")
+        pushed = (self._pushed - self._weigh(self._coasting)).reshape(self._count, -1, 1)
+        b = self._A.mT @ pushed + self._effort[..., None]
+        lost = np.abs(R) @ (np.abs(self._inverse) @ np.abs(b))
+        moved = (self._A @ np.linalg.inv(R)).reshape(self._count, self.n, 2, 3, -1)
+        return np.asarray((np.linalg.norm(moved, axis=3) @ lost[:, None])[..., 0])
+
     def indeterminate_wrenches(self, k: int) -> list[tuple[Array, Array]]:
         """Return forces and moments (S, 3) of a joint that span what is indeterminate of its wrench."""
         own = self.indeterminate[:, 6 * k : 6 * k + 6]

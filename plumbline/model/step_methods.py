@@ -50,6 +50,8 @@ class JointSpaceMethod:
     gap_form: Literal["logarithm", "distance and quaternion"] = "logarithm"
     # joints with a pitch are cylindrical ones, x too is how far the slide is off the pitch times the turn
     holds_pitches: bool = False
+    # a is the product of the inverse of M and the forces f: M a then is off by ε |M| |M⁻¹| |f|, not by ε |f|
+    inverts_mass_matrix: bool = False
     stages: tuple[tuple[float, ...], ...] = ()  # the tableau's rows below the diagonal
     weights: tuple[float, ...] = ()
     new_velocity_share: float = 1.0  # x in q₁ = q ⊕ h (x v₁ + (1−x) v): 0 is explicit Euler
@@ -139,10 +141,12 @@ TABLEAUS: Mapping[str, tuple[tuple[tuple[float, ...], ...], tuple[float, ...]]] 
 }  # fmt: skip
 
 
-def runge_kutta(name: str, coordinates: Literal["joint rotations", "joint angles"]) -> JointSpaceMethod:
-    """Return a method of `TABLEAUS`."""
+def runge_kutta(
+    name: str, coordinates: Literal["joint rotations", "joint angles"], **fields: Any
+) -> JointSpaceMethod:
+    """Return a method of `TABLEAUS`, with further fields of `JointSpaceMethod`."""
     stages, weights = TABLEAUS[name]
-    return JointSpaceMethod("Runge-Kutta", coordinates, stages=stages, weights=weights)
+    return JointSpaceMethod("Runge-Kutta", coordinates, **fields, stages=stages, weights=weights)
 
 
 def generalized_alpha(

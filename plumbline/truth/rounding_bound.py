@@ -24,6 +24,8 @@ the equations by as much: the answer to their roundings (tB, and that of the row
 their accelerations and the forces of the rows together: there σ plays no part, tS is what the factors of
 these equations round, and the rows have the roundings of the gaps x and of their rates, in a² x + 2 a ẋ.
 
+Steps of an engine that multiplies by the inverse of its mass matrix have `Responses.errors_of_inverse`, too.
+
 The torque of a joint's coordinate is e − k (x − x₀) − c ẋ − a ẍ.  Engines that hold positions find x and the
 lengths of springs as differences: k multiplies their roundings, of the positions' size.
 
@@ -69,6 +71,7 @@ ROUNDING_FACTOR = 64  # state quantities; the worst error of a sound engine is a
 SUM_ROUNDING_FACTOR = 256  # energies, momenta, entries of the mass matrix
 MAX_RELATIVE_BOUND = 1e-8  # a tolerance above this fraction of its scale could hide a mistake
 POSITION_SHARE = 1 / 32  # positions are rounded once or twice, where the bound counts 64 roundings of a term
+INVERSE_SHARE = 1 / 32  # likewise what the columns of an inverse round apart
 MAX_ENTRIES = 3_000_000  # of the responses of a batch of states: more do not fit the processor's cache
 
 
@@ -305,6 +308,7 @@ class _Terms:
         # 1/s, of the gaps of loops, and of slides that are held at a pitch
         self.correction = method.gap_correction if method else 0.0
         self.pitch_correction = self.correction if method and method.holds_pitches else 0.0
+        self.inverts_mass_matrix = method is not None and method.inverts_mass_matrix
         self.responses = found = Responses(model, states, ends, row_scale)
         norm, self.model, self.state, self.n = np.linalg.norm, model, found.state, model.n
         state = found.state
@@ -521,6 +525,12 @@ class _Terms:
             rods[:, k] += load * (what in ("upper", "lower"))
             of_joints[:, 0] += load * (np.linalg.norm(tip[:, k], axis=-1) if what == "slide" else 1.0)
             of_joints[:, 1] += load * joints.rate[:, at]
+        if t.inverts_mass_matrix:
+            off = INVERSE_SHARE * self.responses.errors_of_inverse()
+            total[..., :2] += off
+            force, moment = t.m * off[..., 0], t.J * off[..., 1]
+            of_joints[:, 0] += np.sum(np.linalg.norm(state.r, axis=-1) * force + moment, -1)
+            of_joints[:, 1] += np.sum(t.speed * force + rate * moment, -1)
         depth = np.broadcast_to(np.sum(t.below, axis=0), height.shape)
         return total, scale, sums, rods, of_joints, np.stack([height, with_place, depth, rate])
 
