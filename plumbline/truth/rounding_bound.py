@@ -240,7 +240,7 @@ def _of_loops(model: Model, states: State, method: JointSpaceMethod | None) -> R
     cut = cut_open(model)
     there = cut.state(states)
     terms = _Terms(cut.model, there, None, cut.ends, cut.row_scale, method)
-    totals, scales, sums, _, joints, motion = terms.bounds(is_eliminated=method is None)
+    totals, scales, sums, rods, joints, motion = terms.bounds(is_eliminated=method is None)
     (of_welds, of_gaps), spread = terms.weld_errors(), np.ones(len(totals))
     if method is None:
         spread += 1 / smallest_singular_values(cut, there, regular_rank(model, states[0]))
@@ -257,9 +257,9 @@ def _of_loops(model: Model, states: State, method: JointSpaceMethod | None) -> R
     scale = {name: np.repeat(value[:, None], counts[name], axis=1) for name, value in largest.items()}
     spread_sums = {name: size * spread for name, size in sums.items()}
     largest_motion = np.repeat(np.max(motion, axis=-1, keepdims=True), model.n, axis=-1)
-    rods = np.zeros((len(spread), model.n))
+    bodies = cut.place[: model.n]
     of_joints = spread[:, None] * joints, spread[:, None] * largest_motion
-    return _bound(total[:, cut.place], scale, spread_sums, rods, *of_joints, of_gaps[:, cut.place])
+    return _bound(total[:, cut.place], scale, spread_sums, rods[:, bodies], *of_joints, of_gaps[:, cut.place])
 
 
 def _bound(
