@@ -23,7 +23,7 @@ from plumbline.model.kinematics import (
     rotation_matrix,
 )
 from plumbline.model.sampling import compared_states
-from plumbline.scenario.generator import random_scenario
+from plumbline.scenario.generator import random_mechanism, random_scenario
 from plumbline.studies.random_steps import mechanism_of
 from plumbline.truth import step_comparison, step_formulas
 from plumbline.truth.rounding_bound import EPS
@@ -73,6 +73,17 @@ def test_every_step_of_honest_engines_agrees(engine, name):
             assert {row.quantity for row in rows} == OF_JOINT_SPACE
         steps = max(run_counts(model.n))
         assert any(f" of {steps} steps " in row.reason for row in rows), [row.reason for row in rows]
+
+
+@slow
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
+def test_the_spins_of_rods_in_loops_are_passed_on(integrator):
+    """A rod's spin is off by as much as its small inertia lets it; it carries a body 17 m away on slides."""
+    s, adapter = random_mechanism(7, 17), load_adapter("mujoco")
+    rows = rows_of(adapter, adapter.integrator(integrator), s.model, [s.state])
+    of_run = [row for row in rows if row.quantity in RUN_QUANTITIES]
+    assert {row.quantity for row in of_run} == OF_JOINT_SPACE
+    assert all(row.verdict == Verdict.AGREES for row in of_run), of_run
 
 
 @slow
