@@ -94,13 +94,16 @@ from plumbline.model.kinematics import (
     turn_of_z,
 )
 from plumbline.model.loops import STABILISATION, cut_open
-from plumbline.model.step_methods import JointSpaceMethod, classical_runge_kutta
+from plumbline.model.step_methods import SERIES_TURN, JointSpaceMethod, classical_runge_kutta
 from plumbline.model.welding import BodyParts, undivided_bodies
 
 ROD_AXIAL_INERTIA = 1 / 3  # of a rod about its own axis, over the trace of the inertia that it carries
 # Of steps: coordinates of joints, and of free bodies and of gaps of loops.
 ROTATIONS: tuple[Literal["joint rotations"], float] = "joint rotations", ROD_AXIAL_INERTIA
-RIGID: Any = {"free_coordinates": "rigid motion", "gap_correction": STABILISATION}
+# exp3 and exp6 take series below the same turn.
+RIGID: Any = {
+    "free_coordinates": "rigid motion", "gap_correction": STABILISATION, "closed_form_turn": SERIES_TURN,
+}  # fmt: skip
 # Of constraintDynamics: accuracy, damping (any from 1e-12 to 1e-3 does), largest number of steps.
 PROXIMAL_SETTINGS = 1e-15, 1e-8, 50
 MAX_DENSE_JOINTS = 10  # joints up to which their 3 × 3 blocks are solved faster as one matrix

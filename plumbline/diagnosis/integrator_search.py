@@ -343,8 +343,11 @@ def _with_weights(declared: JointSpaceMethod, i: int, j: int, x: float) -> Joint
 
 
 def _other_formulas(declared: JointSpaceMethod, model: Model) -> Iterator[tuple[str, JointSpaceMethod]]:
-    names_kept = "rod_axial_inertia", "free_coordinates", "gap_correction", "gap_form", "holds_pitches"
-    kept = {name: getattr(declared, name) for name in (*names_kept, "inverts_mass_matrix")}
+    names_kept = (
+        "rod_axial_inertia", "free_coordinates", "gap_correction", "gap_form", "holds_pitches",
+        "inverts_mass_matrix", "closed_form_turn",
+    )  # fmt: skip
+    kept = {name: getattr(declared, name) for name in names_kept}
     euler = JointSpaceMethod("semi-implicit Euler", declared.coordinates, **kept)
     is_euler, turns = declared.formula == "semi-implicit Euler", declared.coordinates == "joint rotations"
     is_implicit, verlet = declared.implicit_forces != "none", replace(euler, formula="velocity Verlet")

@@ -38,7 +38,7 @@ from plumbline.model.invariants import (
     motion_errors,
 )
 from plumbline.model.kinematics import angular_velocity, with_joint_coordinates
-from plumbline.model.step_methods import JointSpaceMethod, classical_runge_kutta
+from plumbline.model.step_methods import SERIES_TURN, JointSpaceMethod, classical_runge_kutta
 from plumbline.truth.parameter_effects import difference_effects, effects_at_states
 from plumbline.truth.parameters import STATE_KINDS, Parameter, list_parameters, perturb
 from plumbline.truth.predictability_horizon import project_to_manifold
@@ -69,7 +69,9 @@ RUN_MISTAKE = 1e-6  # of a parameter's scale in them, in extended precision
 MOTION_SAMPLES = 32  # of a motion, at which the effect of a mistake is measured; or all, where it has fewer
 PROOF_SAMPLES = 17  # of the motion, at which a parameter's term is shown to vanish
 # of free bodies the coordinates of the wider bound: what it reports, the others report too
-STEP_METHOD = classical_runge_kutta("joint rotations", free_coordinates="rigid motion")
+STEP_METHOD = classical_runge_kutta(
+    "joint rotations", free_coordinates="rigid motion", closed_form_turn=SERIES_TURN
+)
 _PLACES: dict[str, str] = {
     "state": "at every compared state",
     "step": "at every state that a compared step starts from",

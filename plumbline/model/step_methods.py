@@ -7,7 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import inf
 from typing import Any, Literal
+
+# rad: below it the terms of series that are left out of 1 − cos t are smaller than rounding
+SERIES_TURN = 2.0**-13
 
 
 @dataclass(frozen=True)
@@ -52,6 +56,8 @@ class JointSpaceMethod:
     holds_pitches: bool = False
     # a is the product of the inverse of M and the forces f: M a then is off by ε |M| |M⁻¹| |f|, not by ε |f|
     inverts_mass_matrix: bool = False
+    # rad; from it on turns and rigid motions go by closed forms, which lose digits of 1 − cos t over t²
+    closed_form_turn: float = inf
     stages: tuple[tuple[float, ...], ...] = ()  # the tableau's rows below the diagonal
     weights: tuple[float, ...] = ()
     new_velocity_share: float = 1.0  # x in q₁ = q ⊕ h (x v₁ + (1−x) v): 0 is explicit Euler

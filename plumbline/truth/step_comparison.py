@@ -14,7 +14,7 @@ Ten steps: the sum over the steps, times the growth of perturbations, as one.
 
 Of loops b is that of an engine that solves at joint coordinates of its own (`rounding_bounds`).
 
-Where a method keeps rigid motions, what closed forms lose of slow turns is added (`_lost_in_closed_forms`).
+Where a method takes closed forms, what they lose of slow turns is added (`_lost_in_closed_forms`).
 
 Engines that solve a step iteratively are compared in parts that need no iteration: the quadrature of their
 own accelerations, the residual of their equations, and their first accelerations.
@@ -79,8 +79,6 @@ MAX_DISTANCE = 10.0  # of bodies from where their mechanism hangs, or from its f
 MAX_COSINE_CHANGE = 1 / 2  # of that cosine in a step, over itself
 MAX_TURN = 1.0  # rad, step × fastest rate: beyond it explicit methods become unstable, and bounds do not hold
 SAMPLE_STRIDE = 8  # of the samples at which what changes slowly is estimated: rates, the formula's own errors
-# rad, of a stage: below it Pinocchio takes the first terms of series instead of closed forms of rigid motions
-MIN_CLOSED_TURN = float(np.finfo(float).eps) ** (1 / 4)
 LOST_DIGITS = 4.0  # by how much errors of one size may differ by chance
 # Roundings that are alike in all steps, of those in a bound: see `RunSteps._mean`.
 CONSTANT_ROUNDINGS, CONSTANT_FACTORS = 16 / STEP_ROUNDINGS, 12 / ROUNDING_FACTOR / ACCELERATION_FACTOR
@@ -410,7 +408,7 @@ def step_bound(
 
 
 class Lost(NamedTuple):
-    """How far off Pinocchio's closed forms of slow turns put the bodies in a step."""
+    """How far off closed forms of slow turns put the bodies in a step."""
 
     place: Array  # (..., N) m
     turn: Array  # (..., N) rad
@@ -419,7 +417,7 @@ class Lost(NamedTuple):
 def _lost_in_closed_forms(
     method: JointSpaceMethod, model: Model, states: Iterable[State], speed: Array, h: float | Array
 ) -> Lost:
-    """Bound what is lost in a step; nothing by other engines.
+    """Bound what is lost in a step by a method that takes closed forms of turns and of rigid motions.
 
     The forms divide 1 − cos t by the square of the turn t = t n.  A cosine that is off by its last place, ε,
     makes the quotient off by ε / t²: a translation by ε / t of itself, in exp6 at the end of a step and in
@@ -439,7 +437,7 @@ def _lost_in_closed_forms(
         h: step [s], or (S, 1).
 
     """
-    if method.free_coordinates != "rigid motion":
+    if method.closed_form_turn == np.inf:
         return Lost(np.zeros_like(speed), np.zeros_like(speed))
     norm, rates = np.linalg.norm, np.array([_relative_rates(model, state) for state in states])
     start, end = rates[:-1], rates[1:]
@@ -449,7 +447,7 @@ def _lost_in_closed_forms(
     else:
         turn = h * norm(end, axis=-1)[None]
         fastest = change = np.zeros_like(turn[0])
-    t, is_closed = np.maximum(turn, MIN_CLOSED_TURN), turn > MIN_CLOSED_TURN / 2
+    t, is_closed = np.maximum(turn, method.closed_form_turn), turn > method.closed_form_turn / 2
     place, turned = (
         EPS * np.max(np.where(is_closed, lost, 0.0), axis=(0, 1, 2))
         for lost in (change / t**3 + (2 + 4 * h * fastest) / t, change / t)
