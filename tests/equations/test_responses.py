@@ -203,7 +203,7 @@ def test_velocities_alone_accelerate_a_joint_along_what_it_holds(name):
 
 
 def test_errors_of_an_inverse_are_those_of_one_in_single_precision():
-    """M of trees at rest, of bodies of 10 g to 100 kg: by its inverse, and by a solution, which is sharper."""
+    """Of trees at rest with bodies of 10 g to 100 kg; a solution without an inverse loses less."""
     by_inverse, by_solution = list[float](), list[float]()
     for seed in range(40):
         rng = np.random.default_rng(seed)
