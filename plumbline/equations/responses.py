@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
+from scipy.linalg import lu
 
 from plumbline.equations.arithmetic import floats, stacked
 from plumbline.equations.tree import Tree
@@ -135,17 +136,17 @@ class Responses:
     def errors_of_inverse(self) -> Array:
         """Return what r̈ and α (S, N, 2) are off by, over ε, where ν̇ is a product of H⁻¹ and b, of a tree.
 
-        With H = RᵀR, each column x of H⁻¹ is off by R⁻¹ δ, |δ| <= ε |R| |x|, from its own back substitution
-        (Higham, Accuracy and Stability of Numerical Algorithms, 2002, theorem 8.5).  In H⁻¹ b the columns
-        cancel each other, and these errors do not; those of R cancel, as it is the same for all.
+        By factors L U of H in SI units, with pivots of rows, each column x of H⁻¹ is off by U⁻¹ δ with
+        |δ| <= ε |U| |x|, from its own back substitution (Higham, Accuracy and Stability of Numerical
+        Algorithms, 2002, theorem 8.5).  In H⁻¹ b the columns cancel each other, and these errors do not;
+        those of the factors cancel, as they are the same for all.
         """
-        values, vectors = np.linalg.eigh(self._H)
-        roots = np.sqrt(np.maximum(values, np.finfo(float).eps))
-        R = np.linalg.qr(roots[:, :, None] * vectors.mT, mode="r")
+        _, _, U = lu(self._H / (self._unit[:, :, None] * self._unit[:, None]))
+        U = U * self._unit[:, None]
         pushed = (self._pushed - self._weigh(self._coasting)).reshape(self._count, -1, 1)
         b = self._A.mT @ pushed + self._effort[..., None]
-        lost = np.abs(R) @ (np.abs(self._inverse) @ np.abs(b))
-        moved = (self._A @ np.linalg.inv(R)).reshape(self._count, self.n, 2, 3, -1)
+        lost = np.abs(U) @ (np.abs(self._inverse) @ np.abs(b))
+        moved = (self._A @ np.linalg.inv(U)).reshape(self._count, self.n, 2, 3, -1)
         return np.asarray((np.linalg.norm(moved, axis=3) @ lost[:, None])[..., 0])
 
     def indeterminate_wrenches(self, k: int) -> list[tuple[Array, Array]]:
@@ -235,6 +236,7 @@ class Responses:
             H * unit[:, :, None] * unit[:, None],
             self._effort * unit,
         )
+        self._unit = unit  # of SI
 
     def _join(self, scale: Array) -> None:
         """The inverse of H on the motions that keep the rows of the ends; the indeterminate wrenches."""
