@@ -206,7 +206,7 @@ class _Objects(Arithmetic):
         return a.T
 
     def symmetric(self, a: Any) -> Any:
-        return np.where(np.tri(len(a), dtype=bool), a.T, a)
+        return np.where(np.tri(len(a)), a.T, a)
 
     def dot(self, a: Any, b: Any) -> Any:
         return (a.T @ b).item()

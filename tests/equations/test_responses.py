@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from plumbline.equations.responses import Responses
+from plumbline.model.datatypes import State
 from plumbline.model.kinematics import (
     complete_state,
     mass_matrix,
+    normalised,
     rotation_matrix,
     stack_states,
     velocity_jacobian,
@@ -225,3 +227,54 @@ def test_errors_of_an_inverse_are_those_of_one_in_single_precision():
             ratios.append(np.max(off[bound > 0] / bound[bound > 0]))
     assert 0.03 <= min(by_inverse) <= max(by_inverse) <= 1  # measured: 0.09 and 0.79
     assert min(np.divide(by_solution, by_inverse)) <= 0.05  # an inverse loses what a solution does not
+
+
+def test_ends_without_the_velocity_terms_of_rods_as_bodies():
+    """A ball, a body on a rod on it, and a free one that it is joined to; and with a light body as the rod."""
+    tree = replace(
+        random_tree(np.random.default_rng(5), 3, kinds=("ball",)), kind=("ball", "rod", "free"),
+        body=np.array([[-1, 0], [0, 1], [-1, 2]]), length=np.array([0.0, 0.7, 0.0]),
+    )  # fmt: skip
+    (state,) = random_states(tree, 1, 3)
+    fields = ("mass", "inertia", "force", "moment", "drag_force", "drag_moment")
+    light = {name: np.insert(getattr(tree, name), 1, 0.0, axis=0) for name in fields}
+    light["mass"][1], light["inertia"][1] = 1e-9, 1e-9 * np.eye(3)
+    point = np.insert(tree.point, 1, [tree.point[1, 0], [0.0, 0.0, -tree.length[1]]], axis=0)
+    point[2, 0] = 0.0  # the centre of the light body is at the far end
+    with_body = replace(
+        tree, kind=("ball", "ball", "ball", "free"), body=np.array([[-1, 0], [0, 1], [1, 2], [-1, 3]]),
+        length=np.zeros(4), point=point, turn=np.insert(tree.turn, 1, tree.turn[1], axis=0), **light,
+    )  # fmt: skip
+    x, y, z = state.u[1]
+    along = normalised(np.array([1 + z, -y, x, 0.0]))  # turns z to u
+    spin = rotation_matrix(along).T @ np.cross(state.u[1], state.udot[1])
+    p, omega, r, v = (np.insert(getattr(state, n), 1, 0.0, axis=0) for n in ("p", "omega", "r", "v"))
+    p[1], omega[1] = along, spin
+    same = complete_state(with_body, State(p, omega, r=r, v=v))
+    np.testing.assert_allclose(same.r[[0, 2, 3]], state.r, atol=1e-12)
+    by_rod, expected = (
+        Responses(mechanism, [there], ends, end_rows=rows).solution[0, places, :2]
+        for mechanism, there, ends, rows, places in (
+            (tree, state, [(1, 2)], "without those of rods as bodies", [0, 1, 2]),
+            (with_body, same, [(2, 3)], "without velocity terms", [0, 2, 3]),
+        )
+    )
+    size = np.max(np.abs(expected))
+    np.testing.assert_allclose(by_rod, expected, atol=1e-6 * size)
+    plain = Responses(tree, [state], [(1, 2)], end_rows="without velocity terms").solution[0, :, :2]
+    assert np.max(np.abs(plain - expected)) > 1e-3 * size
+
+
+@pytest.mark.parametrize("name", ["bricard", "four-bar"])
+def test_what_is_indeterminate_of_a_joints_wrench_is_spanned_by_unit_wrenches(name):
+    model, states, ends = cut(name, 3)
+    found = Responses(model, states, *ends)
+    for k in range(model.n):
+        own = found.indeterminate[:, 6 * k : 6 * k + 6]
+        pairs = [np.concatenate(pair, -1) for pair in found.indeterminate_wrenches(k)]
+        span = np.array(pairs).reshape(len(pairs), len(states), 6).transpose(1, 2, 0)
+        assert np.max(np.abs(span.mT @ span - np.eye(len(pairs))), initial=0.0) < 1e-12
+        np.testing.assert_allclose(
+            span @ (span.mT @ own), own, atol=1e-6 * np.max(np.abs(found.indeterminate))
+        )
+    assert len(found.indeterminate_wrenches(0)) > 0

@@ -141,6 +141,7 @@ TEST_FILES = {  # by target or top folder, the tests that must notice its mutant
             for name in ("definition", "rounding_bound", "certified_state", "certified_tree")
         ),
         *(f"tests/diagnosis/test_{name}.py" for name in ("diagnose", "force_location", "prediction")),
+        "tests/judging/test_step_level.py",
     ],
 }
 TOKEN = re.compile(r"\"[^\"]*\"|'[^']*'|\w+\.?\w*|[^\w\s]+")
