@@ -230,7 +230,7 @@ def test_errors_of_an_inverse_are_those_of_one_in_single_precision():
 
 
 def test_ends_without_the_velocity_terms_of_rods_as_bodies():
-    """A ball, a body on a rod on it, and a free one that it is joined to; and with a light body as the rod."""
+    """A ball, on it a body on a rod that is joined to a free one; the same with a light body as the rod."""
     tree = replace(
         random_tree(np.random.default_rng(5), 3, kinds=("ball",)), kind=("ball", "rod", "free"),
         body=np.array([[-1, 0], [0, 1], [-1, 2]]), length=np.array([0.0, 0.7, 0.0]),
