@@ -230,9 +230,9 @@ def test_errors_of_an_inverse_are_those_of_one_in_single_precision():
 
 
 def test_ends_without_the_velocity_terms_of_rods_as_bodies():
-    """A ball, on it a body on a rod that is joined to a free one; the same with a light body as the rod."""
+    """Of a body on a rod below another one, joined to a free one; the same with a light body as the rod."""
     tree = replace(
-        random_tree(np.random.default_rng(5), 3, kinds=("ball",)), kind=("ball", "rod", "free"),
+        random_tree(np.random.default_rng(5), 3, kinds=("ball",)), kind=("universal", "rod", "free"),
         body=np.array([[-1, 0], [0, 1], [-1, 2]]), length=np.array([0.0, 0.7, 0.0]),
     )  # fmt: skip
     (state,) = random_states(tree, 1, 3)
@@ -242,15 +242,15 @@ def test_ends_without_the_velocity_terms_of_rods_as_bodies():
     point = np.insert(tree.point, 1, [tree.point[1, 0], [0.0, 0.0, -tree.length[1]]], axis=0)
     point[2, 0] = 0.0  # the centre of the light body is at the far end
     with_body = replace(
-        tree, kind=("ball", "ball", "ball", "free"), body=np.array([[-1, 0], [0, 1], [1, 2], [-1, 3]]),
+        tree, kind=("universal", "ball", "ball", "free"), body=np.array([[-1, 0], [0, 1], [1, 2], [-1, 3]]),
         length=np.zeros(4), point=point, turn=np.insert(tree.turn, 1, tree.turn[1], axis=0), **light,
     )  # fmt: skip
     x, y, z = state.u[1]
     along = normalised(np.array([1 + z, -y, x, 0.0]))  # turns z to u
     spin = rotation_matrix(along).T @ np.cross(state.u[1], state.udot[1])
-    p, omega, r, v = (np.insert(getattr(state, n), 1, 0.0, axis=0) for n in ("p", "omega", "r", "v"))
-    p[1], omega[1] = along, spin
-    same = complete_state(with_body, State(p, omega, r=r, v=v))
+    given = {n: np.insert(getattr(state, n), 1, 0.0, axis=0) for n in ("p", "omega", "r", "v", "x", "xdot")}
+    given["p"][1], given["omega"][1] = along, spin
+    same = complete_state(with_body, State(**given))
     np.testing.assert_allclose(same.r[[0, 2, 3]], state.r, atol=1e-12)
     by_rod, expected = (
         Responses(mechanism, [there], ends, end_rows=rows).solution[0, places, :2]
@@ -263,6 +263,31 @@ def test_ends_without_the_velocity_terms_of_rods_as_bodies():
     np.testing.assert_allclose(by_rod, expected, atol=1e-6 * size)
     plain = Responses(tree, [state], [(1, 2)], end_rows="without velocity terms").solution[0, :, :2]
     assert np.max(np.abs(plain - expected)) > 1e-3 * size
+
+
+def test_an_inverse_loses_nothing_of_a_body_that_an_effort_holds():
+    """As nothing is multiplied by it then."""
+    tree = random_tree(np.random.default_rng(2), 1, kinds=("slide",), loads=False)
+    at_rest = State(np.array([[1.0, 0, 0, 0]]), np.zeros((1, 3)))
+    state = complete_state(tree, at_rest)
+    falls = Responses(tree, [state])
+    force = tree.mass[0] * np.linalg.norm(falls.solution[0, 0, 0])
+    either = [Responses(tree.changed(effort=np.array([[x, 0.0]])), [state]) for x in (force, -force)]
+    held, pulled = sorted(either, key=lambda found: float(np.linalg.norm(found.solution[0, 0, 0])))
+    assert np.linalg.norm(held.solution[0, 0, 0]) < 1e-12
+    lost = [found.errors_of_inverse()[0, 0, 0] for found in (held, falls, pulled)]
+    assert lost[0] < 1e-12 and lost[2] == pytest.approx(2 * lost[1])
+
+
+def test_errors_of_the_equations_are_the_same_whatever_the_unit_of_mass():
+    model, states, ends = cut("bricard")
+    sizes = []
+    for unit in (1.0, 1e-6, 1e6):
+        other = model.changed(mass=unit * model.mass, inertia=unit * model.inertia)
+        response, unknowns = Responses(other, states, *ends).to_factors()
+        size = np.sum(np.linalg.norm(response[:, :, :2], axis=3), axis=-1)
+        sizes.append(size * np.linalg.norm(unknowns, axis=-1)[:, None, None])
+    np.testing.assert_allclose(sizes[1:], np.broadcast_to(sizes[0], (2, *sizes[0].shape)), rtol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["bricard", "four-bar"])
