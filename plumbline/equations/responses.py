@@ -137,17 +137,15 @@ class Responses:
         """Return what r̈ and α (S, N, 2) are off by, over ε, where ν̇ is a product of H⁻¹ and b, of a tree.
 
         By factors L U of H in SI units, with pivots of rows, each column x of H⁻¹ is off by U⁻¹ δ from its
-        own back substitution, δ = √m ε |U| |x| where a row has m terms: theorem 8.5 of Higham (Accuracy and
-        Stability of Numerical Algorithms, 2002) with roundings that add up as random ones do (Higham and
-        Mary, SIAM J. Sci. Comput. 41 (2019) A2815-A2835).  In H⁻¹ b the columns cancel each other, and these
-        errors do not; those of the factors cancel, as they are the same for all.
+        own back substitution, |δ| <= m ε |U| |x| of m rates (Higham, Accuracy and Stability of Numerical
+        Algorithms, 2002, theorem 8.5).  In H⁻¹ b the columns cancel each other, and these errors do not;
+        those of the factors cancel, as they are the same for all.
         """
         _, _, U = lu(self._H / (self._unit[:, :, None] * self._unit[:, None]))
         U = U * self._unit[:, None]
         pushed = (self._pushed - self._weigh(self._coasting)).reshape(self._count, -1, 1)
         b = self._A.mT @ pushed + self._effort[..., None]
-        chance = np.sqrt(np.arange(U.shape[-1], 0, -1))[:, None]
-        lost = chance * (np.abs(U) @ (np.abs(self._inverse) @ np.abs(b)))
+        lost = U.shape[-1] * (np.abs(U) @ (np.abs(self._inverse) @ np.abs(b)))
         moved = (self._A @ np.linalg.inv(U)).reshape(self._count, self.n, 2, 3, -1)
         return np.asarray((np.linalg.norm(moved, axis=3) @ lost[:, None])[..., 0])
 

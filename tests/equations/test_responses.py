@@ -221,11 +221,11 @@ def test_errors_of_an_inverse_are_those_of_one_in_single_precision():
         M = mass_matrix(model, state).astype(np.float32)
         f = M @ np.linalg.lstsq(jacobian, accelerations.ravel())[0].astype(np.float32)
         true = np.linalg.solve(M.astype(float), f.astype(float))
-        bound = np.finfo(np.float32).eps * responses.errors_of_inverse()[0]
+        bound = np.finfo(np.float32).eps / 2 * responses.errors_of_inverse()[0]
         for found, ratios in ((np.linalg.inv(M) @ f, by_inverse), (np.linalg.solve(M, f), by_solution)):
             off = np.linalg.norm((jacobian @ (found - true)).reshape(-1, 2, 3), axis=-1)
             ratios.append(np.max(off[bound > 0] / bound[bound > 0]))
-    assert 0.03 <= min(by_inverse) <= max(by_inverse) <= 1
+    assert 0.02 <= min(by_inverse) <= max(by_inverse) <= 1
     assert min(np.divide(by_solution, by_inverse)) <= 0.05  # an inverse loses what a solution does not
 
 
