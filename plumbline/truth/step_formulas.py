@@ -250,7 +250,8 @@ class ConstrainedResidual:
     """How far Exudyn's answer is from its equations; sizes are of the terms, for rounding."""
 
     residual: Array  # (T,) 2-norm of M q̈ + Cᵀ λ − f and of the constraints, N and m or m/s; at least
-    size: Array  # (T,) norm of the largest terms, N and m or m/s
+    # (T,) of the terms, N and m or m/s: Newton's first residual has those of the step before, or of this one
+    size: Array
 
 
 def has_written_rows(model: Model) -> bool:
@@ -272,21 +273,21 @@ def constrained_residual(model: Model, method: ConstrainedMethod, run: StepRun) 
         The residuals at each sample but the first.
 
     """
-    q, qdot, qddot = (x[1:] for x in engine_coordinates(run))
+    q, qdot, qddot = engine_coordinates(run)
     assert run.multipliers is not None
-    multipliers = run.multipliers[1:].astype(LongDouble)
+    multipliers = run.multipliers.astype(LongDouble)
     terms = _inertial_and_applied(model, q, qdot, qddot)
     C, gaps = _constraint_rows(model, q)
     used = np.ones((model.n, 4), bool)
     used[model.rods, 1:3] = False
     held = rotate_vectors(C.mT, multipliers[:, used])
-    if method.constraint_level == "velocity":
-        gaps = rotate_vectors(C, qdot.reshape(len(qdot), -1))
     far, near = np.abs(model.point).max(axis=(0, 2))
-    lengths = np.abs(q[..., :3]).max(-1) + far + near + model.length.astype(LongDouble)
+    of_gaps = np.abs(q[..., :3]).max(-1) + far + near + model.length.astype(LongDouble)
+    if method.constraint_level == "velocity":
+        rates = qdot.reshape(len(qdot), -1)
+        gaps, of_gaps = rotate_vectors(C, rates), rotate_vectors(np.abs(C), np.abs(rates))
     return ConstrainedResidual(
-        residual=_norm(terms[0] + terms[1] + held, gaps),
-        size=_norm(*terms, held, lengths),
+        residual=_norm(terms[0] + terms[1] + held, gaps)[1:], size=_sizes_of_steps(*terms, held, of_gaps)
     )
 
 
@@ -305,9 +306,10 @@ def projected_residual(model: Model, run: StepRun) -> ConstrainedResidual:
         joints would move them: the engine's residual is not less.
 
     """
-    q, qdot, qddot = (x[1:] for x in engine_coordinates(run))
-    terms = _inertial_and_applied(model, q, qdot, qddot)
-    t, count = run.trajectory, len(q)
+    q, qdot, qddot = engine_coordinates(run)
+    of_samples = _inertial_and_applied(model, q, qdot, qddot)
+    q, terms, t = q[1:], [x[1:] for x in of_samples], run.trajectory
+    count = len(q)
     omega = angular_velocity(t.p[1:], t.pdot[1:])
     bodies = with_joint_coordinates(model, State(t.p[1:], omega, r=t.r[1:], v=t.v[1:]))
     twists = velocity_jacobian(model, bodies).reshape(count, model.n, 6, -1)
@@ -318,8 +320,8 @@ def projected_residual(model: Model, run: StepRun) -> ConstrainedResidual:
     turning = _body_rate_matrix(t.p[1:]).mT / 2 @ twists[..., 3:, :]
     rates = np.concatenate([twists[..., :3, :], turning], -2).reshape(count, 7 * model.n, -1)
     size = np.maximum(np.linalg.norm(rates, axis=(1, 2)), np.finfo(float).tiny)  # 0 of what is welded
-    along = _norm(rotate_vectors(rates.mT, terms[0] + terms[1])) / size
-    return ConstrainedResidual(residual=np.maximum(along, _norm(gaps) / reach), size=_norm(*terms))
+    along = np.maximum(_norm(rotate_vectors(rates.mT, terms[0] + terms[1])) / size, _norm(gaps) / reach)
+    return ConstrainedResidual(residual=along, size=_sizes_of_steps(*of_samples))
 
 
 def _inertial_and_applied(model: Model, q: Array, qdot: Array, qddot: Array) -> tuple[Array, Array]:
@@ -338,6 +340,12 @@ def _inertial_and_applied(model: Model, q: Array, qdot: Array, qddot: Array) -> 
     inertial = np.concatenate([mass * qddot[..., :3], turning], -1)
     negative = np.concatenate([drag - model.force.astype(LongDouble) - gravity, gyroscopic - applied], -1)
     return inertial.reshape(len(q), -1), negative.reshape(len(q), -1)
+
+
+def _sizes_of_steps(*parts: Any) -> Array:
+    """(T − 1,) sums of the norms of terms (T, ·), the larger ones at both ends of each step."""
+    size = np.sum([_norm(part) for part in parts], axis=0)
+    return np.asarray(np.maximum(size[:-1], size[1:]))
 
 
 def _norm(*parts: Any) -> Array:

@@ -92,6 +92,18 @@ def test_steps_agree_where_slides_have_carried_bodies_far_away(index, engine, in
     assert all(row.verdict == Verdict.AGREES for row in of_run), of_run
 
 
+@pytest.mark.parametrize(
+    ("index", "integrator"),
+    [((10, 25), "trapezoidal"), pytest.param((10, 61), "generalized-alpha", marks=SLOW)],
+)
+def test_newtons_tolerance_is_relative_to_the_terms_of_its_first_residual(index, integrator):
+    """A ball of 2 g that turns at 30 rad/s has larger rates than forces; the forces in a whip change."""
+    s, adapter = random_scenario(*index), load_adapter("exudyn")
+    rows = rows_of(adapter, adapter.integrator(integrator), s.model, [s.state])
+    (equations,) = [row for row in rows if row.quantity == "run_equations"]
+    assert equations.verdict == Verdict.AGREES and equations.ratio > 0.1
+
+
 @slow
 def test_a_run_is_judged_as_far_as_the_method_itself_goes():
     """Three bodies of 3 g to 20 kg become so fast at 0.16 s that RK4 is unstable."""
