@@ -80,7 +80,8 @@ def test_the_page_tells_step_certificate_and_time(chromium, results, shown):
     assert METHOD in note and "0.001 m" in note and "No finished run of Pinocchio, maximal" in note
     for width in (1280, 400):
         page.set_viewport_size({"width": width, "height": 900})
-        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+        # once the page is laid out again
+        page.wait_for_function("document.documentElement.scrollWidth <= innerWidth", timeout=10_000)
     page.goto(path.as_uri() + f"#scenario={PLAIN}&engine=mujoco")
     page.locator("h1.cell-title", has_text=PLAIN).wait_for()
     assert page.locator("table.departures").count() == 0
