@@ -229,11 +229,12 @@ def test_errors_of_an_inverse_are_those_of_one_in_single_precision():
     assert min(np.divide(by_solution, by_inverse)) <= 0.05  # an inverse loses what a solution does not
 
 
-def test_ends_without_the_velocity_terms_of_rods_as_bodies():
-    """Of a body on a rod below another one, joined to a free one; the same with a light body as the rod."""
+@pytest.mark.parametrize("far", [0, -1])
+def test_ends_without_the_velocity_terms_of_rods_as_bodies(far):
+    """Of a body on a rod, below another or the world, joined to a free one; with a light body as the rod."""
     tree = replace(
         random_tree(np.random.default_rng(5), 3, kinds=("ball",)), kind=("universal", "rod", "free"),
-        body=np.array([[-1, 0], [0, 1], [-1, 2]]), length=np.array([0.0, 0.7, 0.0]),
+        body=np.array([[-1, 0], [far, 1], [-1, 2]]), length=np.array([0.0, 0.7, 0.0]),
     )  # fmt: skip
     (state,) = random_states(tree, 1, 3)
     fields = ("mass", "inertia", "force", "moment", "drag_force", "drag_moment")
@@ -242,7 +243,7 @@ def test_ends_without_the_velocity_terms_of_rods_as_bodies():
     point = np.insert(tree.point, 1, [tree.point[1, 0], [0.0, 0.0, -tree.length[1]]], axis=0)
     point[2, 0] = 0.0  # the centre of the light body is at the far end
     with_body = replace(
-        tree, kind=("universal", "ball", "ball", "free"), body=np.array([[-1, 0], [0, 1], [1, 2], [-1, 3]]),
+        tree, kind=("universal", "ball", "ball", "free"), body=np.array([[-1, 0], [far, 1], [1, 2], [-1, 3]]),
         length=np.zeros(4), point=point, turn=np.insert(tree.turn, 1, tree.turn[1], axis=0), **light,
     )  # fmt: skip
     x, y, z = state.u[1]
