@@ -127,9 +127,7 @@ class Responses:
         units = np.broadcast_to(np.eye(rows.shape[-1]), self._H.shape)
         moved = self.solution[:, :, :2].reshape(S, -1, 1) - self._coasting.reshape(S, -1, 1)
         rate = np.linalg.pinv(self._A) @ moved
-        pushed = (self._pushed - self._weigh(self._coasting)).reshape(S, -1, 1)
-        left = self._H @ rate - self._A.mT @ pushed - self._effort[..., None]
-        multipliers = (self._J_inverse.mT @ left)[..., 0] * unit
+        multipliers = (self._J_inverse.mT @ (self._H @ rate - self._along_motions()))[..., 0] * unit
         found = self._respond(effort=units), self.to_gaps() * unit[:, None, None, None]
         return np.concatenate(found, -1), np.concatenate([rate[..., 0], multipliers], -1)
 
@@ -141,11 +139,10 @@ class Responses:
         Algorithms, 2002, theorem 8.5).  In H⁻¹ b the columns cancel each other, and these errors do not;
         those of the factors cancel, as they are the same for all.
         """
-        _, _, U = lu(self._H / (self._unit[:, :, None] * self._unit[:, None]))
+        # runs that become infinite have no bound, and are no error here
+        _, _, U = lu(self._H / (self._unit[:, :, None] * self._unit[:, None]), check_finite=False)
         U = U * self._unit[:, None]
-        pushed = (self._pushed - self._weigh(self._coasting)).reshape(self._count, -1, 1)
-        b = self._A.mT @ pushed + self._effort[..., None]
-        lost = U.shape[-1] * (np.abs(U) @ (np.abs(self._inverse) @ np.abs(b)))
+        lost = U.shape[-1] * (np.abs(U) @ (np.abs(self._inverse) @ np.abs(self._along_motions())))
         moved = (self._A @ np.linalg.inv(U)).reshape(self._count, self.n, 2, 3, -1)
         return np.asarray((np.linalg.norm(moved, axis=3) @ lost[:, None])[..., 0])
 
@@ -222,6 +219,11 @@ class Responses:
         held[:, :3, :2] = across
         held[:, :, 2:3] = both
         self._free[-1], self.held[-1] = free, held
+
+    def _along_motions(self) -> Array:
+        """Forces, velocity terms and efforts along the motions (S, ν, 1): b of H ν̇ = b."""
+        pushed = (self._pushed - self._weigh(self._coasting)).reshape(self._count, -1, 1)
+        return np.asarray(self._A.mT @ pushed + self._effort[..., None])
 
     def _find_motions(self) -> None:
         """A and H = AᵀM A + a, with rates in units in which H has a unit diagonal."""

@@ -71,7 +71,7 @@ ROUNDING_FACTOR = 64  # state quantities; the worst error of a sound engine is a
 SUM_ROUNDING_FACTOR = 256  # energies, momenta, entries of the mass matrix
 MAX_RELATIVE_BOUND = 1e-8  # a tolerance above this fraction of its scale could hide a mistake
 POSITION_SHARE = 1 / 32  # positions are rounded once or twice, where the bound counts 64 roundings of a term
-INVERSE_SHARE = 1 / 64  # what columns of an inverse round apart, of which every rounding is counted
+INVERSE_SHARE = 1 / ROUNDING_FACTOR  # `Responses.errors_of_inverse` counts every rounding itself
 MAX_ENTRIES = 3_000_000  # of the responses of a batch of states: more do not fit the processor's cache
 
 

@@ -343,7 +343,7 @@ def _inertial_and_applied(model: Model, q: Array, qdot: Array, qddot: Array) -> 
 
 
 def _sizes_of_steps(*parts: Any) -> Array:
-    """(T − 1,) sums of the norms of terms (T, ·), the larger ones at both ends of each step."""
+    """(T − 1,) sums of the norms of terms (T, ·), of each step the larger one of those at its ends."""
     size = np.sum([_norm(part) for part in parts], axis=0)
     return np.asarray(np.maximum(size[:-1], size[1:]))
 

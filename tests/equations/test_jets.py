@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from plumbline.equations.arithmetic import balls as ball_arithmetic
-from plumbline.equations.jets import jets, with_slopes
+from plumbline.equations.jets import Jet, jets, with_slopes
 from plumbline.equations.tree import Tree
 from plumbline.model.datatypes import KINDS
 from plumbline.model.kinematics import stack_states
@@ -141,3 +141,8 @@ def test_the_spring_of_an_untwisted_ball_has_the_slope_of_its_stiffness():
     tree = Tree(jets(), *with_slopes(model, states, [{"p": turned}]))
     (effort,) = (block.effort for block in tree.blocks[k])
     np.testing.assert_allclose(effort.slope[0, 0, :, 0], [0, 0, -model.stiffness[k, 0]], atol=1e-12)
+
+
+def test_the_root_of_zero_has_no_slope():
+    root = jets().sqrt(Jet(np.array([0.0, 4.0] * 1000), np.ones(2000)))
+    np.testing.assert_array_equal(root.slope, [0.0, 0.25] * 1000)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from plumbline.equations.responses import Responses
+from plumbline.equations.responses import DEPENDENT, Responses
 from plumbline.model.datatypes import State
 from plumbline.model.kinematics import (
     complete_state,
@@ -19,7 +19,7 @@ from plumbline.model.loops import cut_open
 from plumbline.model.random_mechanisms import random_tree
 from plumbline.model.sampling import compared_states, random_states
 from plumbline.truth.certified_state import certify_state
-from plumbline.truth.rounding_bound import state_rounding_bound
+from plumbline.truth.rounding_bound import EPS, ROUNDING_FACTOR, state_rounding_bound
 from tests.helpers.catalogue import catalogue_scenarios
 
 NAMES = (
@@ -225,7 +225,7 @@ def test_errors_of_an_inverse_are_those_of_one_in_single_precision():
         for found, ratios in ((np.linalg.inv(M) @ f, by_inverse), (np.linalg.solve(M, f), by_solution)):
             off = np.linalg.norm((jacobian @ (found - true)).reshape(-1, 2, 3), axis=-1)
             ratios.append(np.max(off[bound > 0] / bound[bound > 0]))
-    assert 0.02 <= min(by_inverse) <= max(by_inverse) <= 1
+    assert 0.02 <= min(by_inverse) <= max(by_inverse) <= 1  # measured: 0.046 and 0.39, and 0.018 below
     assert min(np.divide(by_solution, by_inverse)) <= 0.05  # an inverse loses what a solution does not
 
 
@@ -239,7 +239,8 @@ def test_ends_without_the_velocity_terms_of_rods_as_bodies(far):
     (state,) = random_states(tree, 1, 3)
     fields = ("mass", "inertia", "force", "moment", "drag_force", "drag_moment")
     light = {name: np.insert(getattr(tree, name), 1, 0.0, axis=0) for name in fields}
-    light["mass"][1], light["inertia"][1] = 1e-9, 1e-9 * np.eye(3)
+    slender = 1e-9  # kg and kg m²
+    light["mass"][1], light["inertia"][1] = slender, slender * np.eye(3)
     point = np.insert(tree.point, 1, [tree.point[1, 0], [0.0, 0.0, -tree.length[1]]], axis=0)
     point[2, 0] = 0.0  # the centre of the light body is at the far end
     with_body = replace(
@@ -252,7 +253,9 @@ def test_ends_without_the_velocity_terms_of_rods_as_bodies(far):
     given = {n: np.insert(getattr(state, n), 1, 0.0, axis=0) for n in ("p", "omega", "r", "v", "x", "xdot")}
     given["p"][1], given["omega"][1] = along, spin
     same = complete_state(with_body, State(**given))
-    np.testing.assert_allclose(same.r[[0, 2, 3]], state.r, atol=1e-12)
+    np.testing.assert_allclose(
+        same.r[[0, 2, 3]], state.r, atol=ROUNDING_FACTOR * EPS * np.max(np.abs(state.r))
+    )
     by_rod, expected = (
         Responses(mechanism, [there], ends, end_rows=rows).solution[0, places, :2]
         for mechanism, there, ends, rows, places in (
@@ -261,7 +264,8 @@ def test_ends_without_the_velocity_terms_of_rods_as_bodies(far):
         )
     )
     size = np.max(np.abs(expected))
-    np.testing.assert_allclose(by_rod, expected, atol=1e-6 * size)
+    share = slender / np.min(np.linalg.eigvalsh(tree.inertia))  # what the light body changes
+    np.testing.assert_allclose(by_rod, expected, atol=share * size)
     plain = Responses(tree, [state], [(1, 2)], end_rows="without velocity terms").solution[0, :, :2]
     assert np.max(np.abs(plain - expected)) > 1e-3 * size
 
@@ -275,20 +279,19 @@ def test_an_inverse_loses_nothing_of_a_body_that_an_effort_holds():
     force = tree.mass[0] * np.linalg.norm(falls.solution[0, 0, 0])
     either = [Responses(tree.changed(effort=np.array([[x, 0.0]])), [state]) for x in (force, -force)]
     held, pulled = sorted(either, key=lambda found: float(np.linalg.norm(found.solution[0, 0, 0])))
-    assert np.linalg.norm(held.solution[0, 0, 0]) < 1e-12
     lost = [found.errors_of_inverse()[0, 0, 0] for found in (held, falls, pulled)]
-    assert lost[0] < 1e-12 and lost[2] == pytest.approx(2 * lost[1])
+    assert lost[0] <= ROUNDING_FACTOR * EPS * lost[1] and lost[2] == pytest.approx(2 * lost[1])
 
 
 def test_errors_of_the_equations_are_the_same_whatever_the_unit_of_mass():
     model, states, ends = cut("bricard")
     sizes = []
-    for unit in (1.0, 1e-6, 1e6):
+    for unit in (1.0, 4.0**-10, 4.0**10):  # whose roots are powers of two, so that nothing else is rounded
         other = model.changed(mass=unit * model.mass, inertia=unit * model.inertia)
         response, unknowns = Responses(other, states, *ends).to_factors()
         size = np.sum(np.linalg.norm(response[:, :, :2], axis=3), axis=-1)
         sizes.append(size * np.linalg.norm(unknowns, axis=-1)[:, None, None])
-    np.testing.assert_allclose(sizes[1:], np.broadcast_to(sizes[0], (2, *sizes[0].shape)), rtol=1e-6)
+    np.testing.assert_array_equal(sizes[1:], np.broadcast_to(sizes[0], (2, *sizes[0].shape)))
 
 
 @pytest.mark.parametrize("name", ["bricard", "four-bar"])
@@ -300,7 +303,6 @@ def test_what_is_indeterminate_of_a_joints_wrench_is_spanned_by_unit_wrenches(na
         pairs = [np.concatenate(pair, -1) for pair in found.indeterminate_wrenches(k)]
         span = np.array(pairs).reshape(len(pairs), len(states), 6).transpose(1, 2, 0)
         assert np.max(np.abs(span.mT @ span - np.eye(len(pairs))), initial=0.0) < 1e-12
-        np.testing.assert_allclose(
-            span @ (span.mT @ own), own, atol=1e-6 * np.max(np.abs(found.indeterminate))
-        )
+        left_out = DEPENDENT * np.linalg.norm(own, axis=(1, 2), keepdims=True)  # singular values below it
+        assert np.all(np.abs(span @ (span.mT @ own) - own) <= left_out)
     assert len(found.indeterminate_wrenches(0)) > 0
