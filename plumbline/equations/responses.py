@@ -64,7 +64,7 @@ class Responses:
                 these coordinates, or in those of rods that are bodies on ball joints.
 
         """
-        state = states if isinstance(states, State) else stack_states(states)
+        state = stack_states(states)
         self.tree = tree = Tree(floats(), model, state)
         self.state, self.n, self.far, self._count = state, model.n, tree.far, len(state.p)
         self._mass = model.mass[..., None, None]

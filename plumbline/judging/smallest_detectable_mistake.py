@@ -37,7 +37,12 @@ from plumbline.model.invariants import (
     compute_invariants,
     motion_errors,
 )
-from plumbline.model.kinematics import angular_velocity, with_joint_coordinates
+from plumbline.model.kinematics import (
+    angular_velocity,
+    complete_state,
+    stack_states,
+    with_joint_coordinates,
+)
 from plumbline.model.step_methods import SERIES_TURN, JointSpaceMethod, classical_runge_kutta
 from plumbline.truth.parameter_effects import difference_effects, effects_at_states
 from plumbline.truth.parameters import STATE_KINDS, Parameter, list_parameters, perturb
@@ -312,18 +317,16 @@ def run_ratios(
     h = RUN_STEP_SHARE * step_sizes(False, model, [state])[0][0]
     times = np.linspace(0, h * max(run_counts(model.n)), RUN_SAMPLES)
     (motion,) = accurate_motions(model, state, times)
-    states = [state, *_visited_states(motion, RUN_SAMPLES)[1:]]
+    # by the coordinates of the joints alone, so that a mistake which leaves them does not move a sample
+    states = complete_state(model, stack_states([state, *_visited_states(motion, RUN_SAMPLES)[1:]]))
     charts = StepCharts(model, method, states)
-    q, v = charts.start()
-    coordinates, velocities = np.asarray(np.concatenate(q, -1), float), np.asarray(v, float)
-    steps = StepsFromSamples(method, model, charts, coordinates, velocities, h, len(states))
+    steps = StepsFromSamples(method, model, charts, *charts.reported(), h, RUN_SAMPLES)
     ratios = _Ratios(len(parameters))
     for k, one in enumerate(parameters):
         if one.kind in STATE_KINDS:
             off = {"run_samples": steps.start_ratio(perturb(model, state, one, RUN_MISTAKE)[1])}
         else:
-            cases = [perturb(model, at, one, RUN_MISTAKE) for at in states]
-            off = steps.mistake_ratios(cases[0][0], [at for _, at in cases])
+            off = steps.mistake_ratios(*perturb(model, states, one, RUN_MISTAKE))
         for quantity, ratio in off.items():
             ratios.add(k, ratio / RUN_MISTAKE, quantity)
     return ratios

@@ -216,13 +216,15 @@ def angular_velocity(p: Float[Array, "... 4"], pdot: Float[Array, "... 4"]) -> F
     return 2.0 * quaternion_product(quaternion_conjugate(p), pdot)[..., 1:]
 
 
-def stack_states(states: Sequence[State]) -> State:
-    """Put states into one, of arrays with a leading axis.
+def stack_states(states: Sequence[State] | State) -> State:
+    """Put states into one, of arrays with a leading axis; one that has it stays as it is.
 
     Returns:
         The states, (S, ...) arrays.
 
     """
+    if isinstance(states, State):
+        return states
     return State(**{name: np.array([getattr(s, name) for s in states]) for name in vars(states[0])})
 
 

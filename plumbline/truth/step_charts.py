@@ -103,13 +103,13 @@ class StepCharts:
     _attitudes: tuple[list[Array], _Attitudes] | None = None
 
     def __init__(
-        self, model: Model, method: JointSpaceMethod, states: Sequence[State],
+        self, model: Model, method: JointSpaceMethod, states: Sequence[State] | State,
         angle_axes: Sequence[Array | None] = (),
     ) -> None:  # fmt: skip
         """Set up the charts.
 
         Args:
-            states: B states, of loops closed or nearly.
+            states: B states, of loops closed or nearly, or one of arrays (B, ...).
             angle_axes: for "joint angles", the axes (angles, 3) of the turns of balls and rods at each state.
 
         """
@@ -199,6 +199,16 @@ class StepCharts:
 
         """
         return [chart.q for chart in self.charts], _joined([chart.v for chart in self.charts])
+
+    def reported(self) -> tuple[Array, Array]:
+        """Return the coordinates of the states as an engine reports them, in double precision.
+
+        Returns:
+            (B, Σ ·) and (B, nv), for `divided`.
+
+        """
+        q, v = self.start()
+        return np.asarray(_joined(q), float), np.asarray(v, float)
 
     def divided(self, coordinates: Array, velocities: Array) -> tuple[list[Array], Array]:
         """Divide an engine's own coordinates among the charts, as `start` returns those of the states.

@@ -751,33 +751,39 @@ class StepsFromSamples:
         off += (model.mass * between["speed"] * self.lost.place).sum(-1)
         return {"energy": energy, "momentum": of_both_ends(sums) + own + off}
 
-    def mistake_ratios(self, model: Model, states: Sequence[State]) -> dict[str, float]:
+    def mistake_ratios(self, model: Model, states: State) -> dict[str, float]:
         """Compute what an engine with another mechanism would be off by, over what rounding explains.
 
         Args:
             model: the mechanism, with a mistake.
-            states: of the samples, in it.
+            states: of the samples (S, ...), in it.
 
         Returns:
             The largest by quantity of `RUN_UNITS`; of `run_mean` none.
 
         """
         charts = StepCharts(model, self.method, states)
-        q, v = charts.start()
+        q, v = charts.divided(*charts.reported())
         ends = coordinates_after(charts, q, v, [self.h])
         # the engine reports bodies of its mechanism at its coordinates, from which the declared step starts
-        declared = coordinates_after(self.charts, q, v, [self.h])
-        reported, true = charts.bodies(*ends), self.charts.bodies(*declared)
+        here, declared, true = self._step_from(q, v)
+        reported = charts.bodies(*ends)
         found = dict[str, float]()
         for quantity, error in _norms(_differences(reported, true)).items():
             found[quantity.replace("step", "run")] = float(np.max(error / self.of_step[quantity]))
-        at_samples = _norms(_differences(charts.bodies(q, v), self.charts.bodies(q, v)))
+        at_samples = _norms(_differences(charts.bodies(q, v), here))
         found["run_samples"] = max(float(np.max(x / self.of_samples[name])) for name, x in at_samples.items())
-        for name, error in self._total_errors(
-            q, ends[1], declared[1], self.charts.bodies(*ends), true
-        ).items():
+        for name, error in self._total_errors(q, ends[1], declared, self.charts.bodies(*ends), true).items():
             found[f"run_{name}"] = float(np.max(error / np.maximum(self.of_totals[name], TINY)))
         return found
+
+    def _step_from(self, q: list[Array], v: Array) -> tuple[BodyStates, Array, BodyStates]:
+        """The bodies at coordinates, the rates after a declared step, and the bodies there."""
+        samples = [*self.start, self.velocities[: len(v)]]
+        if all(map(np.array_equal, [*q, v], samples)):  # as most mistakes leave them
+            return self.here[: len(v)], self.declared, self.after
+        ends, declared = coordinates_after(self.charts, q, v, [self.h])
+        return self.charts.bodies(q, v), declared, self.charts.bodies(ends, declared)
 
     def _total_errors(
         self, start: list[Array], rates: Array, declared: Array, read: BodyStates, true: BodyStates
