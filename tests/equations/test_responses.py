@@ -306,3 +306,13 @@ def test_what_is_indeterminate_of_a_joints_wrench_is_spanned_by_unit_wrenches(na
         left_out = DEPENDENT * np.linalg.norm(own, axis=(1, 2), keepdims=True)  # singular values below it
         assert np.all(np.abs(span @ (span.mT @ own) - own) <= left_out)
     assert len(found.indeterminate_wrenches(0)) > 0
+
+
+@pytest.mark.parametrize("field", ["x", "xdot"])
+def test_errors_of_an_inverse_have_no_bound_where_a_run_has_become_infinite(field):
+    """A slide at infinity makes inertias infinite, an infinite speed forces; neither raises an error."""
+    tree = random_tree(np.random.default_rng(1), 2, kinds=("slide", "hinge"))
+    (state,) = random_states(tree, 1, 0)
+    with np.errstate(invalid="ignore"):
+        there = complete_state(tree, replace(state, **{field: np.inf * np.ones_like(state.x)}))
+        assert not np.any(np.isfinite(Responses(tree, [there]).errors_of_inverse()))
