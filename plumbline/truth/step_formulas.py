@@ -37,6 +37,7 @@ Array = NDArray[Any]  # in this module of extended precision, where nothing else
 Coordinates = list[Array]
 MAX_EXTENDED_EPSILON = 1e-18  # of the numbers that formulas of steps need
 POWER_ITERATIONS = 12
+FIRST_ITERATE = 1.5  # of Newton's for |p|² = 1 from |p| = ½, over what is found in the end
 HAS_EXTENDED_PRECISION = np.finfo(LongDouble).eps < MAX_EXTENDED_EPSILON
 
 
@@ -287,7 +288,8 @@ def constrained_residual(model: Model, method: ConstrainedMethod, run: StepRun) 
         rates = qdot.reshape(len(qdot), -1)
         gaps, of_gaps = rotate_vectors(C, rates), rotate_vectors(np.abs(C), np.abs(rates))
     return ConstrainedResidual(
-        residual=_norm(terms[0] + terms[1] + held, gaps)[1:], size=_sizes_of_steps(*terms, held, of_gaps)
+        residual=_norm(terms[0] + terms[1] + held, gaps)[1:],
+        size=_sizes_of_steps(_inertial_sizes(model, q, qddot), terms[1], held, of_gaps),
     )
 
 
@@ -307,8 +309,9 @@ def projected_residual(model: Model, run: StepRun) -> ConstrainedResidual:
 
     """
     q, qdot, qddot = engine_coordinates(run)
-    of_samples = _inertial_and_applied(model, q, qdot, qddot)
-    q, terms, t = q[1:], [x[1:] for x in of_samples], run.trajectory
+    inertial, negative = _inertial_and_applied(model, q, qdot, qddot)
+    sizes = _sizes_of_steps(_inertial_sizes(model, q, qddot), negative)
+    q, t = q[1:], run.trajectory
     count = len(q)
     omega = angular_velocity(t.p[1:], t.pdot[1:])
     bodies = with_joint_coordinates(model, State(t.p[1:], omega, r=t.r[1:], v=t.v[1:]))
@@ -320,8 +323,8 @@ def projected_residual(model: Model, run: StepRun) -> ConstrainedResidual:
     turning = _body_rate_matrix(t.p[1:]).mT / 2 @ twists[..., 3:, :]
     rates = np.concatenate([twists[..., :3, :], turning], -2).reshape(count, 7 * model.n, -1)
     size = np.maximum(np.linalg.norm(rates, axis=(1, 2)), np.finfo(float).tiny)  # 0 of what is welded
-    along = np.maximum(_norm(rotate_vectors(rates.mT, terms[0] + terms[1])) / size, _norm(gaps) / reach)
-    return ConstrainedResidual(residual=along, size=_sizes_of_steps(*of_samples))
+    along = np.maximum(_norm(rotate_vectors(rates.mT, (inertial + negative)[1:])) / size, _norm(gaps) / reach)
+    return ConstrainedResidual(residual=along, size=sizes)
 
 
 def _inertial_and_applied(model: Model, q: Array, qdot: Array, qddot: Array) -> tuple[Array, Array]:
@@ -340,6 +343,18 @@ def _inertial_and_applied(model: Model, q: Array, qdot: Array, qddot: Array) -> 
     inertial = np.concatenate([mass * qddot[..., :3], turning], -1)
     negative = np.concatenate([drag - model.force.astype(LongDouble) - gravity, gyroscopic - applied], -1)
     return inertial.reshape(len(q), -1), negative.reshape(len(q), -1)
+
+
+def _inertial_sizes(model: Model, q: Array, qddot: Array) -> Array:
+    """Sizes (T, 2 N) of m r̈ and, with all of p̈, of 4 Lᵀ J L p̈, which leaves out what is along p.
+
+    In generalised-α nothing but |p|² = 1 holds p̈ along p, which may alternate and grow.  An iteration that
+    turns p finds it across, and its first step is (1 + |p|)/(2 |p|) times as long as it had to be.
+    """
+    inertia = 4 * np.linalg.norm(model.inertia, 2, axis=(1, 2))
+    linear, turning = (np.sqrt(np.sum(x * x, -1)) for x in (qddot[..., :3], qddot[..., 3:]))
+    turning = FIRST_ITERATE * turning * np.sum(q[..., 3:] ** 2, -1)
+    return np.concatenate([model.mass * linear, inertia * turning], -1)
 
 
 def _sizes_of_steps(*parts: Any) -> Array:
