@@ -233,52 +233,16 @@ def complete_state(model: Model, state: State) -> State:
 
     Args:
         model: the mechanism of N bodies; it need not be the one that the state was made for.
-        state: a state of which the minimal coordinates are used.
+        state: a state of which the minimal coordinates are used; or many, of arrays with leading axes.
 
     Returns:
         The state of the model with the same minimal coordinates.
 
     """
-    x, xdot = state.x, state.xdot
+    u, udot, x, xdot = state.u, state.udot, state.x, state.xdot
     if (missing := model.columns - x.shape[-1]) > 0:  # of a joint that was added
         x, xdot = (np.pad(values, [(0, 0)] * (x.ndim - 1) + [(0, missing)]) for values in (x, xdot))
-        state = replace(state, x=x, xdot=xdot)
-    p, omega, r, v = forward_kinematics(model, *vars(state).values())
-    return replace(state, p=p, omega=omega, r=r, v=v)
-
-
-def forward_kinematics(
-    model: Model,
-    p: Float[Array, "... bodies 4"],
-    omega: Float[Array, "... bodies 3"],
-    u: Float[Array, "... bodies 3"],
-    udot: Float[Array, "... bodies 3"],
-    r: Float[Array, "... bodies 3"],
-    v: Float[Array, "... bodies 3"],
-    x: Float[Array, "... bodies coordinates"],
-    xdot: Float[Array, "... bodies coordinates"],
-) -> tuple[
-    Float[Array, "... bodies 4"],
-    Float[Array, "... bodies 3"],
-    Float[Array, "... bodies 3"],
-    Float[Array, "... bodies 3"],
-]:
-    """Return attitudes, angular velocities, centres of mass and their velocities, of one state or of many.
-
-    Args:
-        p: unit quaternions, body → world, where they are coordinates.
-        omega: angular velocities of the same bodies, body frame [rad/s].
-        u: unit directions of the rods, world frame; zero for other joints.
-        udot: their rates [1/s].
-        r: centres of mass of free bodies, world frame [m].
-        v: their velocities [m/s].
-        x: joint coordinates [rad, m].
-
-    Returns:
-        p, ω′, r and ṙ of all bodies.
-
-    """
-    p, omega, r, v = (given.copy() for given in (p, omega, r, v))
+    p, omega, r, v = (given.copy() for given in (state.p, state.omega, state.r, state.v))
     A = rotation_matrix(p)  # (..., N, 3, 3)
     for k in range(model.n):
         kind, far = model.kinds[k], int(model.body[k, 0])
@@ -306,7 +270,7 @@ def forward_kinematics(
         near = cross(omega[..., k, :], own_point)
         r[..., k, :] = tip + d - rotate_vectors(A[..., k, :, :], own_point)
         v[..., k, :] = tip_v + d_rate - rotate_vectors(A[..., k, :, :], near)
-    return p, omega, r, v
+    return State(p, omega, u, udot, r, v, x, xdot)
 
 
 class Motion(NamedTuple):

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from plumbline.model.datatypes import Array, EngineFailure, Float, JointKind, Model, State
-from plumbline.model.kinematics import forward_kinematics, quaternion_rate, rotate_vectors, rotation_matrix
+from plumbline.model.kinematics import complete_state, quaternion_rate, rotate_vectors, rotation_matrix
 
 BallRates = Literal["body", "relative, near axes", "relative, far axes"]
 _STEP = 2.0**-300
@@ -64,8 +64,8 @@ def lift_acceleration(
             moved["omega"][k] = _absolute_rate(model, state, moved, k, step[-3:], ball_rates)
         else:
             moved["omega"][k] += step[-3:]
-    _, omega, _, v = forward_kinematics(model, **moved)
-    return v.imag / _STEP, omega.imag / _STEP
+    later = complete_state(model, State(**moved))
+    return later.v.imag / _STEP, later.omega.imag / _STEP
 
 
 def _count(kind: JointKind) -> int:
@@ -85,9 +85,10 @@ def _absolute_rate(
     if far < 0:
         spin, spin_later, above, above_later = np.zeros(3), np.zeros(3), np.eye(3), np.eye(3)
     else:  # the bodies before k are complete
-        attitude, rates, _, _ = forward_kinematics(model, **moved)
-        above, above_later = rotation_matrix(state.p[far]), rotation_matrix(attitude[far])
-        spin, spin_later = rotate_vectors(above, state.omega[far]), rotate_vectors(above_later, rates[far])
+        before = complete_state(model, State(**moved))
+        above, above_later = rotation_matrix(state.p[far]), rotation_matrix(before.p[far])
+        spin = rotate_vectors(above, state.omega[far])
+        spin_later = rotate_vectors(above_later, before.omega[far])
     if ball_rates == "relative, near axes":
         axes, axes_later = near_axes, later
     else:

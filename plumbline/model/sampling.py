@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 
 from plumbline.model.datatypes import Model, State
-from plumbline.model.kinematics import cross, forward_kinematics, rate_count
+from plumbline.model.kinematics import complete_state, cross, rate_count
 from plumbline.model.loops import (
     closed_pose,
     closed_rates,
@@ -97,9 +97,8 @@ def random_states(model: Model, count: int, seed: int) -> list[State]:
         spread = own_rate * 10 ** rng.uniform(-1.0, np.log10(4.0))
         xdot[k] = spread * rng.normal(size=xdot[k].shape)
         r[k], v[k] = (np.where(free, size * rng.normal(size=r[k].shape), 0.0) for size in (1.0, spread))
-    p, omega, u, udot, r, v, x, xdot = (part[:wanted] for part in (p, omega, u, udot, r, v, x, xdot))
-    p, omega, r, v = forward_kinematics(model, p, omega, u, udot, r, v, x, xdot)
-    return [State(*parts) for parts in zip(p, omega, u, udot, r, v, x, xdot, strict=True)]
+    states = complete_state(model, State(p, omega, u, udot, r, v, x, xdot)[:wanted])
+    return [states[k] for k in range(wanted)]
 
 
 @lru_cache(maxsize=16)  # seconds for a dozen bodies, and every engine is compared at the same states

@@ -36,7 +36,7 @@ from plumbline.model.datatypes import (
     Model,
     State,
 )
-from plumbline.model.kinematics import forward_kinematics, rotation_matrix
+from plumbline.model.kinematics import complete_state, rotation_matrix
 from plumbline.model.loops import CutMechanism, cut_open, independent_rows
 from plumbline.processes.processor import processor_features
 from plumbline.processes.user_cache import content_key, recall, remember
@@ -114,10 +114,10 @@ def _simulate(
         for name, size in _coordinate_names(kind):
             parts[name][:, k, :size] = y[:, at : at + size]
             at += size
-    parts |= zip(("p", "omega", "r", "v"), forward_kinematics(model, *parts.values()), strict=True)
+    motion = complete_state(model, State(**parts))
     if y.dtype == object:
-        parts = {name: np.array(x.tolist(), samples.dtype) for name, x in parts.items()}
-    return State(**parts), int(steps)
+        motion = State(*(np.array(x.tolist(), samples.dtype) for x in vars(motion).values()))
+    return motion, int(steps)
 
 
 def _closures(cut: CutMechanism, state: State) -> tuple[Closure, ...]:
