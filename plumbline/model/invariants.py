@@ -9,19 +9,20 @@ import numpy as np
 from numpy.polynomial.legendre import legder, leggauss, legvander
 from numpy.typing import NDArray
 
-from plumbline.model.datatypes import JOINT_ELEMENTS, ZERO_INERTIA, Array, Float, Model, Trajectory
+from plumbline.model.datatypes import JOINT_ELEMENTS, ZERO_INERTIA, Array, Float, Model, State, Trajectory
 from plumbline.model.kinematics import (
     angular_velocity,
-    ball_spring_rest,
+    ball_spring_turn,
+    coordinates_of_joints,
     cross,
+    joint_vector_rates,
     joint_vectors,
     nearest_turn,
-    quaternion_conjugate,
     quaternion_exponential,
     quaternion_product,
     rotate_vectors,
     rotation_matrix,
-    rotation_vector,
+    spring_vector_rates,
     spring_vectors,
 )
 
@@ -357,7 +358,7 @@ def compute_invariants(model: Model, run: Trajectory) -> Invariants:
         about = angular_momentum(model, run.r, run.p, run.v, omega) @ (model.gravity / gravity)
         momentum = (about - about[0])[:, None, None]
     d = joint_vectors(model, run.r, run.p)
-    ddot = joint_vector_rates(model, run, omega)
+    ddot = joint_vector_rates(model, run.p, run.v, omega)
     distance = np.linalg.norm(d, axis=-1)
     stretch = np.zeros_like(d)
     stretch[..., 0] = distance - model.length
@@ -404,63 +405,34 @@ def element_energies(
     rotors, springs, power = np.zeros((3, len(run.t)))
     if not model.has_elements:
         return ElementEnergies(rotors, springs, power)
-    A, d, d_rate = (
-        rotation_matrix(run.p),
-        joint_vectors(model, run.r, run.p),
-        joint_vector_rates(model, run, omega),
-    )
-    spin = rotate_vectors(A, omega)
-    for k, (far, b) in enumerate(model.body):
-        if not any(np.any(getattr(model, name)[k]) for name in JOINT_ELEMENTS):
-            continue
-        still = np.tile(np.eye(3), (len(run.t), 1, 1))
-        above, far_spin = (A[:, far], spin[:, far]) if far >= 0 else (still, 0 * spin[:, b])
-        far_axes, near_axes = (
-            above @ rotation_matrix(model.turn[k, 0]),
-            A[:, b] @ rotation_matrix(model.turn[k, 1]),
-        )
-        relative, turning = far_axes.swapaxes(-1, -2) @ near_axes, spin[:, b] - far_spin
+    state = State(run.p, omega, r=run.r, v=run.v)
+    spin = rotate_vectors(rotation_matrix(run.p), omega)
+    joints = np.flatnonzero(np.any([getattr(model, name) for name in JOINT_ELEMENTS], axis=(0, -1)))
+    *_, coordinates, rates = coordinates_of_joints(model, state, joints)
+    for at, k in enumerate(joints):
+        far, near = model.body[k]
         if model.kinds[k].is_spherical:
-            rest = ball_spring_rest(model, k)
-            unloaded = quaternion_product(run.p[:, far], rest) if far >= 0 else np.tile(rest, (len(run.t), 1))
-            turn = rotation_vector(quaternion_product(quaternion_conjugate(unloaded), run.p[:, b]))
-            pairs = [(0, turn, turning)]
+            _, turn = ball_spring_turn(model, k, run.p)
+            pairs = [(turn, spin[:, near] - (spin[:, far] if far >= 0 else 0.0))]
         else:
             pairs = []
-            turned = 0
-            for i, (what, axis) in enumerate(model.kinds[k].motions):
-                along = near_axes[..., axis] if turned else far_axes[..., axis]
-                if what == "slide":
-                    x, rate = _dot(along, d[:, k]), _dot(along, d_rate[:, k] - cross(far_spin, d[:, k]))
-                else:
-                    one, two = (axis + 1) % 3, (axis + 2) % 3
-                    kept = two if turned else one  # perpendicular to both axes
-                    turned += 1
-                    x = np.arctan2(relative[:, two, one], relative[:, kept, kept])
+            for i, (what, _) in enumerate(model.kinds[k].motions):
+                x, rate = coordinates[:, at, i], rates[:, at, i]
+                if what == "turn":
                     known = run.initial_x
                     start = x[0] if known is None or k >= model.n else known[k, i]
-                    rate = _dot(along, turning)
                     x = _unwrapped(x, rate, run.t, start)
-                pairs.append((i, (x - model.rest[k, i])[:, None], rate[:, None]))
-        for i, stretch, rates in pairs:
-            squares = np.sum(rates**2, axis=-1)
+                pairs.append(((x - model.rest[k, i])[:, None], rate[:, None]))
+        for i, (stretch, rate) in enumerate(pairs):
+            squares = np.sum(rate**2, axis=-1)
             rotors += model.armature[k, i] * squares / 2
             springs += model.stiffness[k, i] * np.sum(stretch**2, axis=-1) / 2
-            power += model.effort[k, i] * rates[:, 0] - model.damping[k, i] * squares
-    return _with_point_springs(model, run, spin, ElementEnergies(rotors, springs, power))
-
-
-def _with_point_springs(
-    model: Model, run: Trajectory, spin: Array, found: ElementEnergies
-) -> ElementEnergies:
-    """Add springs and dampers between points."""
-    d, body = spring_vectors(model, run.r, run.p), model.spring_body
-    arm = rotate_vectors(rotation_matrix(run.p)[:, body], model.spring_point)
-    ends = np.where((body < 0)[..., None], 0.0, run.v[:, body] + cross(spin[:, body], arm))
+            power += model.effort[k, i] * rate[:, 0] - model.damping[k, i] * squares
+    d, d_rate = spring_vectors(model, run.r, run.p), spring_vector_rates(model, run.p, run.v, omega)
     length = np.linalg.norm(d, axis=-1)
-    rate = _dot(d, ends[..., 1, :] - ends[..., 0, :]) / np.where(length > 0, length, 1.0)
-    springs = found.springs + ((length - model.spring_length) ** 2) @ model.spring_stiffness / 2
-    return ElementEnergies(found.rotors, springs, found.power - rate**2 @ model.spring_damping)
+    change = _dot(d, d_rate) / np.where(length > 0, length, 1.0)
+    springs += ((length - model.spring_length) ** 2) @ model.spring_stiffness / 2
+    return ElementEnergies(rotors, springs, power - change**2 @ model.spring_damping)
 
 
 def _unwrapped(angle: Array, rate: Array, times: Array, start: float) -> Array:
@@ -472,26 +444,6 @@ def _unwrapped(angle: Array, rate: Array, times: Array, start: float) -> Array:
 
 def _dot(a: Array, b: Array) -> Array:
     return np.asarray(np.sum(a * b, axis=-1))
-
-
-def joint_vector_rates(
-    model: Model, run: Trajectory, omega: Float[Array, "samples bodies 3"]
-) -> Float[Array, "samples joints 3"]:
-    """Return ḋ, the rates of the vectors of `plumbline.model.kinematics.joint_vectors`.
-
-    Args:
-        model: the chain of N bodies.
-        omega: angular velocities of the run, body frame [rad/s].
-
-    Returns:
-        Rates, world frame [m/s].
-
-    """
-    a = rotation_matrix(run.p)
-    far, body = model.body.T
-    near = run.v[:, body] + np.einsum("tkij,tkj->tki", a[:, body], cross(omega[:, body], model.proximal))
-    swing = np.einsum("tkij,tkj->tki", a[:, far], cross(omega[:, far], model.point[:, 0]))
-    return np.asarray(near - np.where((far < 0)[:, None], 0.0, run.v[:, far] + swing))
 
 
 def _across_slides(model: Model, p: Array, omega: Array, d: Array, ddot: Array) -> tuple[Array, Array]:

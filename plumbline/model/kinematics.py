@@ -13,6 +13,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from plumbline.model.datatypes import Array, Bool, Flags, Float, Indices, Int, JointKind, Model, State
 
@@ -172,6 +173,21 @@ def ball_spring_rest(model: Model, k: int) -> Float[Array, "4"]:
 
     """
     return quaternion_product(model.turn[k, 0], quaternion_conjugate(model.turn[k, 1]))
+
+
+def ball_spring_turn(
+    model: Model, k: int, p: Float[Array, "... bodies 4"]
+) -> tuple[Float[Array, "... 4"], Float[Array, "... 3"]]:
+    """Return the near body's attitude at which a ball joint's spring is unloaded, and its turn from there.
+
+    Returns:
+        Quaternions, and rotation vectors [rad] in the axes of the unloaded body.
+
+    """
+    (far, near), unloaded = model.body[k], ball_spring_rest(model, k)
+    if far >= 0:
+        unloaded = quaternion_product(p[..., far, :], unloaded)
+    return unloaded, rotation_vector(quaternion_product(quaternion_conjugate(unloaded), p[..., near, :]))
 
 
 def quaternion_rate(p: Float[Array, "... 4"], omega: Float[Array, "... 3"]) -> Float[Array, "... 4"]:
@@ -351,11 +367,7 @@ def joint_vectors(
         Vectors, world frame [m].
 
     """
-    a, (far, body) = rotation_matrix(p), model.body.T
-    near = r[..., body, :] + rotate_vectors(a[..., body, :, :], model.point[..., 1, :])
-    hang = r[..., far, :] + rotate_vectors(a[..., far, :, :], model.point[..., 0, :])
-    hang[..., far < 0, :] = model.point[..., far < 0, 0, :]
-    return np.asarray(near - hang)
+    return _between(_places(r, p, model.body, model.point))
 
 
 def spring_vectors(
@@ -372,10 +384,53 @@ def spring_vectors(
         Vectors, world frame [m].
 
     """
-    a, body = rotation_matrix(p), model.spring_body
-    ends = r[..., body, :] + rotate_vectors(a[..., body, :, :], model.spring_point)
-    ends[..., body < 0, :] = model.spring_point[body < 0]
-    return np.asarray(ends[..., 1, :] - ends[..., 0, :])
+    return _between(_places(r, p, model.spring_body, model.spring_point))
+
+
+def joint_vector_rates(
+    model: Model,
+    p: Float[Array, "... bodies 4"],
+    v: Float[Array, "... bodies 3"],
+    omega: Float[Array, "... bodies 3"],
+) -> Float[Array, "... joints 3"]:
+    """Return ḋ, the rates of `joint_vectors`.
+
+    Args:
+        p: quaternions, normalised here.
+        v: velocities of the centres of mass, world frame [m/s].
+        omega: angular velocities, body frame [rad/s].
+
+    Returns:
+        Rates, world frame [m/s].
+
+    """
+    return _between(_velocities(p, v, omega, model.body, model.point))
+
+
+def spring_vector_rates(
+    model: Model,
+    p: Float[Array, "... bodies 4"],
+    v: Float[Array, "... bodies 3"],
+    omega: Float[Array, "... bodies 3"],
+) -> Float[Array, "... springs 3"]:
+    """Return the rates of `spring_vectors` [m/s], as `joint_vector_rates`."""
+    return _between(_velocities(p, v, omega, model.spring_body, model.spring_point))
+
+
+def _places(r: Array, p: Array, body: NDArray[np.intp], point: Array) -> Array:
+    """Places (..., pairs, 2, 3) of pairs of points, each of a body or the world (−1)."""
+    found = r[..., body, :] + rotate_vectors(rotation_matrix(p)[..., body, :, :], point)
+    return np.where((body < 0)[..., None], point, found)
+
+
+def _velocities(p: Array, v: Array, omega: Array, body: NDArray[np.intp], point: Array) -> Array:
+    """Velocities (..., pairs, 2, 3) of such points."""
+    turning = rotate_vectors(rotation_matrix(p)[..., body, :, :], cross(omega[..., body, :], point))
+    return np.where((body < 0)[..., None], 0.0, v[..., body, :] + turning)
+
+
+def _between(pairs: Array) -> Array:
+    return np.asarray(pairs[..., 1, :] - pairs[..., 0, :])
 
 
 def elastic_energy(model: Model, state: State) -> float:
@@ -389,9 +444,7 @@ def elastic_energy(model: Model, state: State) -> float:
     energy = np.sum(model.stiffness * (x - model.rest) ** 2)
     for k, kind in enumerate(model.kinds):
         if kind.is_spherical and model.stiffness[k, 0]:
-            rest, (far, near) = ball_spring_rest(model, k), model.body[k]
-            turned = quaternion_product(state.p[far], rest) if far >= 0 else rest
-            turn = rotation_vector(quaternion_product(quaternion_conjugate(turned), state.p[near]))
+            _, turn = ball_spring_turn(model, k, state.p)
             energy += model.stiffness[k, 0] * (turn @ turn - x[k, 0] ** 2)
     length = np.linalg.norm(spring_vectors(model, state.r, state.p), axis=-1)
     return float(energy + np.sum(model.spring_stiffness * (length - model.spring_length) ** 2)) / 2
@@ -589,42 +642,36 @@ def coordinates_of_joints(
     shape = (*state.r.shape[:-2], len(joints))
     u, udot, x, xdot = (np.zeros((*shape, size)) for size in (3, 3, model.columns, model.columns))
     omega, d = rotate_vectors(a, state.omega), joint_vectors(model, state.r, state.p)
+    d_rate = joint_vector_rates(model, state.p, state.v, state.omega)
     for at, k in enumerate(joints):
         far, near = model.body[k]
         above, spin = (a[..., far, :, :], omega[..., far, :]) if far >= 0 else (np.eye(3), np.zeros(3))
-        own = d[..., k, :]
-        ends = [
-            state.v[..., i, :]
-            + cross(omega[..., i, :], rotate_vectors(a[..., i, :, :], model.point[..., k, side, :]))
-            if i >= 0
-            else np.zeros(3)
-            for side, i in enumerate((far, near))
-        ]
-        rate = ends[1] - ends[0]
-        if model.kinds[k].holds_distance:
+        own, rate, kind = d[..., k, :], d_rate[..., k, :], model.kinds[k]
+        if kind.holds_distance:
             rod = normalised(own)
             along = np.sum(rod * rate, axis=-1, keepdims=True)
             u[..., at, :], udot[..., at, :] = rod, (rate - rod * along) / model.length[..., k, None]
             continue
-        motions = model.kinds[k].motions
-        frame = rotation_matrix(model.turn[..., k, 0, :]).swapaxes(-1, -2) @ above.swapaxes(-1, -2)
-        relative = frame @ a[..., near, :, :] @ rotation_matrix(model.turn[..., k, 1, :])
-        shift = rotate_vectors(frame, own)
-        for i, value in enumerate(_coordinates(motions, shift, relative)):
-            x[..., at, i] = value
-        if model.kinds[k].has_pitch:  # which counts full turns
-            x[..., at, 0] = nearest_turn(x[..., at, 0], shift[..., 2], model.length[..., k])
-        axes = JointFrame(model, k, above).axes(x[..., at, :])
-        turns = [about for *_, about in axes if about is not None]
-        turning = iter(())
-        if turns:
-            columns = np.stack(np.broadcast_arrays(*turns), axis=-1)
-            turning = iter(
-                np.moveaxis(rotate_vectors(np.linalg.pinv(columns), omega[..., near, :] - spin), -1, 0)
-            )
-        for i, (axis, _, about) in enumerate(axes):
-            slide = np.sum(axis * (rate - cross(spin, own)), axis=-1)
-            xdot[..., at, i] = slide if about is None else next(turning)
+        far_axes, near_axes = (
+            attitude @ rotation_matrix(model.turn[..., k, side, :])
+            for side, attitude in enumerate((above, a[..., near, :, :]))
+        )
+        relative = far_axes.swapaxes(-1, -2) @ near_axes
+        turning, moving, is_turned = omega[..., near, :] - spin, rate - cross(spin, own), False
+        for i, (what, axis) in enumerate(kind.motions):
+            along = (near_axes if is_turned else far_axes)[..., axis]
+            moved = moving if what == "slide" else turning
+            xdot[..., at, i] = np.sum(along * moved, axis=-1)
+            if what == "slide":
+                x[..., at, i] = np.sum(along * own, axis=-1)
+                continue
+            one, two = (axis + 1) % 3, (axis + 2) % 3
+            kept = two if is_turned else one  # perpendicular to all turns
+            x[..., at, i] = np.arctan2(relative[..., two, one], relative[..., kept, kept])
+            is_turned = True
+            if kind.has_pitch:  # which counts full turns
+                shift = np.sum(along * own, axis=-1)
+                x[..., at, i] = nearest_turn(x[..., at, i], shift, model.length[..., k])
     return u, udot, x, xdot
 
 
@@ -635,23 +682,6 @@ def nearest_turn(
     angle, pitch = np.asarray(angle), np.broadcast_to(pitch, np.shape(angle))
     turned = np.divide(shift, pitch, out=angle.copy(), where=pitch != 0)
     return np.asarray(angle + 2 * np.pi * np.round((turned - angle) / (2 * np.pi)))
-
-
-def _coordinates(motions: tuple[tuple[str, int], ...], shift: Array, relative: Array) -> list[Array]:
-    """Coordinates of a joint from its shift and its turn, both in the far axes: R or R_x R_y."""
-    turns = [axis for what, axis in motions if what == "turn"]
-    angles = []
-    for i, axis in enumerate(turns):
-        j, k = (axis + 1) % 3, (axis + 2) % 3
-        if len(turns) == 1:
-            row, column, over = k, j, (j, j)
-        elif i == 0:  # y and z of the near axes turned about x: y is left by the second turn
-            row, column, over = 2, 1, (1, 1)
-        else:
-            row, column, over = 0, 2, (0, 0)
-        angles.append(np.arctan2(relative[..., row, column], relative[..., *over]))
-    found = iter(angles)
-    return [shift[..., axis] if what == "slide" else next(found) for what, axis in motions]
 
 
 def bodies_beyond(model: Model) -> Bool[Flags, "bodies bodies"]:

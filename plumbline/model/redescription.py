@@ -51,6 +51,7 @@ from plumbline.model.kinematics import (
     quaternion_product,
     rotate_vectors,
     rotation_matrix,
+    spring_vector_rates,
     spring_vectors,
 )
 
@@ -325,15 +326,13 @@ def springs_as_loads(model: Model, state: State) -> Model:
         values[: model.n] = np.where(scalar, 0.0, values[: model.n])
     force, moment = model.force.copy(), model.moment.copy()
     a = rotation_matrix(state.p)
-    for i, d in enumerate(spring_vectors(model, state.r, state.p)):
-        length, pair = float(np.linalg.norm(d)), model.spring_body[i]
-        ends = [
-            state.v[b] + a[b] @ cross(state.omega[b], at) if b >= 0 else np.zeros(3)
-            for b, at in zip(pair, model.spring_point[i], strict=True)
-        ]
+    vectors = spring_vectors(model, state.r, state.p)
+    rates = spring_vector_rates(model, state.p, state.v, state.omega)
+    for i, (d, rate) in enumerate(zip(vectors, rates, strict=True)):
+        length = float(np.linalg.norm(d))
         tension = model.spring_stiffness[i] * (length - model.spring_length[i])
-        tension += model.spring_damping[i] * float((ends[1] - ends[0]) @ d) / length
-        for b, at, sign in zip(pair, model.spring_point[i], (1.0, -1.0), strict=True):
+        tension += model.spring_damping[i] * float(rate @ d) / length
+        for b, at, sign in zip(model.spring_body[i], model.spring_point[i], (1.0, -1.0), strict=True):
             if b >= 0:
                 push = sign * tension * d / length
                 force[b] += push

@@ -46,16 +46,13 @@ from numpy.typing import NDArray
 from plumbline.equations.responses import Responses
 from plumbline.model.datatypes import JOINT_ELEMENTS, ZERO_INERTIA, Array, Model, State
 from plumbline.model.kinematics import (
-    ball_spring_rest,
+    ball_spring_turn,
     bodies_beyond,
     cross,
     cross_matrix,
     joint_vectors,
-    quaternion_conjugate,
-    quaternion_product,
     rotate_vectors,
     rotation_matrix,
-    rotation_vector,
     spring_vectors,
     stack_states,
 )
@@ -682,9 +679,7 @@ def joint_elements(model: Model, state: State, bends: Array) -> list[JointElemen
         bend = bends[:, k] + (spin[:, k] * spin[:, far] if far >= 0 else 0.0)
         coordinates = [(what, i, state.x[:, k, i]) for i, (what, _) in enumerate(kind.motions)]
         if kind.is_spherical:
-            unloaded = ball_spring_rest(model, k)
-            unloaded = quaternion_product(state.p[:, far], unloaded) if far >= 0 else unloaded
-            turn = rotation_vector(quaternion_product(quaternion_conjugate(unloaded), state.p[:, k]))
+            unloaded, turn = ball_spring_turn(model, k, state.p)
             turn = rotate_vectors(rotation_matrix(unloaded), turn)
             coordinates = [("turn", 0, angle) for angle in turn.T]
         for what, i, x in coordinates:
