@@ -23,6 +23,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -119,30 +120,15 @@ def scale_fields(model: Model, **factors: float) -> Model:
     return model.changed(**{name: getattr(model, name) * factor for name, factor in factors.items()})
 
 
-def _rotate_world(model: Model, state: State) -> tuple[Model, State]:
-    return rotate_world(model, state, Q)
-
-
-def _unrotate_world(answers: StateQuantities) -> dict[str, Array]:
-    return unrotate(quantity_values(answers), WORLD_VECTORS, Q)
-
-
-def _rotate_body_frames(model: Model, state: State) -> tuple[Model, State]:
-    return rotate_body_frames(model, state, Q)
-
-
-def _unrotate_body_frames(answers: StateQuantities) -> dict[str, Array]:
-    return unrotate(quantity_values(answers), BODY_VECTORS, Q)
+def _unrotated(vectors: Sequence[str]) -> Callable[[StateQuantities], dict[str, Array]]:
+    """Answers with some of their vectors rotated back."""
+    return lambda answers: unrotate(quantity_values(answers), vectors, Q)
 
 
 def _double_masses(model: Model, state: State) -> tuple[Model, State]:
     fields = ("mass", "inertia", "force", "moment", "drag_force", "drag_moment")
     elements = ("armature", "damping", "stiffness", "effort", "spring_stiffness", "spring_damping")
     return scale_fields(model, **dict.fromkeys((*fields, *elements), 2.0)), state
-
-
-def _halve_forces(answers: StateQuantities) -> dict[str, Array]:
-    return quantity_values(answers, **dict.fromkeys(QUANTITIES[2:], 0.5))
 
 
 def _scale_lengths(model: Model, state: State) -> tuple[Model, State]:
@@ -175,13 +161,6 @@ def _scale_lengths(model: Model, state: State) -> tuple[Model, State]:
     rates = {"omega": state.omega / 2, "udot": state.udot / 2, "v": 2 * state.v}
     x, xdot = of_joint(1, 4)[: model.n] * state.x, of_joint(0.5, 2)[: model.n] * state.xdot
     return large, complete_state(large, replace(state, x=x, xdot=xdot, r=4 * state.r, **rates))
-
-
-def _unscale_lengths(answers: StateQuantities) -> dict[str, Array]:
-    return quantity_values(
-        answers, angular_acceleration=4.0, joint_moment=0.25, kinetic_energy=0.25, potential_energy=0.25,
-        angular_momentum=0.125,
-    )  # fmt: skip
 
 
 def _reverse_time(model: Model, state: State) -> tuple[Model, State]:
@@ -250,14 +229,18 @@ def _redescriptions(model: Model) -> Iterator[Relation]:
         yield Relation(SPRINGS_AS_LOADS, lambda m, state: (springs_as_loads(m, state), state), back, True)
 
 
-TIME_REVERSED = Relation(
-    "time reversed", _reverse_time, lambda answers: quantity_values(answers, angular_momentum=-1.0)
-)
+TIME_REVERSED = Relation("time reversed", _reverse_time, partial(quantity_values, angular_momentum=-1.0))
+_OF_LENGTHS = {
+    "angular_acceleration": 4.0, "joint_moment": 0.25, "kinetic_energy": 0.25, "potential_energy": 0.25,
+    "angular_momentum": 0.125,
+}  # fmt: skip
 STATE_RELATIONS = (
-    Relation("rotated world", _rotate_world, _unrotate_world),
-    Relation("re-chosen body frame", _rotate_body_frames, _unrotate_body_frames),
-    Relation("masses doubled", _double_masses, _halve_forces),
-    Relation("lengths × 4", _scale_lengths, _unscale_lengths),
+    Relation("rotated world", partial(rotate_world, q=Q), _unrotated(WORLD_VECTORS)),
+    Relation("re-chosen body frame", partial(rotate_body_frames, q=Q), _unrotated(BODY_VECTORS)),
+    Relation(
+        "masses doubled", _double_masses, partial(quantity_values, **dict.fromkeys(QUANTITIES[2:], 0.5))
+    ),
+    Relation("lengths × 4", _scale_lengths, partial(quantity_values, **_OF_LENGTHS)),
     TIME_REVERSED,
 )
 

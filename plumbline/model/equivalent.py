@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from plumbline.model.datatypes import (
     BODY_FIELDS,
@@ -44,14 +45,10 @@ def rotate_world(model: Model, state: State, q: Float[Array, "4"]) -> tuple[Mode
 
     """
     turn = rotation_matrix(q)
-    fixed, spring_end = model.body < 0, model.spring_body < 0
     rotated = replace(
-        model,
+        _with_rotated_ends(model, q, model.body < 0, model.spring_body < 0),
         gravity=turn @ model.gravity,
         force=model.force @ turn.T,
-        point=np.where(fixed[..., None], model.point @ turn.T, model.point),
-        turn=np.where(fixed[..., None], normalised(quaternion_product(q, model.turn)), model.turn),
-        spring_point=np.where(spring_end[..., None], model.spring_point @ turn.T, model.spring_point),
     )
     vectors = {name: getattr(state, name) @ turn.T for name in ("u", "udot", "r", "v")}
     p = normalised(quaternion_product(q, state.p))
@@ -70,17 +67,26 @@ def rotate_body_frames(model: Model, state: State, q: Float[Array, "4"]) -> tupl
     """
     turn = rotation_matrix(q)
     inertia = turn @ model.inertia @ turn.T
-    moving, spring_end = model.body >= 0, model.spring_body >= 0
     rotated = replace(
-        model,
+        _with_rotated_ends(model, q, model.body >= 0, model.spring_body >= 0),
         inertia=(inertia + inertia.swapaxes(-1, -2)) / 2,
-        point=np.where(moving[..., None], model.point @ turn.T, model.point),
-        turn=np.where(moving[..., None], normalised(quaternion_product(q, model.turn)), model.turn),
         moment=model.moment @ turn.T,
-        spring_point=np.where(spring_end[..., None], model.spring_point @ turn.T, model.spring_point),
     )
     p = normalised(quaternion_product(state.p, quaternion_conjugate(q)))
     return rotated, complete_state(rotated, replace(state, p=p, omega=state.omega @ turn.T))
+
+
+def _with_rotated_ends(
+    model: Model, q: Array, of_joints: NDArray[np.bool_], of_springs: NDArray[np.bool_]
+) -> Model:
+    """Rotate points and axes of joints, and points of springs, on some of their bodies."""
+    turn = rotation_matrix(q)
+    return replace(
+        model,
+        point=np.where(of_joints[..., None], model.point @ turn.T, model.point),
+        turn=np.where(of_joints[..., None], normalised(quaternion_product(q, model.turn)), model.turn),
+        spring_point=np.where(of_springs[..., None], model.spring_point @ turn.T, model.spring_point),
+    )
 
 
 def unrotate(answers: dict[str, Array], vectors: Sequence[str], q: Float[Array, "4"]) -> dict[str, Array]:
