@@ -107,14 +107,8 @@ def classical_runge_kutta(
         fields: further ones of `JointSpaceMethod`.
 
     """
-    return JointSpaceMethod(
-        "Runge-Kutta",
-        coordinates,
-        rod_axial_inertia,
-        **fields,
-        stages=((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)),
-        weights=(1 / 6, 1 / 3, 1 / 3, 1 / 6),
-    )
+    name = "the classical Runge–Kutta method"
+    return runge_kutta(name, coordinates, rod_axial_inertia=rod_axial_inertia, **fields)
 
 
 # Explicit Runge-Kutta methods: the tableau's rows below the diagonal, and weights.
