@@ -35,7 +35,7 @@ lengths, masses or times are measured in other units.  World frame throughout: A
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, cast
@@ -100,12 +100,11 @@ class RoundingBound:
     def __getitem__(self, s: int | NDArray[np.intp]) -> RoundingBound:
         """Take those at one of many states, or at some."""
 
-        def at(x: Array | float) -> Any:
-            one = np.asarray(x)[s]
+        def at(some: Sequence[Any]) -> Any:
+            one = np.asarray(some[0])[s]
             return one if np.ndim(one) else float(one)
 
-        own = {name: at(x) for name, x in vars(self).items() if name != "scale"}
-        return RoundingBound(**own, scale={name: at(x) for name, x in self.scale.items()})
+        return _combined(at, [self])
 
     def tolerance(self, quantity: str) -> Array | float:
         """Look up a tolerance by the name of its quantity.
@@ -154,6 +153,15 @@ class RoundingBound:
         return f"{how}: at most {largest:.1e}, {self.relative_bound(quantity):.1e} of its scale"
 
 
+def _combined(combine: Callable[[Sequence[Any]], Any], bounds: Sequence[RoundingBound]) -> RoundingBound:
+    """Apply one function to each tolerance, and each scale, of several bounds."""
+    own, scale = (
+        {name: combine([one[name] for one in some]) for name in some[0] if name != "scale"}
+        for some in ([*map(vars, bounds)], [one.scale for one in bounds])
+    )
+    return RoundingBound(**own, scale=scale)
+
+
 def remembered_rounding_bound(model: Model, state: State) -> RoundingBound:
     """Compute the bound of `state_rounding_bound`, or return that of an earlier call with the same numbers.
 
@@ -178,10 +186,7 @@ def state_rounding_bound(model: Model, state: State, parts: BodyParts | None = N
 
 
 def rounding_bounds(
-    model: Model,
-    states: Sequence[State],
-    parts: BodyParts | None = None,
-    method: JointSpaceMethod | None = None,
+    model: Model, states: Sequence[State], parts: BodyParts | None = None
 ) -> list[RoundingBound]:
     """Compute the rounding tolerances of every state quantity at many states.
 
@@ -192,8 +197,6 @@ def rounding_bounds(
             part then: for a part whose centre is c away, levers are longer by ‖c‖ and accelerations by
             ‖c‖(‖ω̇‖ + ‖ω‖W), mass and least inertia are those of the lightest part, and the weld carries the
             weight and inertia of a part with the lever c.
-        method: of steps, by an engine with joint coordinates of its own that corrects gaps: then those of
-            loops depend on no others, and nothing is eliminated onto the joints.
 
     Returns:
         The tolerances, in SI units, and their scales.
@@ -204,14 +207,20 @@ def rounding_bounds(
     """
     if not states:
         return []
-    together = bounds_at(model, stack_states(states), parts, method)
+    together = bounds_at(model, stack_states(states), parts)
     return [together[s] for s in range(len(states))]
 
 
 def bounds_at(
     model: Model, states: State, parts: BodyParts | None = None, method: JointSpaceMethod | None = None
 ) -> RoundingBound:
-    """Compute the tolerances of `rounding_bounds` at many states (S, ...), as arrays (S, ...)."""
+    """Compute the tolerances of `rounding_bounds` at many states (S, ...), as arrays (S, ...).
+
+    Args:
+        method: of steps, by an engine with joint coordinates of its own that corrects gaps: then those of
+            loops depend on no others, and nothing is eliminated onto the joints.
+
+    """
     size = max(1, MAX_ENTRIES // (12 * len(model.kind)) ** 2)
     found: list[RoundingBound] = []
     for first in range(0, len(states.p), size):
@@ -220,16 +229,7 @@ def bounds_at(
             found.append(_of_loops(model, some, method))
         else:
             found.append(_bound(*_Terms(model, some, parts, method=method).bounds()))
-    first_one, *_ = found
-    own = {
-        name: np.concatenate([getattr(one, name) for one in found])
-        for name in vars(first_one)
-        if name != "scale"
-    }
-    scale: dict[str, Array | float] = {
-        name: np.concatenate([one.scale[name] for one in found]) for name in first_one.scale
-    }
-    return RoundingBound(**own, scale=scale)
+    return _combined(np.concatenate, found)
 
 
 def _of_loops(model: Model, states: State, method: JointSpaceMethod | None) -> RoundingBound:
