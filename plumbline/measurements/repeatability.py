@@ -22,7 +22,7 @@ from plumbline.measurements.run_relations import (
     short_steps,
     with_shorter_steps,
 )
-from plumbline.measurements.state_relations import LONG_CHAIN_BODIES, MAX_STATES, evaluate_or_refusal
+from plumbline.measurements.state_relations import compared_states, evaluate_or_refusal
 from plumbline.model.datatypes import (
     Array,
     EngineFailure,
@@ -52,8 +52,7 @@ def check_repeatability(
         largest relative difference, 0 where every bit is the same.
 
     """
-    count = MAX_STATES if model.n <= LONG_CHAIN_BODIES else MAX_STATES // 2
-    yield _check_states(engine, model, states[:count])
+    yield _check_states(engine, model, compared_states(model, states))
     yield from with_shorter_steps(
         engine,
         short_steps(model, states[0]),

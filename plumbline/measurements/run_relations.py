@@ -118,10 +118,35 @@ def check_integrator_relations(
         One result per relation.
 
     """
+    end, is_fixed = RUN_STEPS * step, integrator.kind == "step"
+    resolution = step if is_fixed else integrator.min_rtol
+    driven = _loop_acceleration(model, state) * end
+
+    def result(name: str, ends: tuple[State, State], roundings: int, steps: int) -> RelationResult:
+        limit = roundings * run_tolerance(integrator, model, state, end, steps, growth)
+        differences = relative_differences(model, *ends, driven)
+        return worst_difference_result(name, integrator, differences, limit, steps, resolution, end)
+
     if integrator.is_symmetric and not model.is_dissipative:
-        yield _check_time_reversal(engine, integrator, model, state, step, growth)
-    if integrator.kind == "step" and (options := _options_of_runs(engine, integrator, model)):
-        yield from _check_options(engine, options, integrator, model, state, step, growth)
+        try:
+            run = engine.simulate_round_trip(model, state, end, integrator.name, resolution)
+        except (Unsupported, EngineFailure) as refusal:
+            yield refused_result(REVERSED_IN_TIME, integrator, refusal)
+        else:  # the last row must be the first one with opposite rates
+            there_and_back = state_at_sample(run, 0), state_at_sample(run, 2, -1.0)
+            yield result(REVERSED_IN_TIME, there_and_back, 1, run.steps)
+    if not is_fixed or not (options := _options_of_runs(engine, integrator, model)):
+        return
+    question = model, state, np.array([0.0, end]), integrator.name, step
+    usual = run_or_refusal(engine, *question)
+    for option in options:
+        name, other = OPTION_PREFIX + option, run_or_refusal(engine.with_option(option), *question)
+        if not isinstance(usual, Trajectory):
+            yield refused_result(name, integrator, usual)
+        elif not isinstance(other, Trajectory):
+            yield refused_result(name, integrator, other)
+        else:
+            yield result(name, (state_at_sample(usual, -1), state_at_sample(other, -1)), 2, RUN_STEPS)
 
 
 def _options_of_runs(engine: MetamorphicHooks, integrator: Integrator, model: Model) -> list[str]:
@@ -152,55 +177,6 @@ def _loop_acceleration(model: Model, state: State) -> float:
     if not model.has_loops:
         return 0.0
     return float(np.max(remembered_rounding_bound(model, state).scale["angular_acceleration"]))
-
-
-def _check_time_reversal(
-    engine: MetamorphicHooks, integrator: Integrator, model: Model, state: State, step: float, growth: float
-) -> RelationResult:
-    """Run there and back: the last row must be the first one with opposite rates."""
-    resolution = step if integrator.kind == "step" else integrator.min_rtol
-    end = RUN_STEPS * step
-    try:
-        run = engine.simulate_round_trip(model, state, end, integrator.name, resolution)
-    except (Unsupported, EngineFailure) as refusal:
-        return refused_result(REVERSED_IN_TIME, integrator, refusal)
-    ends, driven = (
-        (state_at_sample(run, 0), state_at_sample(run, 2, -1.0)),
-        _loop_acceleration(model, state) * end,
-    )
-    differences = relative_differences(model, *ends, driven)
-    limit = run_tolerance(integrator, model, state, end, run.steps, growth)
-    return worst_difference_result(
-        REVERSED_IN_TIME, integrator, differences, limit, run.steps, resolution, end
-    )
-
-
-def _check_options(
-    engine: MetamorphicHooks,
-    options: list[str],
-    integrator: Integrator,
-    model: Model,
-    state: State,
-    step: float,
-    growth: float,
-) -> Iterator[RelationResult]:
-    """Compare the same run with each of the engine's options."""
-    end = RUN_STEPS * step
-
-    question = model, state, np.array([0.0, end]), integrator.name, step
-    usual = run_or_refusal(engine, *question)
-    limit = 2 * run_tolerance(integrator, model, state, end, RUN_STEPS, growth)
-    driven = _loop_acceleration(model, state) * end
-    for option in options:
-        name, other = OPTION_PREFIX + option, run_or_refusal(engine.with_option(option), *question)
-        if not isinstance(usual, Trajectory):
-            yield refused_result(name, integrator, usual)
-        elif not isinstance(other, Trajectory):
-            yield refused_result(name, integrator, other)
-        else:
-            ends = state_at_sample(usual, -1), state_at_sample(other, -1)
-            differences = relative_differences(model, *ends, driven)
-            yield worst_difference_result(name, integrator, differences, limit, RUN_STEPS, step, end)
 
 
 def run_or_refusal(
