@@ -12,7 +12,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
 
@@ -106,9 +106,9 @@ class State:
             if not getattr(self, name).size:
                 object.__setattr__(self, name, np.zeros((*self.p.shape[:-1], width)))
 
-    def __getitem__(self, at: Any) -> State:
+    def __getitem__(self, at: Any) -> Self:
         """Take the entries at an index of every array: bodies of one state, or states of many."""
-        return State(*(x[at] for x in vars(self).values()))
+        return replace(self, **{name: x[at] for name, x in vars(self).items()})
 
 
 # sizes of the value that a field of a mechanism or of a state has at one place, behind the axis of the places

@@ -23,7 +23,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from itertools import islice
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,32 +51,26 @@ from plumbline.model.step_methods import JointSpaceMethod
 Array = NDArray[Any]  # in this module of extended precision, where nothing else is stated
 LongDouble: Any = np.longdouble
 Forces = Literal["all", "applied", "joint dampers"]
-# quaternions of the bodies and of the rods by joint, those that turns of the charts lead to, as matrices, and
-# by chart the axes of its angles
-_Attitudes = tuple[list[Array], dict[int, Array], dict[int, Array], dict[int, Array], dict[int, list[Array]]]
 UNIT: Array = np.array([1, 0, 0, 0], LongDouble)
 PROXIMAL_DAMPING = LongDouble(1e-10)  # of rows scaled to a unit diagonal of J M⁻¹ Jᵀ
 PROXIMAL_STEPS = 10
 
 
+class _Attitudes(NamedTuple):
+    """The attitudes of the bodies and rods at coordinates."""
+
+    p: list[Array]  # (..., 4) quaternions of the bodies
+    turned: dict[int, Array]  # by joint the matrices of the bodies whose attitude is a coordinate
+    rods: dict[int, Array]  # by joint the matrices of the rods
+    axes: dict[int, list[Array]]  # by chart (..., 3, 1) of its angles
+
+
 @dataclass(frozen=True, eq=False)
-class BodyStates:
+class BodyStates(State):
     """Motion of the bodies, extended precision; leading axes as in the coordinates it was made from."""
 
-    r: Array  # (..., N, 3) m, world
-    p: Array  # (..., N, 4) unit quaternions
-    v: Array  # (..., N, 3) m/s, world
-    omega: Array  # (..., N, 3) rad/s, body frame
-    u: Array  # (..., N, 3) directions of the rods, world; zero for other joints
-    udot: Array  # (..., N, 3) 1/s
-    x: Array  # (..., N, 2) rad or m, coordinates of the other joints
-    xdot: Array  # (..., N, 2)
-    energy: Array  # (...,) J, kinetic and potential
-    momentum: Array  # (..., 3) kg m²/s, angular, about the origin
-
-    def __getitem__(self, at: Any) -> BodyStates:
-        """Take the entries at an index of the leading axes."""
-        return BodyStates(*(x[at] for x in vars(self).values()))
+    energy: Array = field(kw_only=True)  # (...,) J, kinetic and potential
+    momentum: Array = field(kw_only=True)  # (..., 3) kg m²/s, angular, about the origin
 
     def rounded(self) -> State:
         """Round the motion to doubles."""
@@ -91,6 +85,7 @@ class _Chart:
     v: Array  # (B, size)
     is_group: bool = False  # a quaternion comes first in q, and a turn last in v
     is_point: bool = False  # of a free body
+    is_rigid: bool = False  # the point and its turn are a rigid motion
     axes: tuple[Array, ...] = ()  # (B, 3) of angles, in the frame before
     rest: Array = field(default_factory=lambda: UNIT)  # attitude in that frame at angles of 0
 
@@ -159,7 +154,7 @@ class StepCharts:
         pairs = [*zip(self.own, self.charts, strict=True)]
         places = [range(own.stop - 3, own.stop) for own, chart in pairs if chart.is_group]
         self.turns = np.array(places, np.intp).reshape(-1, 3)  # places of ω among the velocities
-        self.rigid = [own for own, chart in pairs if self.is_rigid(chart)]
+        self.rigid = [own for own, chart in pairs if chart.is_rigid]
 
     def _add_turn(
         self, before: Array, here: Array, w_before: Array, w: Array, axes: list[Array],
@@ -174,20 +169,17 @@ class StepCharts:
             turned = tuple(rotate_vectors(back, axis) for axis in axes)
             if point is not None:
                 q, v = [point[0], *q], [point[1], *v]
-            chart = _Chart(_joined(q), _joined(v), False, point is not None, turned, relative)
+            is_point = point is not None
+            chart = _Chart(_joined(q), _joined(v), is_point=is_point, axes=turned, rest=relative)
             self.charts.append(chart)
             return w_before + sum(axis * found[:, i : i + 1] for i, axis in enumerate(axes))
         back = np.swapaxes(rotation_matrix(here), -1, -2)
-        q, v = [relative], [rotate_vectors(back, w - w_before)]
+        q, v, is_point = [relative], [rotate_vectors(back, w - w_before)], point is not None
+        is_rigid = is_point and self.method.free_coordinates == "rigid motion"
         if point is not None:
-            is_twist = self.method.free_coordinates == "rigid motion"
-            q, v = [*q, point[0]], [rotate_vectors(back, point[1]) if is_twist else point[1], *v]
-        self.charts.append(_Chart(_joined(q), _joined(v), True, point is not None))
+            q, v = [*q, point[0]], [rotate_vectors(back, point[1]) if is_rigid else point[1], *v]
+        self.charts.append(_Chart(_joined(q), _joined(v), True, is_point, is_rigid))
         return w
-
-    def is_rigid(self, chart: _Chart) -> bool:
-        """Whether coordinates are a rigid motion."""
-        return chart.is_group and chart.is_point and self.method.free_coordinates == "rigid motion"
 
     # -- coordinates ---------------------------------------------------------------------------------
 
@@ -287,7 +279,7 @@ class StepCharts:
                 moved.append(at + change)
                 continue
             turn, point = change[..., -3:], at[..., 4:]
-            if self.is_rigid(chart):
+            if chart.is_rigid:
                 shift = rotate_vectors(_left_jacobian(turn), change[..., :3])
                 point = point + rotate_vectors(rotation_matrix(at[..., :4]), shift)
             elif chart.is_point:
@@ -467,35 +459,6 @@ class StepCharts:
 
     # -- bodies --------------------------------------------------------------------------------------
 
-    def quaternions(self, q: list[Array]) -> tuple[list[Array], dict[int, Array], dict[int, list[Array]]]:
-        """Compute attitudes.
-
-        Returns:
-            (..., 4) of the bodies, and of the rods by joint; by chart the axes (..., 3, 1) of its angles.
-
-        """
-        bodies, rods, axes = list[Array](), dict[int, Array](), dict[int, list[Array]]()
-        for k, name in enumerate(self.model.kind):
-            far, own = int(self.model.body[k, 0]), q[self.of_body[k]]
-            here = bodies[far] if far >= 0 else UNIT
-            if k in self.of_rod:
-                at = self.of_rod[k]
-                here, axes[at] = _turned_by(here, self.charts[at], q[at])
-                rods[k] = here
-            if KINDS[name].has_attitude:
-                at = self.of_body[k]
-                here, axes[at] = _turned_by(here, self.charts[at], own)
-            else:
-                first, last = normalised(self.model.turn[k].astype(LongDouble))
-                here = quaternion_product(here, first)
-                for i, (what, axis) in enumerate(KINDS[name].motions):
-                    if what == "turn":
-                        half = np.eye(3, dtype=LongDouble)[axis] * own[..., i : i + 1] / 2
-                        here = quaternion_product(here, quaternion_exponential(half))
-                here = quaternion_product(here, quaternion_conjugate(last))
-            bodies.append(np.broadcast_to(here, (*own.shape[:-1], 4)))
-        return bodies, rods, axes
-
     def tree(self, q: list[Array], v: Array) -> _MovingTree:
         """The mechanism at coordinates and velocities; asked for in turn for the same arrays, it is one."""
         if self._tree is None or self._tree[0] is not q or self._tree[1] is not v:
@@ -505,11 +468,31 @@ class StepCharts:
     def attitudes(self, q: list[Array]) -> _Attitudes:
         """The attitudes at coordinates; asked for in turn for the same list, they are found once."""
         if self._attitudes is None or self._attitudes[0] is not q:
-            p, rod_p, axes = self.quaternions(q)
-            turned = {k: rotation_matrix(one) for k, one in enumerate(p) if self.model.kinds[k].has_attitude}
-            rod_turned = {k: rotation_matrix(one) for k, one in rod_p.items()}
-            self._attitudes = q, (p, rod_p, turned, rod_turned, axes)
+            self._attitudes = q, self._find_attitudes(q)
         return self._attitudes[1]
+
+    def _find_attitudes(self, q: list[Array]) -> _Attitudes:
+        found = _Attitudes([], {}, {}, {})
+        for k, kind in enumerate(self.model.kinds):
+            far, at = int(self.model.body[k, 0]), self.of_body[k]
+            here = found.p[far] if far >= 0 else UNIT
+            if k in self.of_rod:
+                rod = self.of_rod[k]
+                here, found.axes[rod] = _turned_by(here, self.charts[rod], q[rod])
+                found.rods[k] = rotation_matrix(here)
+            if kind.has_attitude:
+                here, found.axes[at] = _turned_by(here, self.charts[at], q[at])
+                found.turned[k] = rotation_matrix(here)
+            else:
+                first, last = normalised(self.model.turn[k].astype(LongDouble))
+                here = quaternion_product(here, first)
+                for i, (what, axis) in enumerate(kind.motions):
+                    if what == "turn":
+                        half = np.eye(3, dtype=LongDouble)[axis] * q[at][..., i : i + 1] / 2
+                        here = quaternion_product(here, quaternion_exponential(half))
+                here = quaternion_product(here, quaternion_conjugate(last))
+            found.p.append(np.broadcast_to(here, (*q[at].shape[:-1], 4)))
+        return found
 
     def bodies(self, q: list[Array], v: Array) -> BodyStates:
         """Return the motion of the mechanism's bodies.
@@ -536,10 +519,9 @@ class StepCharts:
                 x[..., k, : own.shape[-1]], xdot[..., k, : own.shape[-1]] = own, rates
         kinetic, potential, momentum = tree.totals()
         energy = np.broadcast_to((kinetic + potential)[..., 0, 0], lead)
-        every = r, np.stack(tree.p, -2), velocity, omega_, u, udot, x, xdot
+        every = np.stack(tree.p, -2), omega_, u, udot, r, velocity, x, xdot
         momentum = np.broadcast_to(momentum[..., 0], (*lead, 3))
-        r, p, velocity, omega_, u, udot, x, xdot = (one[..., self.place, :] for one in every)
-        return BodyStates(r, p, velocity, omega_, u, udot, x, xdot, energy, momentum)
+        return BodyStates(*(one[..., self.place, :] for one in every), energy=energy, momentum=momentum)
 
     def body_accelerations(self) -> tuple[Array, Array]:
         """Return r̈ (B, N, 3), world axes, and ω̇′ (B, N, 3), body axes, at the states.
@@ -561,7 +543,7 @@ class _MovingTree(Tree):
     def __init__(self, charts: StepCharts, q: list[Array], v: Array, model: Model | None = None) -> None:
         self.charts, self.q = charts, q
         self.rates = [v[..., own] for own in charts.own]
-        self.p, self.rod_p, self.turned, self.rod_turned, self.turned_axes = charts.attitudes(q)
+        self.p, self.turned, self.rod_turned, self.turned_axes = charts.attitudes(q)
         self.rod_w: dict[int, Array] = {}
         self.rods: dict[int, tuple[Array, Array]] = {}  # u and u̇
         self.axes: dict[int, tuple[list[Array], Array]] = {}  # by chart: of its angles; α at q̈ = 0 of them
@@ -603,7 +585,7 @@ class _MovingTree(Tree):
         chart, r, v = self.charts.charts[at], self.q[at][..., :3], self.rates[at][..., :3, None]
         if not chart.axes:
             r = self.q[at][..., 4:]
-        return r[..., None], self.turned[k] @ v if self.charts.is_rigid(chart) else v
+        return r[..., None], self.turned[k] @ v if chart.is_rigid else v
 
     def rod_direction(self, k: int) -> tuple[Any, Any]:
         return self.rods[k]
@@ -640,7 +622,7 @@ class _MovingTree(Tree):
                 w, alpha = self.rod_w[k], alpha_rod
             if kind.holds_nothing:
                 shift = found.acceleration[k]
-                if self.charts.is_rigid(self.charts.charts[own]):
+                if self.charts.charts[own].is_rigid:
                     shift = self.A[k].mT @ (shift - self.num.cross(self.w[k], self.v[k]))
                 out.append(shift[..., 0])
             turns = (w, self.w[k]), (alpha, found.turning[k])
@@ -734,7 +716,9 @@ class _MovingTree(Tree):
             change.append(np.concatenate([alpha, A + num.mul(num.cross_matrix(at), alpha) - carried], -2))
         apart = twist[0] - twist[1]
         turn = rotation_vector(self._turn_between(b, c))
-        gap = np.concatenate([turn, _log_shift(turn, (back @ (self.r[c] - here))[..., 0])], -1)
+        # the logarithm's linear part: Σ Bₖ/k! (turn ×)ᵏ shift, B₁ = −½; turns of less than 2 rad
+        shift = (back @ (self.r[c] - here))[..., 0]
+        gap = np.concatenate([turn, _bernoulli_series(cross, turn, shift, -0.5, BERNOULLI)], -1)
         wanted = (-_twist_cross(apart, twist[1]) - 2 * a * apart)[..., None]
         missing = change[0] - change[1]
         missing = np.concatenate([missing[..., :1] - wanted, missing[..., 1:]], -1)
@@ -826,11 +810,6 @@ def _bernoulli_series(
         power = bracket(by, power)
         total, power = total + weight * power, bracket(by, power)
     return total
-
-
-def _log_shift(turn: Array, shift: Array) -> Array:
-    """The linear part of log of a pose: Σ Bₖ/k! (turn ×)ᵏ shift, B₁ = −½; turns of less than 2 rad."""
-    return _bernoulli_series(cross, turn, shift, -0.5, BERNOULLI)
 
 
 def _left_jacobian(t: Array) -> Array:

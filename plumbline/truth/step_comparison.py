@@ -617,7 +617,7 @@ def _reported(t: Trajectory, at: int | slice | NDArray[np.intp]) -> State:
     return State(p, angular_velocity(p, t.pdot[at]), r=t.r[at], v=t.v[at])
 
 
-def _differences(one: BodyStates | State, other: BodyStates | State) -> dict[str, Array]:
+def _differences(one: State, other: State) -> dict[str, Array]:
     """Differences (..., N, ·) of bodies; of attitudes twice those of quaternions as they are."""
     sign = np.where(np.sum(one.p * other.p, axis=-1, keepdims=True) < 0, -1, 1)
     pairs: dict[str, tuple[Any, Any]] = {
