@@ -104,21 +104,18 @@ class DirectSystem:
         self._unsort = np.argsort(by_row)
 
     def assemble(
-        self,
-        *motion: *Motion,
-        x: Float[Array, "joints coordinates"] | None = None,
+        self, *motion: *Motion
     ) -> tuple[Float[Array, "unknowns unknowns"], Float[Array, "unknowns"]]:
         """Assemble S and b of (N5), on or off the constraints.
 
         Args:
             motion: r, p, ṙ and ṗ.
-            x: as for `solve`.
 
         Returns:
             S (m, m) and b (m,), m = 8 N + c, for x = (r̈, p̈, λ, λ_E).
 
         """
-        values, b, *_ = self._entries(motion, x)
+        values, b, *_ = self._entries(motion, None)
         return self._dense(values), b
 
     def solve(
@@ -175,10 +172,7 @@ class DirectSystem:
         if self.chain.has_loops:
             return self._loop_unknowns(motion, gamma_defect, x, is_run=True)[0]
         with np.errstate(all="ignore"):  # an overflow raises SingularSystem below
-            values, b, joints, elements = self._entries(motion, x)
-            n, c = self.chain.n, len(self.joint)
-            b[7 * n : 7 * n + c] += gamma_defect
-            check_state_solvable(self.chain, *motion[:2], joints.d, self._rods, (values, b, motion[2]))
+            values, b, joints, elements = self._solvable_entries(motion, gamma_defect, x)
 
         entries = values[self._by_row]
         scale = power_of_two_scale(np.maximum.reduceat(np.abs(entries), self._row_start))
@@ -195,22 +189,17 @@ class DirectSystem:
         solution[self._order] = y * scale
         return solution, joints, elements
 
-    def solve_with_dense_factors(
-        self,
-        *motion: *Motion,
-        x: Float[Array, "joints coordinates"] | None = None,
-    ) -> Solution:
+    def solve_with_dense_factors(self, *motion: *Motion) -> Solution:
         """Solve (N5) by dense factors of the assembled S, an independent way to the x of `solve`.
 
         Args:
             motion: r, p, ṙ and ṗ.
-            x: as for `solve`.
 
         Returns:
             As `solve`.
 
         """
-        values, b, joints, elements = self._entries(motion, x)
+        values, b, joints, elements = self._entries(motion, None)
         return self._solution_from_unknowns(motion[1], solve_dense(self._dense(values), b), joints, elements)
 
     def _loop_unknowns(
@@ -223,10 +212,8 @@ class DirectSystem:
         """As `solve_unknowns`, by dense factors; and which of the rows are kept."""
         n, c, plain = self.chain.n, len(self.joint), len(self.joint) - self.rotor_count
         p = motion[1]
-        values, b, joints, elements = self._entries(motion, x)
+        values, b, joints, elements = self._solvable_entries(motion, gamma_defect, x)
         S = self._dense(values)
-        b[7 * n : 7 * n + c] += gamma_defect
-        check_state_solvable(self.chain, *motion[:2], joints.d, self._rods, (values, b, motion[2]))
         rows = S[7 * n : 7 * n + plain, : 7 * n].copy()
         of_p = rows[:, 3 * n :].reshape(plain, n, 4)
         of_p -= p * (dot(of_p, p) / dot(p, p))[..., None]
@@ -266,6 +253,15 @@ class DirectSystem:
         S = np.zeros((self.size, self.size), values.dtype)
         S[self._i, self._j] = values
         return S
+
+    def _solvable_entries(
+        self, motion: Motion, gamma_defect: float | Array, x: Array | None
+    ) -> tuple[Array, Array, ConstraintRows, ElementForces | None]:
+        """`_entries` with γ changed, of a state at which they are finite and no rod or p vanishes."""
+        values, b, joints, elements = self._entries(motion, x)
+        b[7 * self.chain.n :][: len(self.joint)] += gamma_defect
+        check_state_solvable(self.chain, *motion[:2], joints.d, self._rods, (values, b, motion[2]))
+        return values, b, joints, elements
 
     def _entries(
         self, motion: Motion, x: Float[Array, "joints coordinates"] | None
