@@ -27,8 +27,8 @@ from typing import Any
 import numpy as np
 
 from plumbline.equations.arithmetic import Arithmetic
-from plumbline.model.datatypes import KINDS, Model, State
-from plumbline.model.kinematics import own_rates, rate_count
+from plumbline.model.datatypes import JOINT_ELEMENTS, KINDS, Model, State
+from plumbline.model.kinematics import own_rates, path_to_world, rate_count
 
 SUMS = ("kinetic_energy", "potential_energy", "angular_momentum")
 
@@ -423,13 +423,12 @@ class Tree:
         """Go along the scalar motions of joint k."""
         num, model = self.num, self.model
         A, swing, blocks = num.mul(above, self.joint_axes(k, 0)), self.zero, []
-        elements = ("armature", "damping", "stiffness", "rest", "effort")
         for i, (what, number) in enumerate(KINDS[model.kind[k]].motions):
             x, rate = self.coordinate(k, i)
             unit = num.vector(np.eye(3)[number])
             axis = num.mul(A, unit)
             effort, armature = num.scalar(0.0), None
-            numbers = [getattr(model, name)[..., k, i] for name in elements]
+            numbers = [getattr(model, name)[..., k, i] for name in JOINT_ELEMENTS]
             if any(map(np.any, numbers)):
                 a, d, stiffness, rest, push = map(num.scalar, numbers)
                 stretch = x - rest
@@ -801,14 +800,12 @@ class Tree:
             for at, slide, turn in columns[k]:
                 push = _sum(num.mul, (c, slide), (b, turn))
                 moment = _sum(num.mul, (num.transpose(b), slide), (i, turn))
-                j = k
-                while j >= 0:
+                for j in path_to_world(self.far, k):
                     for row, along, about in columns[j]:
                         if j < k or row <= at:
                             add(row, at, _sum(partial(_projected, num), (push, along), (moment, about)))
                     lever = num.mul(num.cross_matrix(self.arm[j]), push)
                     moment = lever if keeps_attitude[j] else moment + lever
-                    j = self.far[j]
         for pairs, armature in self._rotors(columns):
             for number, (row, left) in enumerate(pairs):
                 for column, right in pairs[number:]:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plumbline.model.datatypes import JOINT_ELEMENTS, Array, Kind, Model
+from plumbline.model.kinematics import path_to_world
 
 Index = tuple[int | NDArray[np.bool_], ...]
 Role = Literal["single", "beside", "loop", "closing"]
@@ -67,7 +68,7 @@ def joint_roles(model: Model) -> list[Role]:
     far = model.body[: model.n, 0]
     in_loops = set[int]()
     for ends in model.body[model.n :]:
-        first, second = (set(_path(far, int(end))) for end in ends)
+        first, second = (set(path_to_world(far, int(end))) for end in ends)
         in_loops |= first ^ second
     found: list[Role] = []
     for k in range(model.n):
@@ -105,13 +106,6 @@ def without_feature(model: Model, feature: Feature) -> Model:
     return model.changed(**changes)
 
 
-def _path(far: NDArray[np.intp], body: int) -> Iterator[int]:
-    """The joints from a body to the world."""
-    while body >= 0:
-        yield body
-        body = int(far[body])
-
-
 def _values(model: Model) -> Iterator[_Value]:
     """All values that are not neutral."""
     for axis, letter in enumerate("xyz"):
@@ -120,7 +114,7 @@ def _values(model: Model) -> Iterator[_Value]:
     for k, (kind, role) in enumerate(zip(model.kind, roles, strict=True)):
         for field, name, index, neutral in _joint_values(model, k):
             yield from _changed(model, Feature(field, kind, role), name, index, neutral)
-    tree = [min(_path(model.body[: model.n, 0], k)) for k in range(model.n)]
+    tree = [min(path_to_world(model.body[: model.n, 0], k)) for k in range(model.n)]
     for k, (one, other) in enumerate(model.spring_body):
         where = "two bodies" if tree[one] == tree[other] else "two trees"
         where = f"a spring between {'a body and the world' if min(one, other) < 0 else where}"

@@ -6,7 +6,7 @@ Imports nothing of the project but its types.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
@@ -691,6 +691,13 @@ def bodies_beyond(model: Model) -> Bool[Flags, "bodies bodies"]:
         if far >= 0:
             found[far] |= found[k]
     return found
+
+
+def path_to_world(far: Sequence[int] | Int[Indices, "bodies"], body: int) -> Iterator[int]:
+    """Go from a body to the world, along the far bodies (−1: the world) of all bodies' joints."""
+    while body >= 0:
+        yield body
+        body = int(far[body])
 
 
 def depth_first(

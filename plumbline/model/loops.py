@@ -42,6 +42,7 @@ from plumbline.model.kinematics import (
     mass_matrix,
     minimal_rates,
     own_rates,
+    path_to_world,
     quaternion_product,
     rate_count,
     rotate_vectors,
@@ -658,12 +659,10 @@ def determinate_projectors(model: Model, state: State) -> Float[Array, "joints 6
     change = np.zeros((n, 6, held.shape[-1]))
     for (b, c), wrench in zip(cut.ends, held, strict=True):
         for body, sign in ((b, 1.0), (c, -1.0)):
-            k = body
-            while k >= 0:
+            for k in path_to_world(cut.model.body[:, 0], body):
                 change[k, :3] += sign * wrench[:3]
                 moment = a[b] @ wrench[3:] + cross(there.r[b] - near[k], wrench[:3].T).T
                 change[k, 3:] += sign * moment / wrench_length(model)
-                k = cut.model.body[k, 0]
     projectors = np.tile(np.eye(6), (n, 1, 1))
     for k in range(n):
         vectors, sizes, _ = np.linalg.svd(change[k])

@@ -13,7 +13,6 @@ from plumbline.model.datatypes import (
     BALL,
     FREE,
     HINGE,
-    JOINT_ELEMENTS,
     KINDS,
     WELD,
     Array,
@@ -26,6 +25,7 @@ from plumbline.model.features import Place, Role
 from plumbline.model.kinematics import (
     complete_state,
     normalised,
+    path_to_world,
     quaternion_conjugate,
     quaternion_product,
     rotation_matrix,
@@ -69,14 +69,10 @@ def random_tree(
     far: list[int] = []
     chosen: list[Kind] = []
     for k in range(n):
-        path = [k - 1]
-        while path[-1] >= 0:
-            path.append(far[path[-1]])
-        far.append(int(rng.choice(path)))
+        far.append(int(rng.choice([*path_to_world(far, k - 1), -1])))
         fitting = [kind for kind in kinds if kind != (FREE if far[k] >= 0 else WELD)]
         chosen.append(fitting[rng.integers(len(fitting))] if fitting else HINGE)
-    bare = _with_numbers(rng, chosen, far, loads)
-    return with_elements(rng, bare, elements) if elements else bare
+    return with_elements(rng, _with_numbers(rng, chosen, far, loads), elements)
 
 
 def _with_numbers(
@@ -178,7 +174,6 @@ def close_loop(
         point=np.concatenate([model.point, [[point, at]]]),
         turn=np.concatenate([model.turn, [[axes / np.linalg.norm(axes), turn]]]),
         length=np.append(model.length, length),
-        **{name: np.vstack([getattr(model, name), np.zeros((1, model.columns))]) for name in JOINT_ELEMENTS},
     )
 
 
@@ -215,8 +210,7 @@ def random_loop_mechanism(
                 break
             model = close_loop(model, state, kind, int(rng.choice(ends)), near, rng)
         if len(model.kind) == n + len(kinds) and _moves(model, state):
-            if elements:  # of closing joints too
-                model = with_elements(rng, model, elements)
+            model = with_elements(rng, model, elements)  # of closing joints too
             return model, assembled(model, complete_state(model, state))
     raise AssertionError
 
@@ -297,7 +291,7 @@ def mechanism_with_places(
         for foot, near, closing in rings:
             model = close_loop(model, state, closing, foot.place, near.place, rng)
         if not rings or _moves(model, state):
-            model = with_elements(rng, model, elements) if elements else model
+            model = with_elements(rng, model, elements)
             return model, assembled(model, complete_state(model, state))
     raise AssertionError
 

@@ -48,12 +48,14 @@ from plumbline.model.kinematics import (
     complete_state,
     cross,
     depth_first,
+    path_to_world,
     quaternion_product,
     rotate_vectors,
     rotation_matrix,
     spring_vector_rates,
     spring_vectors,
 )
+from plumbline.model.loops import wrench_length
 
 _CYLINDER = KINDS[CYLINDRICAL].motions
 HELD_KINDS = tuple(  # made of cylindrical joints by holding some of their motions
@@ -100,9 +102,7 @@ def moved_root(model: Model) -> Rearranged | None:
     """
     n, far = model.n, model.body[: model.n, 0]
     last = next((k for k in range(1, n) if far[k] != k - 1), n) - 1
-    path = [last]
-    while far[path[-1]] >= 0:
-        path.append(int(far[path[-1]]))
+    path = [*path_to_world(far, last)]
     root = path[-1]
     is_free = model.free[root]
     if any(np.any(getattr(model, name)[root]) for name in JOINT_ELEMENTS) or (is_free and last == root):
@@ -244,7 +244,7 @@ def joints_as_rods(model: Model) -> Model:
 
     """
     chosen = [k for k in range(model.n) if _is_ball_and_rows(model, k)]
-    size = float(np.mean(np.linalg.norm(model.point, axis=2))) or 1.0
+    size = wrench_length(model)
     body, point, kind = [], [], list[Kind](model.kind)
     for k in chosen:
         # [side, axis]: a vector in that side's body
@@ -266,7 +266,6 @@ def joints_as_rods(model: Model) -> Model:
         point=np.concatenate([model.point, point]),
         turn=np.concatenate([model.turn, identity]),
         length=np.concatenate([model.length, np.full(new, np.sqrt(2.0) * size)]),
-        **{name: np.pad(getattr(model, name), ((0, new), (0, 0))) for name in JOINT_ELEMENTS},
     )
 
 

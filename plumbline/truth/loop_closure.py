@@ -24,6 +24,7 @@ from plumbline.equations.arithmetic import balls as ball_arithmetic
 from plumbline.equations.arithmetic import entries, midpoints
 from plumbline.equations.tree import Solution, Tree
 from plumbline.model.datatypes import KINDS, ZERO_INERTIA, Array, Model, State
+from plumbline.model.kinematics import path_to_world
 from plumbline.model.loops import CutMechanism, cut_open, independent_rows
 
 UNIQUENESS_RADIUS = 1e-10  # of dependent coordinates [rad, m], in which the pose is the only one
@@ -128,8 +129,7 @@ class _LoopTree(Tree):
             if of_gap:
                 turned = (self.one * (R[0, 0] + R[1, 1] + R[2, 2]) - R) * self.arb("0.5") * turned
             for body, sign in ((b, 1), (c, -1)):
-                k = body
-                while k >= 0:
+                for k in path_to_world(self.far, body):
                     motions[k] = slides, turns = motions.get(k) or self.motions(k)
                     lever = self.num.cross_matrix(self.r[k] + self.near[k] - self.r[body])
                     for block, at in ((slides + lever * turns, 6 * loop), (turned * turns, 6 * loop + 3)):
@@ -137,7 +137,6 @@ class _LoopTree(Tree):
                             for i in range(block.ncols()):
                                 place = at + row, int(columns[k]) + i
                                 out[place] = out[place] + sign * block[row, i]
-                    k = self.far[k]
         return out
 
 
@@ -240,11 +239,14 @@ def _prove_pose(
     Y = flint.arb_mat([[flint.arb(float(x)) for x in row] for row in np.linalg.inv(kept[:, dependent])])
     none = _per_joint([flint.arb(0)] * count, sizes)
 
-    def loop_at(values: list[Any]) -> _LoopTree:
+    def placed(values: list[Any]) -> list[list[Any]]:
         z = [flint.arb(0)] * count
         for i, value in zip(dependent, values, strict=True):
             z[int(i)] = value
-        return _LoopTree(flint, cut.model, start, _per_joint(z, sizes), none)
+        return _per_joint(z, sizes)
+
+    def loop_at(values: list[Any]) -> _LoopTree:
+        return _LoopTree(flint, cut.model, start, placed(values), none)
 
     def correction(values: list[Any]) -> list[Any]:
         gap = loop_at(values).gap(cut.ends)
@@ -276,11 +278,7 @@ def _prove_pose(
     contracts(UNIQUENESS_RADIUS)
     if not all(bool(abs(m) < UNIQUENESS_RADIUS) for m in middle):
         raise ZeroDivisionError("the doubles are not near the pose")
-    values = contracts(max(4 * max(float(abs(s).upper()) for s in step), target))
-    z = [flint.arb(0)] * count
-    for i, value in zip(dependent, values, strict=True):
-        z[int(i)] = value
-    return _per_joint(z, sizes)
+    return placed(contracts(max(4 * max(float(abs(s).upper()) for s in step), target)))
 
 
 def _closed_rates(flint: Any, given: Tree, kept: Any, dependent: NDArray[np.intp]) -> list[Any]:
