@@ -123,12 +123,16 @@ def reorder_bodies(model: Model, state: State, order: Int[Indices, "bodies"]) ->
     """
     place = np.append(np.argsort(order), -1)  # the world is −1 in both
     joints = np.append(order, np.arange(model.n, len(model.kind)))  # those that close loops stay
-    fields = {name: getattr(model, name)[order] for name in ("mass", "inertia", *BODY_FIELDS)}
-    fields |= {name: getattr(model, name)[joints] for name in JOINT_FIELDS if name not in ("kind", "body")}
-    kind = tuple(model.kind[k] for k in joints)
-    spring_body = place[model.spring_body]
-    reordered = replace(model, kind=kind, body=place[model.body[joints]], spring_body=spring_body, **fields)
-    return reordered, state[order]
+    fields = _fields_of(model, order, joints)
+    changes = {"body": place[fields["body"]], "spring_body": place[model.spring_body]}
+    return replace(model, **fields | changes), state[order]
+
+
+def _fields_of(model: Model, bodies: Any, joints: NDArray[np.intp]) -> dict[str, Any]:
+    """Fields of some bodies and joints, in an order; the joints' bodies by their old numbers."""
+    fields = {name: getattr(model, name)[bodies] for name in ("mass", "inertia", *BODY_FIELDS)}
+    fields |= {name: getattr(model, name)[joints] for name in JOINT_FIELDS if name != "kind"}
+    return fields | {"kind": tuple(model.kind[k] for k in joints)}
 
 
 def bodies_between(model: Model, state: State, first: int, end: int) -> tuple[Model, State]:
@@ -149,9 +153,8 @@ def bodies_between(model: Model, state: State, first: int, end: int) -> tuple[Mo
     )
     near = model.body[:, 1]
     joints = np.flatnonzero(np.where(tree, (near >= first) & (near < end), inside))
-    fields: dict[str, Any] = {name: getattr(model, name)[joints] for name in JOINT_FIELDS if name != "kind"}
+    fields = _fields_of(model, slice(first, end), joints)
     fields["point"][~inside[joints], 0] = 0.0
-    fields |= {name: getattr(model, name)[first:end] for name in ("mass", "inertia", *BODY_FIELDS)}
     fields |= {name: getattr(model, name)[springs] for name in SPRING_FIELDS}
     fields |= {name: np.maximum(fields[name] - first, -1) for name in ("body", "spring_body")}
-    return replace(model, kind=tuple(model.kind[k] for k in joints), **fields), state[first:end]
+    return replace(model, **fields), state[first:end]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.polynomial.legendre import legder, leggauss, legvander
 from numpy.typing import NDArray
 
-from plumbline.model.datatypes import JOINT_ELEMENTS, ZERO_INERTIA, Array, Float, Model, State, Trajectory
+from plumbline.model.datatypes import ZERO_INERTIA, Array, Float, Model, State, Trajectory
 from plumbline.model.kinematics import (
     angular_velocity,
     ball_spring_turn,
@@ -17,6 +17,7 @@ from plumbline.model.kinematics import (
     cross,
     joint_vector_rates,
     joint_vectors,
+    joints_with_elements,
     nearest_turn,
     quaternion_exponential,
     quaternion_product,
@@ -407,7 +408,7 @@ def element_energies(
         return ElementEnergies(rotors, springs, power)
     state = State(run.p, omega, r=run.r, v=run.v)
     spin = rotate_vectors(rotation_matrix(run.p), omega)
-    joints = np.flatnonzero(np.any([getattr(model, name) for name in JOINT_ELEMENTS], axis=(0, -1)))
+    joints = np.flatnonzero(joints_with_elements(model)).tolist()
     *_, coordinates, rates = coordinates_of_joints(model, state, joints)
     for at, k in enumerate(joints):
         far, near = model.body[k]

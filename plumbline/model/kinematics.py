@@ -15,7 +15,18 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from plumbline.model.datatypes import Array, Bool, Flags, Float, Indices, Int, JointKind, Model, State
+from plumbline.model.datatypes import (
+    JOINT_ELEMENTS,
+    Array,
+    Bool,
+    Flags,
+    Float,
+    Indices,
+    Int,
+    JointKind,
+    Model,
+    State,
+)
 
 _NEXT = np.array([1, 2, 0])  # of each axis the next one
 
@@ -691,6 +702,11 @@ def bodies_beyond(model: Model) -> Bool[Flags, "bodies bodies"]:
         if far >= 0:
             found[far] |= found[k]
     return found
+
+
+def joints_with_elements(model: Model) -> Bool[Flags, "joints"]:
+    """Return which joints have a rotor, a damper, a spring or an effort."""
+    return np.asarray(np.any([getattr(model, name) for name in JOINT_ELEMENTS], axis=(0, -1)))
 
 
 def path_to_world(far: Sequence[int] | Int[Indices, "bodies"], body: int) -> Iterator[int]:

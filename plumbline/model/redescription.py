@@ -48,6 +48,7 @@ from plumbline.model.kinematics import (
     complete_state,
     cross,
     depth_first,
+    joints_with_elements,
     path_to_world,
     quaternion_product,
     rotate_vectors,
@@ -105,7 +106,7 @@ def moved_root(model: Model) -> Rearranged | None:
     path = [*path_to_world(far, last)]
     root = path[-1]
     is_free = model.free[root]
-    if any(np.any(getattr(model, name)[root]) for name in JOINT_ELEMENTS) or (is_free and last == root):
+    if joints_with_elements(model)[root] or (is_free and last == root):
         return None
     above = far.copy()
     for k in path[:-1]:
@@ -243,7 +244,8 @@ def joints_as_rods(model: Model) -> Model:
         The same mechanism; the model itself where it has none of them.
 
     """
-    chosen = [k for k in range(model.n) if _is_ball_and_rows(model, k)]
+    is_more_than_a_ball = [kind.holds_points and not kind.is_spherical for kind in model.kinds]
+    chosen = np.flatnonzero((is_more_than_a_ball & ~joints_with_elements(model))[: model.n]).tolist()
     size = wrench_length(model)
     body, point, kind = [], [], list[Kind](model.kind)
     for k in chosen:
@@ -267,12 +269,6 @@ def joints_as_rods(model: Model) -> Model:
         turn=np.concatenate([model.turn, identity]),
         length=np.concatenate([model.length, np.full(new, np.sqrt(2.0) * size)]),
     )
-
-
-def _is_ball_and_rows(model: Model, k: int) -> bool:
-    kind = model.kinds[k]
-    has_elements = any(np.any(getattr(model, name)[k]) for name in JOINT_ELEMENTS)
-    return kind.holds_points and not kind.is_spherical and not has_elements
 
 
 def state_of_balls(model: Model, state: State) -> State:

@@ -398,7 +398,7 @@ def step_bound(
         gyration = np.sqrt(np.min(np.linalg.eigvalsh(model.inertia), axis=-1).clip(0) / model.mass)
         omega += np.where(gyration > 0, felt / np.maximum(gyration, TINY), 0.0)
     if method.free_coordinates == "rigid motion":  # ṙ is kept in the body's axes, which turn
-        velocity += np.where(_free(model), count * h * omega * speed, 0.0) @ path.T
+        velocity += np.where(model.free[: model.n], count * h * omega * speed, 0.0) @ path.T
     return {
         "step_rate": omega,
         "step_velocity": velocity,
@@ -453,7 +453,7 @@ def _lost_in_closed_forms(
         for lost in (change / t**3 + (2 + 4 * h * fastest) / t, change / t)
     )
     path = _paths(model)
-    return Lost(np.where(_free(model), h * speed * place, 0.0) @ path.T, turned @ path.T)
+    return Lost(np.where(model.free[: model.n], h * speed * place, 0.0) @ path.T, turned @ path.T)
 
 
 def _relative_rates(model: Model, states: State) -> Array:
@@ -577,11 +577,6 @@ def _spread(values: Array, some: NDArray[np.intp]) -> Array:
     """Give each sample the larger of the two values around it, of those at some samples."""
     at = np.searchsorted(some, np.arange(some[-1] + 1))
     return np.maximum(values[at], values[np.maximum(at - 1, 0)])
-
-
-def _free(model: Model) -> NDArray[np.bool_]:
-    """Which bodies move freely."""
-    return np.array([kind.holds_nothing for kind in model.kinds[: model.n]])
 
 
 def _paths(model: Model) -> NDArray[np.bool_]:
@@ -718,38 +713,28 @@ class StepsFromSamples:
         the origin, it is off as all rates together.  The equations hold at one pose: in methods that use
         those of several, or derivatives by the rates, what relative rates pass on changes both totals.
         """
-        kinetic, potential, sums, joint_terms, power = (
-            np.asarray(getattr(self.bounds, name))
-            for name in (
-                "kinetic_energy",
-                "potential_energy",
-                "angular_momentum",
-                "joint_terms",
-                "joint_power",
-            )
-        )
 
-        def of_both_ends(x: Array) -> Array:
+        def of_both_ends(x: Any) -> Array:
             return np.asarray(np.maximum(x[:count], x[-count:]))
 
-        model, reach = self.model, np.linalg.norm(self.states.r, axis=-1)
+        bounds, model, reach = self.bounds, self.model, np.linalg.norm(self.states.r, axis=-1)
         share = ACCELERATION_FACTOR * self.h / np.maximum(self.middle_cosine, TINY) ** 4
-        energy, left = of_both_ends(kinetic + potential + share * power), of_both_ends(share * joint_terms)
+        energy = of_both_ends(bounds.kinetic_energy + bounds.potential_energy + share * bounds.joint_power)
         reach, inertia = of_both_ends(reach), np.linalg.norm(model.inertia, axis=(1, 2))
         passed_on = _passed_on(self.method, model, between, 0.0 if self.is_of_one_pose else self.h, 1)
         passed_on = {name: of_both_ends(share)[:, None] * x for name, x in passed_on.items()}
         unsure = {name: x + self.uncertainty[name] for name, x in passed_on.items()}
         energy += (model.mass * between["speed"] * unsure["step_velocity"]).sum(-1)
         energy += (between["rate"] * unsure["step_rate"]) @ inertia
-        accelerations = of_both_ends(np.asarray(self.bounds.scale["acceleration"]))
+        accelerations = of_both_ends(bounds.scale["acceleration"])
         energy += (model.mass * accelerations * self.lost.place).sum(-1)
         rates, own = self.of_step, np.zeros(count)
         if _is_momentum_free(model):
             rates = {name: of_both_ends(self.of_samples[name]) + x for name, x in passed_on.items()}
-            own = left
+            own = of_both_ends(share * bounds.joint_terms)
         off = (model.mass * reach * rates["step_velocity"]).sum(-1) + rates["step_rate"] @ inertia
         off += (model.mass * between["speed"] * self.lost.place).sum(-1)
-        return {"energy": energy, "momentum": of_both_ends(sums) + own + off}
+        return {"energy": energy, "momentum": of_both_ends(bounds.angular_momentum) + own + off}
 
     def mistake_ratios(self, model: Model, states: State) -> dict[str, float]:
         """Compute what an engine with another mechanism would be off by, over what rounding explains.
@@ -918,7 +903,7 @@ class RunSteps(StepsFromSamples):
         fast |= np.maximum(self.fastest[:-1], self.fastest[1:]) * self.h > most
         size = np.sum(stretched_length(self.model)) + np.max(np.linalg.norm(self.model.point, axis=2))
         first = np.argmax(_paths(self.model), axis=1)  # of the bodies between each and the world
-        free = _free(self.model)[first] & (not self.model.has_loops)
+        free = self.model.free[first] & (not self.model.has_loops)
         apart = self.states.r - np.where(free[:, None], self.states.r[:, first], 0.0)
         far = np.max(np.linalg.norm(apart, axis=-1), axis=-1) > MAX_DISTANCE * size
         cosine = self.middle_cosine

@@ -185,6 +185,16 @@ class Motion:
         return found[0].plus(found[1]) if moment is not None else found[0]
 
 
+def _exactly(numbers: Array) -> Rounded:
+    """Vectors of one component, without errors."""
+    return Rounded(numbers[:, None], np.zeros(len(numbers)), np.abs(numbers))
+
+
+def _of_first(vectors: Rounded) -> Rounded:
+    """The first body's vector for every body."""
+    return Rounded(*(np.broadcast_to(x[:1], x.shape) for x in vectors))
+
+
 def _about_centre(motion: Motion, weights: Array, moving: Rounded, spin: Rounded) -> Rounded:
     """Σ (r − c) × moving + spin with the weights (sums, N) of bodies, about their centre of mass c."""
     found = list[Rounded]()
@@ -201,8 +211,7 @@ def _subtree(motion: Motion, vectors: Rounded) -> Rounded:
 
 
 def _subtree_mass(motion: Motion) -> Rounded:
-    mass = motion.below @ motion.mass
-    return Rounded(mass[:, None], np.zeros(len(mass)), mass)
+    return _exactly(motion.below @ motion.mass)
 
 
 def _momenta(motion: Motion) -> Rounded:
@@ -242,7 +251,7 @@ def _frame_distance_rate(motion: Motion) -> Rounded:
 
 def _first(motion: Motion, vectors: Rounded) -> Rounded:
     """The vectors less the first body's."""
-    return vectors.minus(Rounded(*(np.broadcast_to(x[:1], x.shape) for x in vectors)))
+    return vectors.minus(_of_first(vectors))
 
 
 def _in_first(motion: Motion, vectors: Rounded) -> Rounded:
@@ -253,8 +262,8 @@ def _in_first(motion: Motion, vectors: Rounded) -> Rounded:
 
 def _velocity_in_first(motion: Motion) -> Rounded:
     """As an observer sees it who turns with the first probe frame."""
-    spin = Rounded(*(np.broadcast_to(x[:1], x.shape) for x in motion.w))
-    return _first(motion, motion.point_velocity).minus(spin.cross(_first(motion, motion.point)))
+    turned = _of_first(motion.w).cross(_first(motion, motion.point))
+    return _first(motion, motion.point_velocity).minus(turned)
 
 
 def _axes_in_first(motion: Motion) -> Rounded:
@@ -276,14 +285,12 @@ def _spatial(motion: Motion) -> Rounded:
 
 
 def _total_mass(m: Motion) -> Rounded:
-    total = np.sum(m.mass)
-    return Rounded(np.full((1, 1), total), np.zeros(1), np.full(1, total))
+    return _exactly(np.sum(m.mass, keepdims=True))
 
 
 def _degrees_of_freedom(m: Motion) -> Rounded:
     """The rates of ν, less what the directions of rods have too many."""
-    count = float(len(m.mass_matrix) - np.sum(m.model.rods))
-    return Rounded(np.full((1, 1), count), np.zeros(1), np.full(1, count))
+    return _exactly(np.array([float(len(m.mass_matrix) - np.sum(m.model.rods))]))
 
 
 def _inverse_dynamics(m: Motion) -> Rounded:
@@ -315,9 +322,7 @@ def _total(m: Motion, vectors: Rounded, others: Rounded) -> Rounded:
 
 def _kinetic_energy(m: Motion) -> Rounded:
     """½ ν · M ν, with the rotors."""
-    rates = minimal_rates(m.model, m.state)[:, None] / 2
-    exact = np.zeros(len(rates))
-    return _total(m, _generalized_momentum(m), Rounded(rates, exact, np.abs(rates[:, 0])))
+    return _total(m, _generalized_momentum(m), _exactly(minimal_rates(m.model, m.state) / 2))
 
 
 def _gravity_energy(m: Motion, rates: Rounded) -> Rounded:

@@ -36,7 +36,7 @@ from plumbline.model.datatypes import (
     Model,
     State,
 )
-from plumbline.model.kinematics import complete_state, rotation_matrix
+from plumbline.model.kinematics import complete_state, joints_with_elements, rotation_matrix
 from plumbline.model.loops import CutMechanism, cut_open, independent_rows
 from plumbline.processes.processor import processor_features
 from plumbline.processes.user_cache import content_key, recall, remember
@@ -276,8 +276,7 @@ def _bare_joints(model: Model) -> list[int]:
     bare = (model.mass > 0) & (principal[:, 0] > ZERO_INERTIA * principal[:, 2])
     bare &= ~np.isin(np.arange(model.n), model.spring_body)
     bare &= bool(np.any(model.rods))  # balls alone need more products so
-    for k, kind in enumerate(model.kinds[: model.n]):
-        bare[k] &= kind.holds_no_turn and not any(np.any(getattr(model, name)[k]) for name in JOINT_ELEMENTS)
+    bare &= [kind.holds_no_turn for kind in model.kinds] & ~joints_with_elements(model)
     for k in reversed(range(model.n)):
         if model.body[k, 0] >= 0 and not bare[k]:
             bare[model.body[k, 0]] = False
