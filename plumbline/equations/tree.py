@@ -597,11 +597,8 @@ class Tree:
 
         """
         num, at, acceleration, turning = self.num, list[Any](), list[Any](), list[Any]()
-        for k, far in enumerate(self.far):
-            a, alpha = self._bias[k]
-            if far >= 0:
-                a = a + at[far] - num.mul(num.cross_matrix(self.arm[k]), turning[far])
-                alpha = alpha + turning[far]
+        for k in range(self.model.n):
+            a, alpha = self._carried(k, self.zero, at, turning)
             if KINDS[self.model.kind[k]].holds_distance:
                 swing = self.blocks[k][0]
                 a = a + swing.u * swing.pull
@@ -609,6 +606,14 @@ class Tree:
             turning.append(alpha)
             acceleration.append(a + num.cross(self.near[k], alpha) - self._inward[k])
         return acceleration, turning
+
+    def _carried(self, k: int, like: Any, at: list[Any], turning: list[Any]) -> tuple[Any, Any]:
+        """Accelerations of the point that joint k carries, and of its turn, by those of the bodies before."""
+        num, far = self.num, self.far[k]
+        a, alpha = (num.widened(bias, like) for bias in self._bias[k])
+        if far < 0:
+            return a, alpha
+        return a + at[far] - num.mul(num.cross_matrix(self.arm[k]), turning[far]), alpha + turning[far]
 
     def _inertia(self, k: int) -> tuple[Any, Any, Any]:
         """c, b and i of body k by itself."""
@@ -642,11 +647,8 @@ class Tree:
         rates: list[list[Any]] = [[]] * n
         at: list[Any] = []  # accelerations of the near points
         for k in range(n):
-            far, x = self.far[k], carried[k]
-            a, alpha = (num.widened(bias, x.f) for bias in self._bias[k])
-            if far >= 0:
-                a = a + at[far] - num.mul(num.cross_matrix(self.arm[k]), turning[far])
-                alpha = alpha + turning[far]
+            x = carried[k]
+            a, alpha = self._carried(k, x.f, at, turning)
             force, moment = num.mul(x.c, a) + x.f, x.n
             if x.b is not None:
                 force = force + num.mul(x.b, alpha)
