@@ -44,9 +44,10 @@ from plumbline.truth.notes_motion import integrate_batch, side_by_side, trajecto
 from plumbline.truth.parameters import Parameter, perturb
 from plumbline.truth.step_formulas import fastest_rates
 from plumbline.truth.taylor import Precision, simulate_taylor
+from reference_impl.arrays import Motion
 from reference_impl.fast.chain_elimination import component_first
-from reference_impl.fast.collocation import integrate_collocation
-from reference_impl.fast.tree_elimination import eliminated_system, fastest_acceleration
+from reference_impl.fast.collocation import BatchIntegrationResult, integrate_collocation
+from reference_impl.fast.tree_elimination import EliminatedSystem, eliminated_system, fastest_acceleration
 from reference_impl.integrate import IntegrationResult, integrate_dop853
 
 if TYPE_CHECKING:
@@ -103,17 +104,14 @@ def trajectory_truth(
     if proof is not None:
         run = replace(proof.trajectory, initial_x=state.x)
         return TrajectoryTruth(run, proof.radius, proof.method)
-    failure = ""
+    notes = simulate_notes_form(model, state, times, NOTES_RTOL)
     try:
         run, method = _simulate_minimal_coordinates(model, state, times, max_compiled_bodies)
+        other, other_method = notes, NOTES_METHOD
     except Exception as error:  # whatever fails in heyoka, the notes' form remains
-        run, method = simulate_notes_form(model, state, times, NOTES_RTOL), NOTES_METHOD
         failure = str(error) if isinstance(error, TruthUnavailable) else f"{type(error).__name__}: {error}"
-    if failure:
+        run, method, other_method = notes, NOTES_METHOD, f"the same by DOP853, no Taylor series: {failure}"
         other = simulate_notes_form(model, state, times, NOTES_RTOL, "dop853")
-        other_method = f"the same by DOP853, no Taylor series: {failure}"
-    else:
-        other, other_method = simulate_notes_form(model, state, times, NOTES_RTOL), NOTES_METHOD
     uncertainty = motion_errors(run, other)
     if closed_form is not None:
         r, p, source = closed_form
@@ -405,9 +403,7 @@ def _simulate_batch(motion: AccurateMotion, cases: Sequence[tuple[Model, State]]
         y = true(stage) + delta
         samples.append(np.stack(system.project(y[0], y[1])))
     # (cases, 2, T, N, 7)
-    found = np.moveaxis(
-        np.array(samples).reshape(len(times), 2, 7, len(cases), -1), (3, 1, 0, 4, 2), (0, 1, 2, 3, 4)
-    )
+    found = np.array(samples).reshape(len(times), 2, 7, len(cases), -1).transpose(3, 1, 0, 4, 2)
     return [
         Trajectory(times, q[..., :3], q[..., 3:], rate[..., :3], rate[..., 3:], substeps, start.x)
         for (_, start), (q, rate) in zip(cases, found, strict=True)
@@ -467,8 +463,8 @@ def regular_motion(model: Model, state: State, times: Array) -> RegularMotion:
         if stride > interval and not (is_safe and np.all(values >= MIN_MOTION_SINGULAR_VALUE)):
             longest = stride = interval
         elif is_safe:
-            t, value, system = float(grid[-1]), float(values[-1]), eliminated_system([model], run.x[-1])
-            here, stride = (run.r[-1], run.p[-1], run.v[-1], run.pdot[-1]), min(2 * stride, longest)
+            t, value, stride = float(grid[-1]), float(values[-1]), min(2 * stride, longest)
+            system, here = _end_of(run, model)
         elif stride < SHORTEST_STRIDE * interval:
             return RegularMotion(t, True, value)
         else:
@@ -506,9 +502,14 @@ def resolved_motion_end(model: Model, state: State, last: float, step: float) ->
                 return t
             stride /= 2
             continue
-        t, stride, system = end, 2 * stride, eliminated_system([model], run.x[-1])
-        here = run.r[-1], run.p[-1], run.v[-1], run.pdot[-1]
+        t, stride = end, 2 * stride
+        system, here = _end_of(run, model)
     return last
+
+
+def _end_of(run: BatchIntegrationResult, model: Model) -> tuple[EliminatedSystem, Motion]:
+    """The notes' system and the motion at the end of a run, from where it goes on."""
+    return eliminated_system([model], run.x[-1]), (run.r[-1], run.p[-1], run.v[-1], run.pdot[-1])
 
 
 def first_doubt(model: Model, state: State, run: Trajectory) -> float | None:
