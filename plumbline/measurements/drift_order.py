@@ -83,20 +83,6 @@ class DriftOrder:
         means = float(np.mean(coarse)), float(np.mean(fine))
         return cls(*means, halvings, float(order), float(np.sqrt(scatter)))
 
-    def max_fine_mean(self, required_order: float, floor: float) -> float:
-        """Return the largest mean of the fine blocks that the required order allows.
-
-        Args:
-            required_order: least order of the fall.
-            floor: drift of a block by rounding, in the invariant's unit.
-
-        Returns:
-            The mean, in the invariant's unit; the order's error widens it.
-
-        """
-        exponent = self.halvings * (SIGMA_FACTOR * self.order_error - required_order)
-        return self.coarse_mean * 2**exponent + floor
-
 
 @dataclass(frozen=True)
 class InvariantDrift:
@@ -177,8 +163,12 @@ class InvariantDrift:
         return DriftOrder.from_blocks(a, b, float(np.log2(coarse.resolution / fine.resolution)))
 
     def max_fine_mean(self, order: DriftOrder) -> float:
-        """Return the largest mean of the finer run's blocks that the method's order allows."""
-        return order.max_fine_mean(self.required_order, self.rounding_floor(BLOCK_COUNT))
+        """Return the largest mean of the finer run's blocks that the method's order allows.
+
+        The order's error widens it, and what a block drifts by rounding is added.
+        """
+        exponent = order.halvings * (SIGMA_FACTOR * order.order_error - self.required_order)
+        return order.coarse_mean * 2**exponent + self.rounding_floor(BLOCK_COUNT)
 
     @property
     def falls_too_slowly(self) -> bool:
