@@ -72,8 +72,10 @@ def certify_state(
                 raise CertificationFailure(
                     f"a loop is not closed: rows that depend on others leave a gap of {gap:.1g}"
                 )
-            if _definition_holds(model, state, balls, bits):
-                break
+            flint = import_truth_tool("flint")
+            with flint.ctx.workprec(bits):
+                if definition_holds(flint, model, state, balls):
+                    break
         bits = bits * 3 // 2
     else:
         raise CertificationFailure(
@@ -98,12 +100,6 @@ def certify_state(
     elif mass_matrix:
         found = replace(found, mass_matrix=middle["mass_matrix"])
     return CertifiedQuantities(found, radius, bits)
-
-
-def _definition_holds(model: Model, state: State, balls: dict[str, Any], bits: int) -> bool:
-    flint = import_truth_tool("flint")
-    with flint.ctx.workprec(bits):
-        return definition_holds(flint, model, state, balls)
 
 
 def enclose_quantities(

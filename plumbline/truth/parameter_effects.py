@@ -47,11 +47,14 @@ def effects_at_states(
     found = list[Effects]()
     for some in _batches(states, size):
         parts = [_effects_by_jets(model, some, directions) for directions in _batches(parameters, DIRECTIONS)]
-        found += [
-            {name: np.concatenate([part[name][:, at] for part in parts]) for name in parts[0]}
-            for at in range(len(some))
-        ]
+        found += _state_by_state(parts, len(some))
     return found
+
+
+def _state_by_state(parts: Sequence[Effects], count: int) -> list[Effects]:
+    """Join the effects of batches of parameters, and divide them among the states."""
+    joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return [{name: x[:, at] for name, x in joined.items()} for at in range(count)]
 
 
 def _batches(every: Sequence[_Any], size: int) -> Iterator[Sequence[_Any]]:
@@ -175,10 +178,7 @@ def difference_effects(
         evaluated = evaluate_models(model, states, [(model, stack_states(states)), *cases])
         scale = mistake * np.array([one.scale for one in some])[:, None, None]
         parts.append({name: _sizes(name, x[1:] - x[:1]) / scale for name, x in evaluated.items()})
-    return [
-        {name: np.concatenate([part[name][:, at] for part in parts]) for name in parts[0]}
-        for at in range(len(states))
-    ]
+    return _state_by_state(parts, len(states))
 
 
 def _perturbed(

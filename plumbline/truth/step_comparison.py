@@ -838,12 +838,11 @@ class RunSteps(StepsFromSamples):
         """
         motion = run.trajectory
         assert motion.coordinates is not None and motion.velocities is not None
+        self.own = motion.coordinates, motion.velocities
         self.state, self.motion, self.angle_axes = state, motion, run.angle_axes
         charts = StepCharts(model, method, [state], [run.angle_axes])
         count = len(motion.velocities) - 1
-        super().__init__(
-            method, model, charts, motion.coordinates, motion.velocities, h, count, _limit_errors(run)
-        )
+        super().__init__(method, model, charts, *self.own, h, count, _limit_errors(run))
 
     def compare(self) -> dict[str, StepDeviations]:
         """Compare every step.
@@ -877,9 +876,7 @@ class RunSteps(StepsFromSamples):
 
     def resolves_rest(self, count: int) -> bool:
         """Find out whether the declared formula itself resolves so many steps more, from the last sample."""
-        coordinates, velocities = self.motion.coordinates, self.motion.velocities
-        assert coordinates is not None and velocities is not None
-        start = self.charts.divided(coordinates[-1:], velocities[-1:])
+        start = self.charts.divided(*(x[-1:] for x in self.own))
         with np.errstate(all="ignore"):
             passed = steps_in_charts(self.charts, *start, [self.h], count)
             rates = np.array([np.linalg.norm(np.asarray(links.omega, float), axis=-1) for links in passed])
@@ -978,9 +975,8 @@ class RunSteps(StepsFromSamples):
             bounds of the declared formula.
 
         """
-        charts, motion = StepCharts(model, method, [self.state], [self.angle_axes]), self.motion
-        assert motion.coordinates is not None and motion.velocities is not None
-        start = charts.divided(motion.coordinates[at], motion.velocities[at])
+        charts = StepCharts(model, method, [self.state], [self.angle_axes])
+        start = charts.divided(*(x[at] for x in self.own))
         after = charts.bodies(*coordinates_after(charts, *start, [self.h]))
         off = _differences(_reported(run.trajectory, at + 1), after)
         padded = [

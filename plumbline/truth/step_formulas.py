@@ -25,6 +25,7 @@ from plumbline.model.kinematics import (
     cross_matrix,
     quaternion_conjugate,
     quaternion_product,
+    quaternion_rate,
     rotate_vectors,
     stretched_length,
     velocity_jacobian,
@@ -377,12 +378,9 @@ def first_coordinate_acceleration(model: Model, state: State) -> Array:
     tree = StepCharts(model, JointSpaceMethod("Runge-Kutta", "joint rotations"), [state])
     (acceleration,), (turning,) = tree.body_accelerations()
     here = tree.bodies(*tree.start())
-
-    def rate(q: Array, w: Array) -> Array:
-        return quaternion_product(q, np.concatenate([np.zeros_like(w[..., :1]), w], -1)) / 2
-
     p, omega = here.p[0], here.omega[0]
-    return np.concatenate([acceleration, rate(p, turning) + rate(rate(p, omega), omega)], -1)
+    pddot = quaternion_rate(p, turning) + quaternion_rate(quaternion_rate(p, omega), omega)
+    return np.concatenate([acceleration, pddot], -1)
 
 
 def first_acceleration_bound(model: Model, method: ConstrainedMethod, state: State) -> Array:

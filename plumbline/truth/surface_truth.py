@@ -26,7 +26,7 @@ from plumbline.model.kinematics import (
     rotation_matrix,
     velocity_jacobian,
 )
-from plumbline.model.probe_frames import PROBE_ATTITUDE, anchor_point, probe_points
+from plumbline.model.probe_frames import PROBE_TURN, anchor_point, probe_points
 from plumbline.truth.rounding_bound import EPS, ROUNDING_FACTOR, RoundingBound
 
 
@@ -118,7 +118,7 @@ class Motion:
                 for name, value in zip(names, values, strict=True)
             )
             self.mass_matrix, self.mass_matrix_error = quantities.mass_matrix, bound.mass_matrix
-        self.axes = A @ rotation_matrix(PROBE_ATTITUDE)  # of the probe frames
+        self.axes = A @ PROBE_TURN  # of the probe frames
         self.point = self.r.plus(self.arm)
         self.below = bodies_beyond(model).astype(float)
         self.velocity = self.v._replace(size=self.v.size + self._moved_velocities())
