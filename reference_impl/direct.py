@@ -203,11 +203,7 @@ class DirectSystem:
         return self._solution_from_unknowns(motion[1], solve_dense(self._dense(values), b), joints, elements)
 
     def _loop_unknowns(
-        self,
-        motion: Motion,
-        gamma_defect: float | Float[Array, "c"],
-        x: Array | None,
-        is_run: bool,
+        self, motion: Motion, gamma_defect: float | Float[Array, "c"], x: Array | None, is_run: bool
     ) -> tuple[tuple[Array, ConstraintRows, ElementForces | None], NDArray[np.bool_]]:
         """As `solve_unknowns`, by dense factors; and which of the rows are kept."""
         n, c, plain = self.chain.n, len(self.joint), len(self.joint) - self.rotor_count

@@ -108,9 +108,7 @@ class Elements:
         self.has_winding_angles = bool(np.any((self.stiffness != 0) & ~self.is_slide & ~self.is_ball))
 
     def coordinates(
-        self,
-        *motion: *Motion,
-        x: Float[Array, "joints coordinates"] | None = None,
+        self, *motion: *Motion, x: Float[Array, "joints coordinates"] | None = None
     ) -> tuple[Float[Array, "joints coordinates"], Float[Array, "joints coordinates"]]:
         """Return the joint coordinates that have elements, and their rates.
 
@@ -127,9 +125,7 @@ class Elements:
         return values[0], values[1]
 
     def evaluate(
-        self,
-        *motion: *Motion,
-        x: Float[Array, "joints coordinates"] | None = None,
+        self, *motion: *Motion, x: Float[Array, "joints coordinates"] | None = None
     ) -> ElementForces:
         """Evaluate all elements.
 
@@ -169,10 +165,7 @@ class Elements:
             dissipation=lost + float(self.damping @ rate**2),
         )
 
-    def rates(
-        self,
-        *motion: *Motion,
-    ) -> Float[Array, "joints coordinates"]:
+    def rates(self, *motion: *Motion) -> Float[Array, "joints coordinates"]:
         """Return the rates of `coordinates` alone."""
         found = np.zeros(self.mechanism.armature.shape)
         found[self.joint, self.column] = self._motion(motion).rate

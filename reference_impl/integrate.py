@@ -32,9 +32,7 @@ class IntegrationResult:
     evaluations: int  # of the right-hand side
 
 
-def pack_state(
-    *motion: *Motion,
-) -> Float[Array, "entries"]:
+def pack_state(*motion: *Motion) -> Float[Array, "entries"]:
     """Concatenate y = (r, p, ṙ, ṗ) (N6)."""
     return np.concatenate([x.ravel() for x in motion])
 
@@ -87,10 +85,7 @@ def notes_acceleration(chain: Mechanism) -> Acceleration:
     return acceleration
 
 
-def state_scales(
-    chain: Mechanism,
-    *motion: *Motion,
-) -> Float[Array, "entries"]:
+def state_scales(chain: Mechanism, *motion: *Motion) -> Float[Array, "entries"]:
     """Return the size that each part of y has in this motion, for absolute tolerances.
 
     A coordinate that passes through zero needs no more digits there than the motion as a whole: the

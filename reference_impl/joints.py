@@ -193,10 +193,7 @@ def _row_layout(mechanism: Mechanism) -> _RowLayout:
     )
 
 
-def constraint_rows(
-    mechanism: Mechanism,
-    *motion: *Motion,
-) -> ConstraintRows:
+def constraint_rows(mechanism: Mechanism, *motion: *Motion) -> ConstraintRows:
     """Evaluate C, C_r, C_p and γ of every joint (S1–S4, D2–D6 for rods; L1–L3 for the others).
 
     Args:

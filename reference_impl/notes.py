@@ -161,8 +161,7 @@ def block_diagonal(blocks: Shaped[AnyArray, "n i j"]) -> Shaped[AnyArray, "n*i n
 
 
 def assemble_system(
-    chain: Mechanism,
-    *motion: *Motion,
+    chain: Mechanism, *motion: *Motion
 ) -> tuple[Shaped[AnyArray, "unknowns unknowns"], Shaped[AnyArray, "unknowns"]]:
     """Assemble S and b of (N5) for one body (S1–S5) or two (D1–D6); every joint is read as a rod.
 
@@ -210,10 +209,7 @@ def assemble_system(
     return np.concatenate([np.concatenate(row, axis=1) for row in S]), np.concatenate(b)
 
 
-def solve_system(
-    chain: Mechanism,
-    *motion: *Motion,
-) -> Float[Array, "unknowns"]:
+def solve_system(chain: Mechanism, *motion: *Motion) -> Float[Array, "unknowns"]:
     """Solve (N5) for x = (r̈, p̈, λ, λ_E).
 
     Args:

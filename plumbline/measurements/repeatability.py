@@ -123,10 +123,7 @@ def _check_run(
 def _other_question(model: Model, state: State) -> tuple[Model, State]:
     """Another pendulum of as many bodies in another motion, so that nothing kept from it can be right."""
     other = replace(
-        model,
-        mass=1.5 * model.mass,
-        inertia=1.25 * model.inertia,
-        gravity=model.gravity[[1, 2, 0]] + 0.5,
+        model, mass=1.5 * model.mass, inertia=1.25 * model.inertia, gravity=model.gravity[[1, 2, 0]] + 0.5
     )
     slower = {name: -0.75 * getattr(state, name) for name in ("omega", "udot", "v", "xdot")}
     return other, complete_state(other, replace(state, **slower))

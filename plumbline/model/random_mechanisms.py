@@ -9,18 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from plumbline.model.datatypes import (
-    BALL,
-    FREE,
-    HINGE,
-    KINDS,
-    WELD,
-    Array,
-    Float,
-    Kind,
-    Model,
-    State,
-)
+from plumbline.model.datatypes import BALL, FREE, HINGE, KINDS, WELD, Array, Float, Kind, Model, State
 from plumbline.model.features import Place, Role
 from plumbline.model.kinematics import (
     complete_state,
@@ -178,11 +167,7 @@ def close_loop(
 
 
 def random_loop_mechanism(
-    seed: int,
-    n: int,
-    kinds: Sequence[Kind],
-    tree: Sequence[Kind] = LOOP_KINDS,
-    elements: Sequence[str] = (),
+    seed: int, n: int, kinds: Sequence[Kind], tree: Sequence[Kind] = LOOP_KINDS, elements: Sequence[str] = ()
 ) -> tuple[Model, State]:
     """Draw a tree whose last bodies are closed by joints of some kinds, at an assembled state.
 

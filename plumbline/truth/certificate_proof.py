@@ -186,12 +186,7 @@ def checked_numbers(model: Model, state: State) -> dict[str, Array]:
     found = {name: getattr(state if name in names else model, name) for name in SHAPES}
     free = model.free
     # u is the place of its centre of mass
-    own: dict[str, Any] = {
-        "u": state.r,
-        "udot": state.v,
-        "length": 1.0,
-        "point": 0.0,
-    }
+    own: dict[str, Any] = {"u": state.r, "udot": state.v, "length": 1.0, "point": 0.0}
     return {
         name: np.where(free.reshape(-1, *[1] * (x.ndim - 1)), own[name], x) if name in own else x
         for name, x in found.items()

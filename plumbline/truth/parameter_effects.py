@@ -19,13 +19,7 @@ from plumbline.equations.jets import Jet, jets, with_slopes
 from plumbline.equations.tree import Tree
 from plumbline.model.datatypes import Array, Model, State
 from plumbline.model.kinematics import complete_state, stack_states
-from plumbline.model.loops import (
-    PER_JOINT,
-    CutMechanism,
-    cut_open,
-    determinate_wrenches,
-    independent_rows,
-)
+from plumbline.model.loops import PER_JOINT, CutMechanism, cut_open, determinate_wrenches, independent_rows
 from plumbline.truth.loop_closure import shifted_inertia
 from plumbline.truth.parameters import STATE_KINDS, Parameter, derivative, perturb, perturb_model
 

@@ -1011,10 +1011,7 @@ def sample_deviations(
 
 
 def compare_parts(
-    method: ConstrainedMethod,
-    model: Model,
-    states: Sequence[State],
-    runs: Runs,
+    method: ConstrainedMethod, model: Model, states: Sequence[State], runs: Runs
 ) -> dict[str, StepDeviations]:
     """Compare an iterative engine's steps in parts that need no iteration.
 

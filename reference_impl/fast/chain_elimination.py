@@ -419,13 +419,7 @@ class StructuredSystem:
         return out, mu, joints, omega
 
     def _rod_rows(
-        self,
-        joints: FactoredJoints,
-        linear: Array,
-        relative: Array,
-        v: Array,
-        sigma: Array,
-        swing: Array,
+        self, joints: FactoredJoints, linear: Array, relative: Array, v: Array, sigma: Array, swing: Array
     ) -> Array:
         """H (c, M) where there are rods: C̈ without the joints' forces, with the notes' E2 and E3.
 
@@ -457,10 +451,7 @@ class StructuredSystem:
         rows[0] = np.where(self.rods, row, rows[0])
         return rows
 
-    def solve(
-        self,
-        *motion: *Motion,
-    ) -> Solution:
+    def solve(self, *motion: *Motion) -> Solution:
         """Solve (N5) for every chain.
 
         Args:

@@ -164,11 +164,7 @@ class TreeSystem:
             raise SingularSystem("the accelerations are not finite: S is singular, or the state is no number")
         return found, multiplier, rows, elements
 
-    def solve(
-        self,
-        *motion: *Motion,
-        x: Float[Array, "joints coordinates"] | None = None,
-    ) -> Solution:
+    def solve(self, *motion: *Motion, x: Float[Array, "joints coordinates"] | None = None) -> Solution:
         """Solve (N5) for every tree.
 
         Args:
