@@ -81,12 +81,7 @@ class Elements:
             balls = [("turn", 0), ("turn", 1), ("turn", 2)]
             for i, (what, axis) in enumerate(balls if kind.is_spherical else kind.motions):
                 column = 0 if kind.is_spherical else i
-                if (
-                    m.armature[k, column]
-                    or m.damping[k, column]
-                    or m.stiffness[k, column]
-                    or m.effort[k, column]
-                ):
+                if any(x[k, column] for x in (m.armature, m.damping, m.stiffness, m.effort)):
                     is_far = not kind.is_spherical and (i == 0 or axis in kind.slide_axes[1:])
                     found.append((k, column, axis, what == "slide", is_far))
         table = np.array(found, np.intp).reshape(-1, 5).T

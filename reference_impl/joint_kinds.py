@@ -68,9 +68,14 @@ class JointKind:
         return self.rows == _POINT
 
     @cached_property
+    def freedom(self) -> int:
+        """How many independent rates it leaves."""
+        return 6 - len(self.rows)
+
+    @cached_property
     def is_rigid(self) -> bool:
         """Whether it leaves no motion."""
-        return len(self.rows) == 6
+        return self.freedom == 0
 
     @cached_property
     def holds_no_turn(self) -> bool:

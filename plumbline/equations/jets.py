@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -95,15 +96,11 @@ class _Jets(Arithmetic):
         for name in ("cross_matrix", "transpose", "symmetric"):
             setattr(self, name, self._linear(getattr(self.num, name)))
         for name in ("mul", "dot", "cross"):
-            setattr(self, name, self._bilinear(getattr(self.num, name)))
+            setattr(self, name, partial(bilinear, getattr(self.num, name)))
 
     @staticmethod
     def _linear(function: Callable[[Any], Any]) -> Callable[[Jet], Jet]:
         return lambda x: Jet(function(x.value), None if x.slope is None else function(x.slope))
-
-    @staticmethod
-    def _bilinear(function: Callable[[Any, Any], Any]) -> Callable[[Jet, Jet], Jet]:
-        return lambda a, b: bilinear(function, a, b)
 
     def _lift(self, x: Any, axes: int, shaped: Callable[[Any], Any]) -> Jet:
         x = np.asarray(x, float)

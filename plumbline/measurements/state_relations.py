@@ -40,7 +40,7 @@ from plumbline.model.equivalent import (
     siblings_reversed,
     unrotate,
 )
-from plumbline.model.kinematics import complete_state
+from plumbline.model.kinematics import complete_state, sliding_coordinates
 from plumbline.model.redescription import (
     inertia_as_rotors,
     joints_as_rods,
@@ -133,9 +133,7 @@ def _double_masses(model: Model, state: State) -> tuple[Model, State]:
 
 def _scale_lengths(model: Model, state: State) -> tuple[Model, State]:
     """Lengths × 4 and times × 2."""
-    slides = np.zeros((len(model.kind), model.columns), bool)
-    for k, kind in enumerate(model.kinds):
-        slides[k, : len(kind.motions)] = [what == "slide" for what, _ in kind.motions]
+    slides = sliding_coordinates(model)
 
     def of_joint(turn: float, slide: float) -> Array:
         return np.where(slides, slide, turn)
@@ -318,11 +316,9 @@ def check_state_relations(
     if formulation := engine.other_formulation:
         others.append((Relation(OTHER_FORMULATION_PREFIX + formulation), load_adapter(formulation).evaluate))
 
-    def evaluate_welded(model: Model, states: list[State]) -> list[StateQuantities]:
-        return engine.with_welded_halves().evaluate(model, states)
-
     if not model.has_loops:
-        others.append((Relation(WELDED_HALVES), evaluate_welded))
+        welded = Relation(WELDED_HALVES)
+        others.append((welded, lambda m, at: engine.with_welded_halves().evaluate(m, at)))
     for relation, evaluate in others:
         of_others = bounds.others.get(relation.name, bounds.usual)
         yield check_state_relation(relation, answers, evaluate, model, states, bounds.usual, of_others)

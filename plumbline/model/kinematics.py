@@ -709,6 +709,14 @@ def joints_with_elements(model: Model) -> Bool[Flags, "joints"]:
     return np.asarray(np.any([getattr(model, name) for name in JOINT_ELEMENTS], axis=(0, -1)))
 
 
+def sliding_coordinates(model: Model) -> Bool[Flags, "joints coordinates"]:
+    """Return which coordinates of the joints are slides."""
+    found = np.zeros((len(model.kind), model.columns), bool)
+    for k, kind in enumerate(model.kinds):
+        found[k, : len(kind.motions)] = [what == "slide" for what, _ in kind.motions]
+    return found
+
+
 def path_to_world(far: Sequence[int] | Int[Indices, "bodies"], body: int) -> Iterator[int]:
     """Go from a body to the world, along the far bodies (−1: the world) of all bodies' joints."""
     while body >= 0:

@@ -263,8 +263,8 @@ def mechanism_with_places(
             foot = world if FREE in own or (rng.random() < 0.5 and not is_base_free) else hub
             if closing == WELD and foot is world:
                 foot = last
-            freedom = sum(_freedom(kind) for kind in own)
-            while freedom < 6 - _freedom(closing) + 2:
+            freedom = sum(KINDS[kind].freedom for kind in own)
+            while freedom < 6 - KINDS[closing].freedom + 2:
                 own.insert(int(rng.integers(len(own) + 1)), BALL)
                 freedom += 3
             own.sort(key=lambda kind: (kind != FREE, kind == WELD))  # free bodies first, welds last
@@ -279,11 +279,6 @@ def mechanism_with_places(
             model = with_elements(rng, model, elements)
             return model, assembled(model, complete_state(model, state))
     raise AssertionError
-
-
-def _freedom(kind: Kind) -> int:
-    """How many independent rates a joint leaves."""
-    return 6 - len(KINDS[kind].rows)
 
 
 def _number(node: _Node, kinds: list[Kind], far: list[int]) -> None:

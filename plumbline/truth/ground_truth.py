@@ -15,9 +15,9 @@ import numpy as np
 
 from plumbline.engines.engine_calls import SURFACE_STATES
 from plumbline.engines.registry import load_adapter
-from plumbline.model.datatypes import KINDS, Array, EngineFailure, Model, State, StateQuantities, Trajectory
+from plumbline.model.datatypes import Array, EngineFailure, Model, State, StateQuantities, Trajectory
 from plumbline.model.invariants import MOTION_UNITS, motion_errors, motion_scales
-from plumbline.model.kinematics import complete_state, stretched_length
+from plumbline.model.kinematics import complete_state, sliding_coordinates, stretched_length
 from plumbline.model.loops import MIN_MOTION_SINGULAR_VALUE, assembled
 from plumbline.model.sampling import derive_seed
 from plumbline.truth import TruthUnavailable
@@ -221,19 +221,12 @@ def perturbed_models(model: Model, state: State) -> list[tuple[Model, State]]:
     if model.has_loops:
         size = 1 + DETECTABLE_PARAMETER_ERROR
         larger = replace(model, point=size * model.point, length=size * model.length)
-        grown = replace(state, r=size * state.r, v=size * state.v, **_with_longer_slides(model, state, size))
+        longer = np.where(sliding_coordinates(model)[: model.n], size, 1.0)  # shifts
+        x, xdot = longer * state.x, longer * state.xdot
+        grown = replace(state, r=size * state.r, v=size * state.v, x=x, xdot=xdot)
         return [*((m, state) for m in models), (larger, assembled(larger, complete_state(larger, grown)))]
     models.append(replace(model, point=perturbed(model.point)))
     return [(m, complete_state(m, state)) for m in models]
-
-
-def _with_longer_slides(model: Model, state: State, size: float) -> dict[str, Array]:
-    """The joint coordinates of a state with shifts ``size`` times as long."""
-    factors = np.ones_like(state.x)
-    for k, kind in enumerate(model.kind[: model.n]):
-        for i, (what, _) in enumerate(KINDS[kind].motions):
-            factors[k, i] = size if what == "slide" else 1.0
-    return {"x": factors * state.x, "xdot": factors * state.xdot}
 
 
 def detectable_effect(model: Model, runs: Sequence[Trajectory]) -> dict[str, Array]:

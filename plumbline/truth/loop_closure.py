@@ -164,7 +164,7 @@ def solve_loop(flint: Any, model: Model, state: State) -> tuple[Tree, Solution, 
     cut = cut_open(model)
     start = cut.state(state)
     given = Tree(ball_arithmetic(flint), cut.model, start)
-    sizes = [_rate_count(kind) for kind in cut.model.kind]
+    sizes = [kind.freedom for kind in cut.model.kinds]  # relative rates
     none = _per_joint([flint.arb(0)] * sum(sizes), sizes)
     here = _LoopTree(flint, cut.model, start, none, none)
     J = here.rates_jacobian(cut.ends, True) * here.chart_matrix()
@@ -182,14 +182,6 @@ def solve_loop(flint: Any, model: Model, state: State) -> tuple[Tree, Solution, 
     gap, rate = c.gap(cut.ends), entries(J * flint.arb_mat(len(nu), 1, nu))
     widest = max((float(abs(x[int(i)]).upper()) for x in (gap, rate) for i in dropped), default=0.0)
     return c, c.solve_joined(cut.ends, [int(row) for row in rows]), cut, widest
-
-
-def _rate_count(kind: str) -> int:
-    """Relative rates of a joint."""
-    joint = KINDS[kind]  # type: ignore[index]
-    if not joint.has_attitude:
-        return len(joint.motions)
-    return 3 + 2 * joint.holds_distance + 3 * joint.holds_nothing
 
 
 def shifted_inertia(cut: CutMechanism) -> dict[int, float]:

@@ -18,6 +18,7 @@ from plumbline.model.kinematics import (
     angular_velocity,
     complete_state,
     cross,
+    normalised,
     quaternion_conjugate,
     quaternion_product,
     quaternion_rate,
@@ -142,17 +143,21 @@ def perturbed_states(
     for _ in range(count):
         turn = perturbation_size * rng.normal(size=(model.n, 3)) / 2
         quaternion = np.concatenate([np.ones((model.n, 1)), turn], axis=1)
-        p = quaternion_product(state.p, quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True))
+        p = normalised(quaternion_product(state.p, normalised(quaternion)))
         spread = perturbation_size * fastest
         omega = state.omega + spread * rng.normal(size=(model.n, 3))
         u = state.u + cross(perturbation_size * rng.normal(size=(model.n, 3)), state.u)
         udot = state.udot + cross(spread * rng.normal(size=(model.n, 3)), state.u)
+        u = u / np.maximum(
+            np.linalg.norm(u, axis=1, keepdims=True), np.finfo(float).tiny
+        )  # 0 of other joints
+        udot = udot - np.sum(udot * u, axis=1, keepdims=True) * u
         others: tuple[Array, ...] = state.x, state.r, state.xdot, state.v
         if not all(kind.holds_no_turn for kind in model.kinds[: model.n]):  # these are coordinates too
             sizes = (perturbation_size, perturbation_size, spread, spread)
             others = tuple(y + size * rng.normal(size=y.shape) for y, size in zip(others, sizes, strict=True))
         x, r, xdot, v = others
-        near = complete_state(model, State(*_unit_coordinates(model, p, omega, u, udot), r, v, x, xdot))
+        near = complete_state(model, State(p, omega, u, udot, r, v, x, xdot))
         found.append(assembled(model, near))
     return found
 
@@ -194,13 +199,3 @@ def _interpolate_states(model: Model, base: State, other: State, part: float) ->
     p, names = quaternion_product(base.p, turn), ("omega", "r", "v")
     omega, r, v = (getattr(base, x) + part * (getattr(other, x) - getattr(base, x)) for x in names)
     return replace(project_to_manifold(model, r, p, v, quaternion_rate(p, omega)), x=base.x)
-
-
-def _unit_coordinates(
-    model: Model, p: Array, omega: Array, u: Array, udot: Array
-) -> tuple[Array, Array, Array, Array]:
-    """The coordinates on their unit spheres; u and u̇ are 0 for joints other than rods."""
-    rods = model.rods[: model.n, None]
-    u = np.where(rods, u / np.maximum(np.linalg.norm(u, axis=1, keepdims=True), np.finfo(float).tiny), 0.0)
-    udot = np.where(rods, udot - np.sum(udot * u, axis=1, keepdims=True) * u, 0.0)
-    return p / np.linalg.norm(p, axis=1, keepdims=True), omega, u, udot

@@ -210,10 +210,6 @@ def _subtree(motion: Motion, vectors: Rounded) -> Rounded:
     return vectors.summed(weights / np.sum(weights, axis=1, keepdims=True))
 
 
-def _subtree_mass(motion: Motion) -> Rounded:
-    return _exactly(motion.below @ motion.mass)
-
-
 def _momenta(motion: Motion) -> Rounded:
     return motion.v.times(motion.mass)
 
@@ -284,17 +280,9 @@ def _spatial(motion: Motion) -> Rounded:
     return motion.point_acceleration.minus(motion.w.cross(motion.point_velocity))
 
 
-def _total_mass(m: Motion) -> Rounded:
-    return _exactly(np.sum(m.mass, keepdims=True))
-
-
 def _degrees_of_freedom(m: Motion) -> Rounded:
     """The rates of ν, less what the directions of rods have too many."""
     return _exactly(np.array([float(len(m.mass_matrix) - np.sum(m.model.rods))]))
-
-
-def _inverse_dynamics(m: Motion) -> Rounded:
-    return m.generalized(_body_force(m), m.spin_momentum_rate())
 
 
 def _generalized_momentum(m: Motion) -> Rounded:
@@ -330,12 +318,8 @@ def _gravity_energy(m: Motion, rates: Rounded) -> Rounded:
     return _total(m, m.gravity._replace(size=np.linalg.norm(m.gravity.value, axis=-1)).times(-m.mass), rates)
 
 
-def _body_force(m: Motion) -> Rounded:
-    return m.a.minus(m.gravity).times(m.mass)
-
-
 def _force_of_probe(m: Motion) -> Rounded:
-    """The same by the acceleration of the probe points, as engines take it where their frames are."""
+    """Mass times r̈ − g, by the acceleration of the probe points: engines take it where their frames are."""
     return m.point_acceleration.minus(m.swing).minus(m.gravity).times(m.mass)
 
 
@@ -383,7 +367,7 @@ _FORMULAS: Mapping[str, tuple[str, Callable[[Motion], Rounded]]] = {
     "centre_of_mass": ("m", lambda m: m.centre(m.r)),
     "centre_of_mass_velocity": ("m/s", lambda m: m.centre(m.v)),
     "centre_of_mass_acceleration": ("m/s²", lambda m: m.centre(m.a)),
-    "total_mass": ("kg", _total_mass),
+    "total_mass": ("kg", lambda m: _exactly(np.sum(m.mass, keepdims=True))),
     "degrees_of_freedom": ("1", _degrees_of_freedom),
     "momentum": ("kg m/s", lambda m: _momenta(m).summed(_weights(m))),
     "momentum_rate": ("N", lambda m: m.a.times(m.mass).summed(_weights(m))),
@@ -399,7 +383,7 @@ _FORMULAS: Mapping[str, tuple[str, Callable[[Motion], Rounded]]] = {
     "subtree_angular_momentum": (
         "kg m²/s", lambda m: _about_centre(m, m.below, _momenta(m), m.spin_momentum()),
     ),
-    "subtree_mass": ("kg", _subtree_mass),
+    "subtree_mass": ("kg", lambda m: _exactly(m.below @ m.mass)),
     "kinetic_energy": ("J", _kinetic_energy),
     "gravity_energy": ("J", lambda m: _gravity_energy(m, m.r)),
     "potential_energy": ("J", lambda m: m.potential_energy),
@@ -412,7 +396,9 @@ _FORMULAS: Mapping[str, tuple[str, Callable[[Motion], Rounded]]] = {
     "generalized_momentum": ("kg m²/s", _generalized_momentum),
     "momentum_through_inverse": ("kg m²/s", _momentum_through_inverse),
     "generalized_gravity": ("N m", lambda m: m.generalized(m.gravity.times(-m.mass), None)),
-    "inverse_dynamics": ("N m", _inverse_dynamics),
+    "inverse_dynamics": (
+        "N m", lambda m: m.generalized(m.a.minus(m.gravity).times(m.mass), m.spin_momentum_rate()),
+    ),
 }  # fmt: skip
 # The same by an algorithm that is compared by itself, because it can be wrong where others are right.
 _BY_ALGORITHM = {

@@ -52,11 +52,6 @@ _BAND_INDICES = np.array(
 )
 
 
-def _tilde(omega: Array) -> Array:
-    """ω̃ (3, 3, M) of ω (3, M)."""
-    return np.asarray((_TO_TILDE @ omega).reshape(3, 3, -1))
-
-
 def _matrix_vector(matrix: Array, vector: Array) -> Array:
     """Matrix (i, j, M) times vector (j, M), or (c, j, M) of several points."""
     return np.asarray(np.einsum("ijm,...jm->...im", matrix, vector))
@@ -233,7 +228,7 @@ class StructuredSystem:
         Rs, As = self._attachment_points(norm, R)
         rates = self._rate_products(q, v)
         sigma, omega = rates[0], rates[1:4]
-        velocity = _matrix_vector(R, _matrix_vector(_tilde(omega), self.s))
+        velocity = _matrix_vector(R, _matrix_vector((_TO_TILDE @ omega).reshape(3, 3, -1), self.s))
         velocity += 2 * sigma * (Rs + self.s)
         d = q[:3] + As[0] - self._at_parent(q[:3] + As[1]) - self.pivot
         return d, v[:3] + velocity[0] - self._at_parent(v[:3] + velocity[1])

@@ -201,7 +201,7 @@ def damped_oscillator(model: Model, state: State) -> ClosedFormMotion:
 
     """
     kinds = model.kinds
-    require(len(kinds) == 1 and len(kinds[0].rows) == 5, "one body on a joint of one motion")
+    require(len(kinds) == 1 and kinds[0].freedom == 1, "one body on a joint of one motion")
     require_no_loads(model)
     require(not len(model.spring_body), "no springs between points")
     axis = rotation_matrix(model.turn[0, 0])[:, 2]
