@@ -134,8 +134,8 @@ def run_long_run_study(
     method = adapter.integrator(integrator)
     spacing = _sample_spacing(method, model, sample_interval, plan)
 
-    def runs_until(end: float, is_checked: bool) -> LongRunStudy | float:
-        """All runs; where they are checked and a pose may be singular, when [s]."""
+    def runs_until(end: float, is_checked: bool = False) -> tuple[LongRunStudy, float | None]:
+        """All runs; where they are checked and a pose may be singular, those up to it, and when [s]."""
         lengths = [t for t in _window_ends(end, plan) if t >= min(MIN_WINDOW * plan.time_unit, end)]
         runs: list[LongRun] = []
         resolutions = list(plan.resolutions)
@@ -148,7 +148,7 @@ def run_long_run_study(
                     )
                     break
                 except Unsupported as refusal:
-                    return LongRunStudy(runs, plan, describe_exception(refusal), gap=refusal.gap)
+                    return LongRunStudy(runs, plan, describe_exception(refusal), gap=refusal.gap), None
                 except MemoryError:
                     raise
                 except Exception as error:  # an engine may raise anything; its message belongs in the results
@@ -156,27 +156,24 @@ def run_long_run_study(
             runs.append(_reduce_run(model, plan, trajectory, resolution, failure, begin))
             doubt = _first_doubt(model, state, trajectory, runs[-1], end) if is_checked else None
             if doubt is not None:
-                return doubt
+                return LongRunStudy(runs, plan), doubt
             more = len(runs) - len(plan.resolutions)
             stops = 0 <= more < MAX_HALVINGS and _stops_in_range(runs[-1], end)
             if stops or (more == 0 and _falls_too_slowly(runs, method, plan)):
                 resolutions.append(resolution**2 / resolutions[-2])  # the loop goes on with it
-        return LongRunStudy(runs, plan)
+        return LongRunStudy(runs, plan), None
 
-    study = runs_until(plan.seconds, is_checked=model.has_loops)
-    if isinstance(study, LongRunStudy):
-        if method.kind == "step" and not model.has_loops and study.is_in_doubt:
-            end = _resolved_length(model, state, _samples(plan.seconds, spacing), plan.resolutions[-1])
-            if end < plan.seconds:
-                plan = replace(plan, seconds=end, is_too_fast=True)
-                study = runs_until(end, is_checked=False)
-                assert isinstance(study, LongRunStudy)
-    else:
-        times = _samples(plan.seconds, spacing)
-        end, singular = _regular_length(model, state, times[times <= study + spacing])
-        study = runs_until(end if singular else plan.seconds, is_checked=False)
-        assert isinstance(study, LongRunStudy)
-        study = replace(study, singular=singular)
+    study, doubt = runs_until(plan.seconds, is_checked=model.has_loops)
+    times = _samples(plan.seconds, spacing)
+    if doubt is not None:
+        end, singular = _regular_length(model, state, times[times <= doubt + spacing])
+        study, _ = runs_until(end if singular else plan.seconds)
+        return replace(study, singular=singular)
+    if method.kind == "step" and not model.has_loops and study.is_in_doubt:
+        end = _resolved_length(model, state, times, plan.resolutions[-1])
+        if end < plan.seconds:
+            plan = replace(plan, seconds=end, is_too_fast=True)
+            study, _ = runs_until(end)
     return study
 
 

@@ -112,10 +112,7 @@ class _Check:
             far, near = (int(body) for body in model.body[k])
             at = self.r[near] + self.A[near] * self._vector(model.point[k, 1])
             for body, sign in ((near, 1), (far, -1)):
-                if body >= 0:
-                    force = self.force[k] * sign
-                    moment = self.moment[k] * sign + self._cross(at - self.r[body]) * force
-                    pulls[body] = pulls[body][0] + force, pulls[body][1] + moment
+                self._push(pulls, body, at, self.force[k] * sign, self.moment[k] * sign)
         for k, (force, moment) in enumerate(pulls):
             m, spin = self.arb(float(model.mass[k])), self._matrix(model.inertia[k]) * self.omega[k]
             change = self.bodies[k].turn[1] * spin
@@ -164,11 +161,14 @@ class _Check:
         stretch = length - self.arb(float(model.spring_length[number]))
         tension = k * stretch + self.arb(float(model.spring_damping[number])) * self._dot(d, rate) / length
         for body, (at, *_), sign in zip(bodies, ends, (1, -1), strict=True):
-            if body >= 0:
-                force = d * (tension * sign / length)
-                moment = self._cross(at - self.r[body]) * force
-                pulls[body] = pulls[body][0] + force, pulls[body][1] + moment
+            self._push(pulls, body, at, d * (tension * sign / length), self.zero)
         return k * stretch * stretch / 2
+
+    def _push(self, pulls: list[tuple[Any, Any]], body: int, at: Any, force: Any, moment: Any) -> None:
+        """Add a force at a place, and a moment, to those of a body; the world bears them."""
+        if body >= 0:
+            moment = moment + self._cross(at - self.r[body]) * force
+            pulls[body] = pulls[body][0] + force, pulls[body][1] + moment
 
     def _joint(self, k: int, given: list[Array]) -> tuple[Any, Any]:
         """Rows, coordinates and work of joint k; returns the energies of its rotor and its spring."""

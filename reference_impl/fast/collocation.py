@@ -14,8 +14,8 @@ S − 1, and its integrals are the dense output.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from functools import cache
+from dataclasses import dataclass
+from functools import cache, lru_cache
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss, legvander
@@ -52,7 +52,6 @@ class GaussTables:
     b: Float[Array, "nodes"]  # weights
     A: Float[Array, "nodes nodes"]  # ∫₀^cᵢ of the polynomial through the nodes
     node_to_mode: Float[Array, "nodes nodes"]  # node values → Legendre coefficients
-    _extrapolation_cache: dict[float, Array] = field(default_factory=dict)
 
     def extrapolation_matrix(self, ratio: float) -> Float[Array, "nodes nodes"]:
         """Return the matrix from Legendre modes of a step to values at the nodes of the next one.
@@ -61,13 +60,7 @@ class GaussTables:
             ratio: length of the next step over that of this one.
 
         """
-        if ratio not in self._extrapolation_cache:
-            if len(self._extrapolation_cache) > 64:
-                self._extrapolation_cache.clear()
-            self._extrapolation_cache[ratio] = np.asarray(
-                legvander(1 + 2 * ratio * self.c, len(self.c) - 1), dtype=float
-            )
-        return self._extrapolation_cache[ratio]
+        return _extrapolation_matrix(len(self.c), ratio)
 
     def mode_integrals(
         self, tau: Float[Array, "samples"]
@@ -89,6 +82,11 @@ class GaussTables:
         twice[:, 0] = tau**2 / 2
         twice[:, 1:] = (once[:, 2:] - once[:, :-2]) / odd[1:S] / 2
         return once[:, :S], twice
+
+
+@lru_cache(maxsize=64)
+def _extrapolation_matrix(S: int, ratio: float) -> Array:
+    return np.asarray(legvander(1 + 2 * ratio * gauss_tables(S).c, S - 1), dtype=float)
 
 
 @cache

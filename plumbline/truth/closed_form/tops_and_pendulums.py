@@ -209,11 +209,9 @@ def _on_ball(model: Model, state: State) -> _Pendulum:
     s = model.proximal[0]
     rate = float(np.linalg.norm(state.omega[0]))
     axis = A @ (state.omega[0] / rate) if rate > 0 else np.cross(A @ s, -up)
-    require(np.linalg.norm(axis) > 0, "an angular velocity or a torque that defines the plane")
-    axis = axis / np.linalg.norm(axis)
+    axis = _horizontal(axis, up)
     pivot_inertia = inertia_about_pivot(model)
     body_axis = A.T @ axis
-    require(abs(axis @ up) < CONDITION_RTOL, "a horizontal axis of rotation")
     require(abs(body_axis @ s) < CONDITION_RTOL * lever, "a centre of mass in the plane of motion")
     moment = float(body_axis @ pivot_inertia @ body_axis)
     off_axis = np.linalg.norm(pivot_inertia @ body_axis - moment * body_axis)
@@ -242,12 +240,18 @@ def _on_rod(model: Model, state: State) -> _Pendulum:
     u, spin = state.u[0], np.cross(state.u[0], state.udot[0])
     rate = float(np.linalg.norm(spin))
     axis = spin if rate > 0 else np.cross(u, -up)
-    require(np.linalg.norm(axis) > 0, "an angular velocity or a torque that defines the plane")
-    axis = axis / np.linalg.norm(axis)
-    require(abs(axis @ up) < CONDITION_RTOL, "a horizontal axis of rotation")
+    axis = _horizontal(axis, up)
     arm = model.length[0] * u
     moment = float(model.mass[0] * model.length[0] ** 2)
     return _Pendulum(axis, model.point[0, 0], arm, moment, rate, turns=False)
+
+
+def _horizontal(axis: Array, up: Array) -> Array:
+    """The axis of a plane of motion as a unit vector."""
+    require(np.linalg.norm(axis) > 0, "an angular velocity or a torque that defines the plane")
+    axis = axis / np.linalg.norm(axis)
+    require(abs(axis @ up) < CONDITION_RTOL, "a horizontal axis of rotation")
+    return axis
 
 
 # -- Euler's free top: a rigid body without applied moments --------------------------------------------
