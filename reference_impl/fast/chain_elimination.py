@@ -95,14 +95,8 @@ class StructuredSystem:
         self.chains = tuple(chains)
         if not all(chain.has_chain_joints for chain in chains):
             raise ValueError("the structured form covers chains of rods and balls")
-        mass, inertia, proximal, distal, length = (
-            np.concatenate([getattr(chain, name) for chain in chains])
-            for name in ("mass", "inertia", "proximal", "distal", "length")
-        )
-        moment, drag_force, drag_moment = (
-            np.concatenate([getattr(chain, name) for chain in chains])
-            for name in ("moment", "drag_force", "drag_moment")
-        )
+        forest = side_by_side(self.chains)
+        mass, inertia, length, drag_moment = forest.mass, forest.inertia, forest.length, forest.drag_moment
         weight = np.concatenate([c.mass[:, None] * c.gravity + c.force for c in chains])
         self.body_count = len(mass)
         self.first_body = np.cumsum([0, *(chain.n for chain in chains)])
@@ -116,7 +110,8 @@ class StructuredSystem:
                 f"{principal[body].tolist()} kg m², so 4 LᵀJL has rank 2 or less (E7)"
             )
         K = np.linalg.inv(np.linalg.cholesky(inertia)).swapaxes(-1, -2)  # J⁻¹ = K Kᵀ
-        points = np.stack([proximal, distal], 1)  # (M, 2, 3)
+        distal = np.concatenate([chain.distal for chain in chains])
+        points = np.stack([forest.proximal, distal], 1)  # (M, 2, 3)
 
         def last(x: Array) -> Array:
             return np.ascontiguousarray(np.moveaxis(x, 0, -1))
@@ -124,12 +119,12 @@ class StructuredSystem:
         self.inverse_mass = 1 / mass  # (M,) 1/kg
         self.J, self.K = last(inertia), last(K)  # (3, 3, M)
         self.s = last(points)  # (2, 3, M) m, proximal and distal point, body frame
-        pivots = [chain.point[:, 0] * (chain.body[:, :1] < 0) for chain in chains]
-        self.pivot = last(np.concatenate(pivots))  # (3, M) m, of the first bodies; 0 of the others
+        # (3, M) m, of the first bodies; 0 of the others
+        self.pivot = last(forest.point[:, 0] * (forest.body[:, :1] < 0))
         self.lever = float(np.abs(points).max())  # m
         self.free_acceleration = last(weight / mass[:, None])  # (3, M) m/s²
-        self.drag_rate = drag_force / mass  # (M,) 1/s
-        self.has_drag = bool(np.any(drag_force) or np.any(drag_moment))
+        self.drag_rate = forest.drag_force / mass  # (M,) 1/s
+        self.has_drag = forest.has_drag
         # β = K⁻¹ J⁻¹ (n′ − ω×Jω/π) and, in the body frame, the points about the centre, B β + ω×(ω×s)/π:
         # (9, M) constant, and (9, 6, M) of the ωᵢ ωⱼ/π; with drag or rods (·, 9, M), the last three of ω.
         cross, one = _TO_TILDE.reshape(3, 3, 3), np.eye(3)
@@ -142,7 +137,7 @@ class StructuredSystem:
             np.arange(6) > 2
         )
         turned = np.concatenate([K.mT, (B @ K.mT[:, None]).reshape(-1, 6, 3)], 1)  # from a moment
-        constant = np.matvec(turned, moment)
+        constant = np.matvec(turned, forest.moment)
         self.rods = length > 0
         self.has_only_balls = not np.any(self.rods)
         if self.has_drag:
