@@ -110,11 +110,11 @@ class Relation:
     missing_term: Callable[[Model, State], dict[str, Array]] | None = None
 
 
-def scale_fields(model: Model, **factors: float) -> Model:
+def scale_fields(model: Model, **factors: float | Array) -> Model:
     """Multiply fields of a model.
 
     Args:
-        **factors: by name of a field, the number to multiply it by.
+        **factors: by name of a field, the number or numbers to multiply it by.
 
     """
     return model.changed(**{name: getattr(model, name) * factor for name, factor in factors.items()})
@@ -138,24 +138,13 @@ def _scale_lengths(model: Model, state: State) -> tuple[Model, State]:
     def of_joint(turn: float, slide: float) -> Array:
         return np.where(slides, slide, turn)
 
-    large = replace(
-        model,
-        point=4 * model.point,
-        length=4 * model.length,
-        inertia=16 * model.inertia,
-        moment=4 * model.moment,
-        drag_force=model.drag_force / 2,
-        drag_moment=8 * model.drag_moment,
-        armature=of_joint(16, 1) * model.armature,
-        damping=of_joint(8, 0.5) * model.damping,
-        stiffness=of_joint(4, 0.25) * model.stiffness,
-        rest=of_joint(1, 4) * model.rest,
-        effort=of_joint(4, 1) * model.effort,
-        spring_point=4 * model.spring_point,
-        spring_length=4 * model.spring_length,
-        spring_stiffness=model.spring_stiffness / 4,
-        spring_damping=model.spring_damping / 2,
-    )
+    factors: dict[str, float | Array] = {
+        "point": 4, "length": 4, "inertia": 16, "moment": 4, "drag_force": 0.5, "drag_moment": 8,
+        "armature": of_joint(16, 1), "damping": of_joint(8, 0.5), "stiffness": of_joint(4, 0.25),
+        "rest": of_joint(1, 4), "effort": of_joint(4, 1),
+        "spring_point": 4, "spring_length": 4, "spring_stiffness": 0.25, "spring_damping": 0.5,
+    }  # fmt: skip
+    large = scale_fields(model, **factors)
     rates = {"omega": state.omega / 2, "udot": state.udot / 2, "v": 2 * state.v}
     x, xdot = of_joint(1, 4)[: model.n] * state.x, of_joint(0.5, 2)[: model.n] * state.xdot
     return large, complete_state(large, replace(state, x=x, xdot=xdot, r=4 * state.r, **rates))

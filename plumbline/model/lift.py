@@ -40,19 +40,12 @@ def lift_acceleration(
     sizes = [_count(kind) for kind in tree.kinds]
     if joints.shape != (sum(sizes),):
         raise EngineFailure(f"{label} has shape {joints.shape}, expected ({sum(sizes)},)")
-    moved = {  # the minimal coordinates a moment later
-        "p": state.p + _STEP * 1j * quaternion_rate(state.p, state.omega),
-        "omega": state.omega.astype(complex),
-        "u": state.u + _STEP * 1j * state.udot,
-        "udot": state.udot.astype(complex),
-        "r": state.r + _STEP * 1j * state.v,
-        "v": state.v.astype(complex),
-        "x": state.x + _STEP * 1j * state.xdot,
-        "xdot": state.xdot.astype(complex),
-    }
+    rates = {"p": quaternion_rate(state.p, state.omega), "u": state.udot, "r": state.v, "x": state.xdot}
+    # the minimal coordinates a moment later
+    moved = {name: x + _STEP * 1j * rates.get(name, 0.0) for name, x in vars(state).items()}
     given = np.split(joints, np.cumsum(sizes)[:-1])
-    for k, (kind, rates) in enumerate(zip(tree.kinds, given, strict=True)):
-        step = _STEP * 1j * rates
+    for k, (kind, own) in enumerate(zip(tree.kinds, given, strict=True)):
+        step = _STEP * 1j * own
         if not kind.has_attitude:
             moved["xdot"][k, : len(step)] += step
             continue

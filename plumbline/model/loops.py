@@ -125,21 +125,18 @@ class CutMechanism:
         """
         if not self.ends:
             return answer
-        bodies, found = self.place[: self.source.n], {}
-        for name, value in vars(answer).items():
-            places = self.place if name in PER_JOINT else bodies if name in PER_BODY else None
-            found[name] = value if value is None or places is None else value[places]
-        return StateQuantities(**found | {"mass_matrix": None})
+        return StateQuantities(**self.of_source(vars(answer)) | {"mass_matrix": None})
 
     def of_source(self, quantities: Mapping[str, Any]) -> dict[str, Any]:
-        """Order lists over the tree's bodies and their joints as the mechanism has them; the rest is kept."""
-        bodies = self.place[: self.source.n]
-        return {
-            name: [value[k] for k in (self.place if name in PER_JOINT else bodies)]
-            if isinstance(value, list)
-            else value
-            for name, value in quantities.items()
-        }
+        """Order lists and arrays over the tree's bodies and joints as the mechanism has them; others stay."""
+        found = {**quantities}
+        for name, value in quantities.items():
+            places = self.place if name in PER_JOINT else self.place[: self.source.n]
+            if isinstance(value, list):
+                found[name] = [value[k] for k in places]
+            elif value is not None and name in (*PER_JOINT, *PER_BODY):
+                found[name] = value[places]
+        return found
 
     def source_run(self, run: Trajectory) -> Trajectory:
         """Describe a run of the tree as one of the mechanism.

@@ -8,7 +8,7 @@ solution is checked by the definition of the mechanism (`definition`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -84,21 +84,13 @@ def certify_state(
     quantities = {name: ball for name, ball in balls.items() if name != "scale"}
     middle = {name: midpoints(ball) for name, ball in quantities.items()}
     radius = {name: max(float(x.rad()) for x in flatten(ball)) for name, ball in quantities.items()}
-    found = StateQuantities(
-        acceleration=middle["acceleration"],
-        angular_acceleration=middle["angular_acceleration"],
-        joint_reaction=middle["joint_reaction"],
-        kinetic_energy=float(middle["kinetic_energy"][0]),
-        potential_energy=float(middle["potential_energy"][0]),
-        angular_momentum=middle["angular_momentum"],
-        joint_moment=middle.get("joint_moment"),
-    )
+    names = middle.keys() & {one.name for one in fields(StateQuantities)}
+    energies = {name: float(middle[name][0]) for name in ("kinetic_energy", "potential_energy")}
+    found = StateQuantities(**{name: middle[name] for name in names} | energies)
     if model.has_loops:
         found = determinate_part(model, state, found)
         if not model.has_joint_moments:  # as of trees
             found = replace(found, joint_moment=None)
-    elif mass_matrix:
-        found = replace(found, mass_matrix=middle["mass_matrix"])
     return CertifiedQuantities(found, radius, bits)
 
 
