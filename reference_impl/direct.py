@@ -16,11 +16,11 @@ from scipy.linalg import lapack, qr
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from reference_impl.arrays import Motion
+from reference_impl.arrays import Array, Bool, Flags, Float, Indices, Int, Motion
 from reference_impl.elements import ElementForces, Elements
 from reference_impl.euler_parameters import A, L, angular_velocity, dot
 from reference_impl.joints import ConstraintRows, constraint_rows, joint_of_rows, of_far_body
-from reference_impl.mechanism import Array, Bool, Flags, Float, Indices, Int, Mechanism
+from reference_impl.mechanism import Mechanism
 from reference_impl.singular_system import SingularSystem
 
 EPS = float(np.finfo(float).eps)

@@ -27,10 +27,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy import vecdot
 
-from reference_impl.arrays import Motion
+from reference_impl.arrays import Array, Float, Motion
 from reference_impl.euler_parameters import A, G, L, cross
 from reference_impl.joints import ConstraintRows
-from reference_impl.mechanism import Array, Float, Mechanism
+from reference_impl.mechanism import Mechanism
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,8 +14,7 @@ from functools import wraps
 
 import numpy as np
 
-from reference_impl.arrays import AnyArray as AnyArray
-from reference_impl.arrays import Shaped
+from reference_impl.arrays import AnyArray, Shaped
 
 I3 = np.eye(3, dtype=int)  # integers: exact in every field
 _NEXT = np.array([1, 2, 0])  # of each axis the next one

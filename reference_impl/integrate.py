@@ -9,11 +9,11 @@ import numpy as np
 from scipy.integrate import DOP853
 
 from reference_impl import notes
-from reference_impl.arrays import Motion
+from reference_impl.arrays import Array, Float, Motion
 from reference_impl.direct import DirectSystem
 from reference_impl.elements import Elements
 from reference_impl.euler_parameters import angular_velocity
-from reference_impl.mechanism import Array, Float, Mechanism
+from reference_impl.mechanism import Mechanism
 
 # r̈ and p̈, (7 N,), at r, p, ṙ, ṗ (N, ·) and joint coordinates (N, 2), near which angles of springs are taken
 Acceleration = Callable[[Array, Array, Array, Array, Array | None], Array]

@@ -36,9 +36,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from reference_impl.arrays import Motion
+from reference_impl.arrays import AnyArray, Indices, Int, Motion, Shaped
 from reference_impl.euler_parameters import I3, A, G, H, L, dot
-from reference_impl.mechanism import AnyArray, Indices, Int, Mechanism, Shaped
+from reference_impl.mechanism import Mechanism
 
 VECTORS = "XYZxyzijkd"  # what rows are products of: axes of the near and the far body and of the world, and d
 Z_FAR, IS_D = 5, 9  # places of the last axis of a body, and of d

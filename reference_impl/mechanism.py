@@ -9,14 +9,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from reference_impl.arrays import AnyArray as AnyArray
-from reference_impl.arrays import Array as Array
-from reference_impl.arrays import Bool as Bool
-from reference_impl.arrays import Flags as Flags
-from reference_impl.arrays import Float as Float
-from reference_impl.arrays import Indices as Indices
-from reference_impl.arrays import Int as Int
-from reference_impl.arrays import Shaped as Shaped
+from reference_impl.arrays import Array, Bool, Flags, Float, Indices, Int
 from reference_impl.joint_kinds import BALL, KINDS, ROD, JointKind, Kind, column_count
 
 ZERO_INERTIA = 1e-14  # a principal moment that is this part of the largest is the rounding of 0

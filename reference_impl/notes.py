@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from reference_impl.arrays import Motion
+from reference_impl.arrays import AnyArray, Array, Float, Motion, Shaped
 from reference_impl.direct import check_state_solvable, solve_dense
 from reference_impl.euler_parameters import A, A_rate, B, G, H, L, outer
-from reference_impl.mechanism import AnyArray, Array, Float, Mechanism, Shaped
+from reference_impl.mechanism import Mechanism
 
 Number = Any  # float, complex or exact
 

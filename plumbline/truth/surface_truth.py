@@ -245,7 +245,7 @@ def _frame_distance_rate(motion: Motion) -> Rounded:
     return Rounded(rate[:, None], velocity.error + away.tolerance * speed / length, velocity.size)
 
 
-def _first(motion: Motion, vectors: Rounded) -> Rounded:
+def _from_first(vectors: Rounded) -> Rounded:
     """The vectors less the first body's."""
     return vectors.minus(_of_first(vectors))
 
@@ -258,8 +258,8 @@ def _in_first(motion: Motion, vectors: Rounded) -> Rounded:
 
 def _velocity_in_first(motion: Motion) -> Rounded:
     """As an observer sees it who turns with the first probe frame."""
-    turned = _of_first(motion.w).cross(_first(motion, motion.point))
-    return _first(motion, motion.point_velocity).minus(turned)
+    turned = _of_first(motion.w).cross(_from_first(motion.point))
+    return _from_first(motion.point_velocity).minus(turned)
 
 
 def _axes_in_first(motion: Motion) -> Rounded:
@@ -300,7 +300,7 @@ def _momentum_through_inverse(m: Motion) -> Rounded:
     return once._replace(error=once.error + 2 * through @ once.tolerance)
 
 
-def _total(m: Motion, vectors: Rounded, others: Rounded) -> Rounded:
+def _total(vectors: Rounded, others: Rounded) -> Rounded:
     """Σ a · b over all rows, (1, 1)."""
     norms = [np.linalg.norm(x.value, axis=-1) for x in (vectors, others)]
     error = np.sum(norms[0] * others.error + norms[1] * vectors.error)
@@ -310,12 +310,12 @@ def _total(m: Motion, vectors: Rounded, others: Rounded) -> Rounded:
 
 def _kinetic_energy(m: Motion) -> Rounded:
     """½ ν · M ν, with the rotors."""
-    return _total(m, _generalized_momentum(m), _exactly(minimal_rates(m.model, m.state) / 2))
+    return _total(_generalized_momentum(m), _exactly(minimal_rates(m.model, m.state) / 2))
 
 
 def _gravity_energy(m: Motion, rates: Rounded) -> Rounded:
     """Of positions −Σ m g · r, of accelerations its second rate."""
-    return _total(m, m.gravity._replace(size=np.linalg.norm(m.gravity.value, axis=-1)).times(-m.mass), rates)
+    return _total(m.gravity._replace(size=np.linalg.norm(m.gravity.value, axis=-1)).times(-m.mass), rates)
 
 
 def _force_of_probe(m: Motion) -> Rounded:
@@ -349,10 +349,10 @@ _FORMULAS: Mapping[str, tuple[str, Callable[[Motion], Rounded]]] = {
     "frame_position_from_anchor": ("m", _from_anchor),
     "frame_distance": ("m", _frame_distance),
     "frame_distance_rate": ("m/s", _frame_distance_rate),
-    "frame_position_in_first": ("m", lambda m: _in_first(m, _first(m, m.point))),
+    "frame_position_in_first": ("m", lambda m: _in_first(m, _from_first(m.point))),
     "frame_axes_in_first": ("1", _axes_in_first),
     "frame_velocity_in_first": ("m/s", lambda m: _in_first(m, _velocity_in_first(m))),
-    "frame_angular_velocity_in_first": ("rad/s", lambda m: _in_first(m, _first(m, m.w))),
+    "frame_angular_velocity_in_first": ("rad/s", lambda m: _in_first(m, _from_first(m.w))),
     "frame_acceleration": ("m/s²", lambda m: m.point_acceleration),
     "frame_acceleration_local": ("m/s²", lambda m: m.local(m.point_acceleration)),
     "frame_proper_acceleration": ("m/s²", lambda m: m.point_acceleration.minus(m.gravity)),

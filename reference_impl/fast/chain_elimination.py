@@ -24,12 +24,12 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import lapack
 
-from reference_impl.arrays import Motion
+from reference_impl.arrays import Array, Float, Motion
 from reference_impl.direct import EPS, Solution, check_state_solvable, joint_forces
 from reference_impl.elements import Elements
 from reference_impl.euler_parameters import G, L, tilde
 from reference_impl.joints import constraint_rows
-from reference_impl.mechanism import Array, Float, Mechanism, side_by_side
+from reference_impl.mechanism import Mechanism, side_by_side
 from reference_impl.singular_system import SingularSystem
 
 # Constants that turn flattened outer products of p with another vector into what is needed of them.

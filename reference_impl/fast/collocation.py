@@ -20,11 +20,11 @@ from functools import cache, lru_cache
 import numpy as np
 from numpy.polynomial.legendre import leggauss, legvander
 
-from reference_impl.arrays import Motion
+from reference_impl.arrays import Array, Float, Motion
 from reference_impl.fast.chain_elimination import component_first
 from reference_impl.fast.tree_elimination import EliminatedSystem, eliminated_system
 from reference_impl.integrate import IntegrationResult, state_scales
-from reference_impl.mechanism import Array, Float, Mechanism
+from reference_impl.mechanism import Mechanism
 
 DEFAULT_NODES = 16  # a sweep of a small chain costs NumPy's calls and not its nodes: 8 … 20 were tried
 MAX_SWEEPS = 14  # at most in a step; more are better spent on a shorter step

@@ -29,7 +29,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from reference_impl.arrays import Motion
+from reference_impl.arrays import Array, Float, Indices, Int, Motion
 from reference_impl.direct import (
     RUN_RANK_TOLERANCE,
     Solution,
@@ -42,7 +42,7 @@ from reference_impl.euler_parameters import L, angular_velocity, cross, dot
 from reference_impl.fast.chain_elimination import StructuredSystem, component_first
 from reference_impl.integrate import Acceleration, direct_acceleration
 from reference_impl.joints import ConstraintRows, constraint_rows, joint_of_rows
-from reference_impl.mechanism import Array, Float, Indices, Int, Mechanism, side_by_side
+from reference_impl.mechanism import Mechanism, side_by_side
 from reference_impl.singular_system import SingularSystem
 
 
