@@ -476,7 +476,8 @@ class _Terms:
         total += result
         free = model.free  # its wrench is what rounding leaves
         total[:, free, 2:] += np.stack([force @ t.below.T, moment @ t.below.T], -1)[:, free]
-        total[..., 2:] += np.sum(t.element_size, -1, keepdims=True) * (t.element_size > 0)
+        elements = t.element_size
+        total[..., 2:] += np.sum(elements, -1, keepdims=True) * (elements > 0)
         total += np.stack([swing + t.a + t.transport, turning, carried @ t.below.T, carried_moment], -1)
 
         rate, speed = ((x.mT @ joints.rate[..., None])[..., 0] for x in (joints.turns, joints.lever))
@@ -495,22 +496,12 @@ class _Terms:
             "mass_matrix": np.max(joints.mass_matrix, axis=(1, 2), initial=0.0),
         }
         inertia = np.where(t.J > 0, t.J, np.inf)
-        weight = np.broadcast_to(t.m * t.g, t.F.shape)
+        weight, moments = np.broadcast_to(t.m * t.g, t.F.shape), (np.sum(elements, -1), lever @ (t.m * t.g))
         scale = {
             "acceleration": result[..., 0],
             "angular_acceleration": np.max([t.alpha, moment / inertia, turning], 0),
             "joint_reaction": np.max([t.F, weight, t.m * t.a], 0),
-            "joint_moment": np.max(
-                [
-                    t.moment,
-                    t.arm * t.F,
-                    t.J * t.alpha,
-                    t.spin,
-                    np.sum(t.element_size, -1),
-                    lever @ (t.m * t.g),
-                ],
-                0,
-            ),
+            "joint_moment": np.max([*moments, t.moment, t.arm * t.F, t.J * t.alpha, t.spin], 0),
         }
         rods, of_joints = np.zeros(t.a.shape), np.zeros((len(total), 2))
         for at, (what, k) in enumerate(joints.pairs):

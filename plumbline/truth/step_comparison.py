@@ -1119,18 +1119,13 @@ def _quadrature_differences(
     if has_loops:  # a body may be held still, whose iterates move as the others'
         size[2] = np.broadcast_to(np.max(size[2], axis=1, keepdims=True), size[2].shape)
     size[2] = np.maximum.accumulate(size[2], axis=0)  # the averaged a depends on all earlier ones
-    predicted_q, predicted_rate = constrained_quadrature(method, run, h)
-    roundings = STEP_ROUNDINGS * EPS
-    before = np.maximum(size[1][:-1], size[1][1:])
+    off_q, off_rate = (
+        np.asarray(predicted - found[1:], float)
+        for predicted, found in zip(constrained_quadrature(method, run, h), (q, qdot), strict=True)
+    )
+    roundings, before = STEP_ROUNDINGS * EPS, np.maximum(size[1][:-1], size[1][1:])
+    of_q, of_rate = h * h * size[2][1:], h * size[2][1:]  # the accelerations' effects
     return (
-        (
-            np.asarray(predicted_q - q[1:], float),
-            roundings * (size[0][1:] + h * before + h * h * size[2][1:]),
-            h * h * size[2][1:],
-        ),
-        (
-            np.asarray(predicted_rate - qdot[1:], float),
-            roundings * (before + h * size[2][1:]),
-            h * size[2][1:],
-        ),
+        (off_q, roundings * (size[0][1:] + h * before + of_q), of_q),
+        (off_rate, roundings * (before + of_rate), of_rate),
     )
