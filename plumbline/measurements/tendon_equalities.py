@@ -53,11 +53,9 @@ def effects_of_missing_terms(model: Model, state: State) -> dict[str, Array]:
 def _lengthening(model: Model, state: State, u: Array, udot: Array) -> dict[int, float]:
     """Of each rod ℓ̈ [m/s²] at q̈ = 0, in the coordinates of the mechanism without rods, cut open."""
     rodless = rods_taken_out(model)
-    tree, there, place = rodless.model, rodless.state(state), np.append(np.argsort(rodless.order), -1)
-    if tree.has_loops:
-        cut = cut_open(tree)
-        tree, there, place = cut.model, cut.state(there), np.append(cut.place, -1)[place]
-    found, bodies = dict[int, float](), Tree(floats(), tree, there)
+    cut = cut_open(rodless.model)
+    place = np.append(cut.place, -1)[np.append(np.argsort(rodless.order), -1)]
+    found, bodies = dict[int, float](), Tree(floats(), cut.model, cut.state(rodless.state(state)))
     a, alpha = bodies.coasting()  # at q̈ = 0
     for k in np.flatnonzero(model.rods):
         ends = np.zeros((2, 3))

@@ -466,11 +466,9 @@ def motion_without_inertia(model: Model, state: State) -> int | None:
     """
     if not model.lacks_inertia:
         return None
-    tree, there, place = model, state, np.arange(model.n)
-    null = np.eye(rate_count(model))
-    if model.has_loops:
-        cut = cut_open(model)
-        tree, there, place = cut.model, cut.state(state), cut.place
+    cut = cut_open(model)
+    tree, there, null = cut.model, cut.state(state), np.eye(rate_count(cut.model))
+    if cut.ends:
         held = singular_values(cut, there)[1]
         null = np.linalg.svd(held)[2][len(held) :].T
     M = mass_matrix(tree, there)
@@ -482,7 +480,7 @@ def motion_without_inertia(model: Model, state: State) -> int | None:
     if values[0] > MIN_MASS_RATIO:
         return None
     free = null @ (vectors[:, values <= MIN_MASS_RATIO] / size[:, None])
-    turns = (velocity_jacobian(tree, there) @ free).reshape(tree.n, 6, -1)[place[: model.n], 3:]
+    turns = (velocity_jacobian(tree, there) @ free).reshape(tree.n, 6, -1)[cut.place[: model.n], 3:]
     principal = np.linalg.eigvalsh(model.inertia)
     lacking = principal[:, 0] <= ZERO_INERTIA * principal[:, 2]
     # Of several such motions any basis is as good: their norm is that of all, and equal ones are the first's.

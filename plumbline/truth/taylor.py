@@ -84,44 +84,36 @@ def simulate_taylor(
             jumps, or heyoka was built without quad precision.
 
     """
-    if not model.has_loops:
-        return _simulate(model, state, times, precision)
     cut = cut_open(model)
-    there, bodies = cut.state(state), cut.place[: model.n]
-    run, steps = _simulate(cut.model, there, times, precision, _closures(cut, there))
-    return run[:, bodies], steps
-
-
-def _simulate(
-    model: Model, state: State, times: Array, precision: Precision, closures: tuple[Closure, ...] = ()
-) -> tuple[State, int]:
-    """Integrate a tree, its loops closed."""
-    integrator, number = _prepared_integrator(model, state, precision, closures=closures)
+    there, opened = cut.state(state), cut.model
+    integrator, number = _prepared_integrator(opened, there, precision, closures=_closures(cut, there))
     outcome, _, _, steps, _, samples = integrator.propagate_grid([number(float(t)) for t in times])
     if "time_limit" not in str(outcome):
         raise EngineFailure(f"heyoka stopped: {outcome}")
     y = np.asarray(samples)
     is_quad = y.dtype not in (np.dtype(float), np.dtype(np.longdouble))
-    if is_quad and all(kind.has_attitude for kind in model.kinds):
+    if is_quad and all(kind.has_attitude for kind in opened.kinds):
         y = y.astype(object)  # NumPy multiplies matrices of these numbers as objects only
     elif is_quad:  # sines of angles are computed in extended precision
         y = np.vectorize(lambda x: np.longdouble(str(x)), otypes=[np.longdouble])(y)
-    shape = {"p": 4, "x": model.columns, "xdot": model.columns}
+    shape = {"p": 4, "x": opened.columns, "xdot": opened.columns}
     names = ("p", "omega", "u", "udot", "r", "v", "x", "xdot")
-    parts = {name: np.zeros((len(times), model.n, shape.get(name, 3)), y.dtype) for name in names}
+    parts = {name: np.zeros((len(times), opened.n, shape.get(name, 3)), y.dtype) for name in names}
     parts["p"][..., 0], at = 1, 0
-    for k, kind in enumerate(model.kind):
+    for k, kind in enumerate(opened.kind):
         for name, size in _coordinate_names(kind):
             parts[name][:, k, :size] = y[:, at : at + size]
             at += size
-    motion = complete_state(model, State(**parts))
+    motion = complete_state(opened, State(**parts))
     if y.dtype == object:
         motion = State(*(np.array(x.tolist(), samples.dtype) for x in vars(motion).values()))
-    return motion, int(steps)
+    return motion[:, cut.place[: model.n]], int(steps)
 
 
 def _closures(cut: CutMechanism, state: State) -> tuple[Closure, ...]:
     """Choose rows that close the loops and do not depend on others, at a state with the ends together."""
+    if not cut.ends:
+        return ()
     J = cut.jacobian(state).reshape(len(cut.ends), 6, -1)
     for block, (b, _) in zip(J, cut.ends, strict=True):
         block[:3] = rotation_matrix(state.p[b]).T @ block[:3]
