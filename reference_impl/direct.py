@@ -300,46 +300,39 @@ class DirectSystem:
         """The parts of x, and λ as forces."""
         n, c = self.chain.n, len(self.joint)
         multiplier = x[7 * n : 7 * n + c]
-        rows = self.joint, multiplier, joints.r_near, joints.p_near
-        of_elements = (self.elements.joint, elements) if self.elements and elements else None
         return Solution(
             acceleration=x[: 3 * n].reshape(n, 3),
             pddot=x[3 * n : 7 * n].reshape(n, 4),
             multiplier=multiplier,
             norm_multiplier=x[7 * n + c :],
             joint=self.joint,
-            **joint_forces(self.chain, p, rows, of_elements),
+            **joint_forces(self.chain, p, joints, multiplier, elements),
         )
 
 
 def joint_forces(
     mechanism: Mechanism,
     p: Float[Array, "bodies 4"],
-    rows: tuple[Int[Indices, "c"], Float[Array, "c"], Float[Array, "c 3"], Float[Array, "c 4"]],
-    of_elements: tuple[Int[Indices, "e"], ElementForces] | None = None,
+    rows: ConstraintRows,
+    multiplier: Float[Array, "c"],
+    elements: ElementForces | None = None,
 ) -> dict[str, Any]:
     """Compute what the rows and the elements of the joints do to the near bodies.
 
     A ½ L Q_p is the moment about the centre of mass; L p = 0 takes the normalisation's share out (E2).
 
-    Args:
-        rows: of each its joint, its multiplier, and ∂/∂r and ∂/∂p of the near body.
-        of_elements: the joints of the elements, and the elements.
-
     Returns:
         The fields ``tension``, ``joint_reaction`` and ``joint_moment`` of `Solution`.
 
     """
-    joint, multiplier, r_near, p_near = rows
     force, of_p = np.zeros((len(mechanism.kind), 3)), np.zeros((len(mechanism.kind), 4))
-    np.subtract.at(force, joint, multiplier[:, None] * r_near)
-    np.subtract.at(of_p, joint, multiplier[:, None] * p_near)
-    if of_elements:
-        at, found = of_elements
-        np.add.at(force, at, found.torque[:, None] * found.r_near)
-        np.add.at(of_p, at, found.torque[:, None] * found.p_near)
+    np.subtract.at(force, rows.joint, multiplier[:, None] * rows.r_near)
+    np.subtract.at(of_p, rows.joint, multiplier[:, None] * rows.p_near)
+    if elements:
+        np.add.at(force, elements.joint, elements.torque[:, None] * elements.r_near)
+        np.add.at(of_p, elements.joint, elements.torque[:, None] * elements.p_near)
     tension, rod = np.full(len(mechanism.kind), np.nan), mechanism.rods
-    tension[rod] = 2 * mechanism.length[rod] * multiplier[rod[joint]]
+    tension[rod] = 2 * mechanism.length[rod] * multiplier[rod[rows.joint]]
     p = p[mechanism.body[:, 1]]
     turn = A(p)
     near = (turn @ mechanism.point[:, 1, :, None])[..., 0]

@@ -27,7 +27,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy import vecdot
 
-from reference_impl.arrays import Array, Float, Motion
+from reference_impl.arrays import Array, Float, Indices, Int, Motion
 from reference_impl.euler_parameters import A, G, L, cross
 from reference_impl.joints import ConstraintRows
 from reference_impl.mechanism import Mechanism
@@ -37,6 +37,7 @@ from reference_impl.mechanism import Mechanism
 class ElementForces:
     """The elements of a mechanism at one state; e joint coordinates that have some, in the joints' order."""
 
+    joint: Int[Indices, "e"]  # of each coordinate
     r_near: Float[Array, "e 3"]  # J_φ of r of the near body; of the far body it is −r_near
     p_near: Float[Array, "e 4"]  # J_φ of p of the near body
     p_far: Float[Array, "e 4"]  # J_φ of p of the far body
@@ -147,6 +148,7 @@ class Elements:
             spring_wrench, potential, lost = self._point_springs(at)
             np.add.at(total, self._ends[:, e:], spring_wrench)
         return ElementForces(
+            joint=self.joint,
             r_near=push,
             p_near=np.vecmat(n_near, at.turning[0]),
             p_far=-np.vecmat(n_far, at.turning[1]),

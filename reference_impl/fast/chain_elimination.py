@@ -478,7 +478,7 @@ class StructuredSystem:
             multiplier=multiplier,
             norm_multiplier=spin + _dot(Rs[0] + self.s[0], turn_near) - _dot(Rs[1] + self.s[1], turn_far),
             joint=rows.joint,
-            **joint_forces(forest, p, (rows.joint, multiplier, rows.r_near, rows.p_near)),
+            **joint_forces(forest, p, rows, multiplier),
         )
 
     # -- the manifold -------------------------------------------------------------------------------

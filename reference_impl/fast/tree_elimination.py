@@ -182,14 +182,13 @@ class TreeSystem:
         q, qdot = component_first(r, p), component_first(v, pdot)
         found, multiplier, rows, elements = self._solve_motion(q, qdot, 0.0, x, refine=True)
         c = len(self.joint) - np.count_nonzero(self.compliance)
-        of_elements = (self.elements.joint, elements) if self.elements and elements else None
         return Solution(
             acceleration=found[:3].T,
             pddot=found[3:].T,
             multiplier=multiplier[:c],
             norm_multiplier=np.full(self.body_count, np.nan),
             joint=self.joint[:c],
-            **joint_forces(self.forest, p, (self.joint, multiplier, rows.r_near, rows.p_near), of_elements),
+            **joint_forces(self.forest, p, rows, multiplier, elements),
         )
 
     def project(
