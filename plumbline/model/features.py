@@ -54,7 +54,7 @@ class _Value(NamedTuple):
     feature: Feature
     name: str  # of the array of the model
     at: Index
-    neutral: Array | float
+    neutral: Array | float = 0.0
 
 
 def joint_roles(model: Model) -> list[Role]:
@@ -108,20 +108,24 @@ def without_feature(model: Model, feature: Feature) -> Model:
 
 def _values(model: Model) -> Iterator[_Value]:
     """All values that are not neutral."""
+    return (one for one in _every_value(model) if np.any(getattr(model, one.name)[one.at] != one.neutral))
+
+
+def _every_value(model: Model) -> Iterator[_Value]:
     for axis, letter in enumerate("xyz"):
-        yield from _changed(model, Feature(f"gravity {letter}"), "gravity", (axis,))
+        yield _Value(Feature(f"gravity {letter}"), "gravity", (axis,))
     roles = joint_roles(model)
     for k, (kind, role) in enumerate(zip(model.kind, roles, strict=True)):
         for field, name, index, neutral in _joint_values(model, k):
-            yield from _changed(model, Feature(field, kind, role), name, index, neutral)
+            yield _Value(Feature(field, kind, role), name, index, neutral)
     tree = [min(path_to_world(model.body[: model.n, 0], k)) for k in range(model.n)]
     for k, (one, other) in enumerate(model.spring_body):
         where = "two bodies" if tree[one] == tree[other] else "two trees"
         where = f"a spring between {'a body and the world' if min(one, other) < 0 else where}"
         for side, field in enumerate(("first point", "second point")):
-            yield from _changed(model, Feature(field, "", where), "spring_point", (k, side))
+            yield _Value(Feature(field, "", where), "spring_point", (k, side))
         for field in ("stiffness", "damping", "length"):
-            yield from _changed(model, Feature(field, "", where), f"spring_{field}", (k,))
+            yield _Value(Feature(field, "", where), f"spring_{field}", (k,))
 
 
 def _joint_values(model: Model, k: int) -> Iterator[tuple[str, str, Index, Array | float]]:
@@ -150,12 +154,3 @@ def _joint_values(model: Model, k: int) -> Iterator[tuple[str, str, Index, Array
     yield "unequal moments of inertia", "inertia", (k, np.eye(3, dtype=bool)), np.full(3, moments.mean())
     for name in ("force", "moment", "drag_force", "drag_moment"):
         yield name.replace("_", " "), name, (k,), 0.0
-
-
-def _changed(
-    model: Model, feature: Feature, name: str,
-    index: Index, neutral: Array | float = 0.0,
-) -> Iterator[_Value]:  # fmt: skip
-    """The value, if it is not neutral."""
-    if np.any(getattr(model, name)[index] != neutral):
-        yield _Value(feature, name, index, neutral)
