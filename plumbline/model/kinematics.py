@@ -23,7 +23,6 @@ from plumbline.model.datatypes import (
     Float,
     Indices,
     Int,
-    JointKind,
     Model,
     State,
 )
@@ -485,17 +484,13 @@ def rate_count(model: Model) -> int:
         Their number: the size of `StateQuantities.mass_matrix`.
 
     """
-    return 3 * int(model.tree.rods.sum()) + sum(map(_own_rate_count, model.tree.kinds))
-
-
-def _own_rate_count(kind: JointKind) -> int:
-    """Rates in ν that are a body's own: ω′, (ṙ, ω′) of a free body, else those of its joint."""
-    return 6 if kind.holds_nothing else 3 if kind.has_attitude else len(kind.motions)
+    return int(own_rates(model)[-1].stop)
 
 
 def own_rates(model: Model) -> list[slice]:
-    """Return where each body's own rates are in ν, behind those of the rods."""
-    first = 3 * int(model.tree.rods.sum()) + np.cumsum([0, *map(_own_rate_count, model.tree.kinds)])
+    """Return where in ν each body's own rates are, behind those of the rods: ω′, or (ṙ, ω′), or ẋ."""
+    counts = [3 if kind.holds_distance else kind.freedom for kind in model.tree.kinds]
+    first = 3 * int(model.tree.rods.sum()) + np.cumsum([0, *counts])
     return [slice(int(start), int(end)) for start, end in pairwise(first)]
 
 
