@@ -15,17 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from plumbline.model.datatypes import (
-    JOINT_ELEMENTS,
-    Array,
-    Bool,
-    Flags,
-    Float,
-    Indices,
-    Int,
-    Model,
-    State,
-)
+from plumbline.model.datatypes import JOINT_ELEMENTS, Array, Bool, Flags, Float, Indices, Int, Model, State
 
 _NEXT = np.array([1, 2, 0])  # of each axis the next one
 

@@ -369,9 +369,8 @@ class StepCharts:
             D = self._damping(q, v, M, forces)
         if own:
             D[..., own, :] = 0
-            D[..., np.array(own)[:, None], own] = self._damping(q, v, M, "all")[
-                ..., np.array(own)[:, None], own
-            ]
+            block = (..., np.array(own)[:, None], own)
+            D[block] = self._damping(q, v, M, "all")[block]
         D = factor * np.where(self._on_one_path(), D, 0)
         if self.method.is_damping_symmetric:
             D = (D + np.swapaxes(D, -1, -2)) / 2
