@@ -70,7 +70,7 @@ class DirectSystem:
         self.joint, self.size = joint, 8 * n + c
         self._rods = chain.rods
         self._masses = np.repeat(chain.mass, 3)
-        self._drag = bool(chain.drag_force.any() or chain.drag_moment.any())
+        self._drag = chain.has_drag
         self._weight = chain.mass[:, None] * chain.gravity + chain.force
         far, near = chain.body[joint].T
         self._far = np.flatnonzero(far >= 0)

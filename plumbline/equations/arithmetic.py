@@ -53,8 +53,6 @@ class Arithmetic:
     columns: Callable[[Sequence[Any]], Any]  # the matrix of columns
     widened: Callable[[Any, Any], Any]  # x and columns of 0, as many as a matrix has
     assemble: Callable[[int, Mapping[tuple[int, int], Any]], Any]  # size, blocks by first row and column
-    mul: Callable[[Any, Any], Any]  # product of two matrices
-    transpose: Callable[[Any], Any]
     symmetric: Callable[[Any], Any]  # of a matrix that is symmetric but for rounding
     dot: Callable[[Any, Any], Any]  # aᵀb, a scalar
     cross: Callable[[Any, Any], Any]  # a × b
@@ -64,6 +62,14 @@ class Arithmetic:
     sqrt: Callable[[Any], Any]  # of a scalar that is not negative, but for rounding
     sin_cos: Callable[[Any], tuple[Any, Any]]  # of a scalar
     turn_over_sine: Callable[[Any, Any], Any]  # θ/sin θ by sin θ and cos θ, 0 ≤ θ < π
+
+    def mul(self, a: Any, b: Any) -> Any:
+        """Return the product of two matrices."""
+        return a @ b
+
+    def transpose(self, a: Any) -> Any:
+        """Return the transpose of a matrix."""
+        return a.mT
 
 
 class _Floats(Arithmetic):
@@ -111,12 +117,6 @@ class _Floats(Arithmetic):
         for (i, j), block in blocks.items():
             out[..., i : i + block.shape[-2], j : j + block.shape[-1]] = block
         return out
-
-    def mul(self, a: Any, b: Any) -> Any:
-        return a @ b
-
-    def transpose(self, a: Any) -> Any:
-        return a.mT
 
     def symmetric(self, a: Any) -> Any:
         return (a + a.mT) / 2
@@ -198,12 +198,6 @@ class _Objects(Arithmetic):
         for (i, j), block in blocks.items():
             out[i : i + block.shape[0], j : j + block.shape[1]] = block
         return out
-
-    def mul(self, a: Any, b: Any) -> Any:
-        return a @ b
-
-    def transpose(self, a: Any) -> Any:
-        return a.T
 
     def symmetric(self, a: Any) -> Any:
         return np.where(np.tri(len(a)), a.T, a)

@@ -225,15 +225,10 @@ class Tree:
         self.shifted: Mapping[int, float] = {}
         self.zero, self.one = num.vector(np.zeros(3)), num.matrix(np.eye(3))
         self.far = [int(far) for far in model.body[: model.n, 0]]
-        self.A: list[Any] = []
-        self.r: list[Any] = []
-        self.v: list[Any] = []
-        self.w: list[Any] = []
-        self.near: list[Any] = []
-        self.arm: list[Any] = []
-        self._bias: list[tuple[Any, Any]] = []  # acceleration of the carried point, angular acceleration
-        self.blocks: list[list[Any]] = []
-        self._inward: list[Any] = []  # ω × (ω × s) of the near points
+        self.A, self.r, self.v, self.w, self.near, self.arm = (list[Any]() for _ in range(6))
+        self.blocks = list[list[Any]]()
+        self._bias = list[tuple[Any, Any]]()  # acceleration of the carried point, angular acceleration
+        self._inward = list[Any]()  # ω × (ω × s) of the near points
         self._kinetic = self._potential = num.scalar(0.0)  # of the joints' elements
         for k in range(model.n):
             self._add_body(k)
