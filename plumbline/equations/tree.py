@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from plumbline.equations.arithmetic import Arithmetic
-from plumbline.model.datatypes import JOINT_ELEMENTS, KINDS, Model, State
+from plumbline.model.datatypes import JOINT_ELEMENTS, Model, State
 from plumbline.model.kinematics import own_rates, path_to_world, rate_count
 
 SUMS = ("kinetic_energy", "potential_energy", "angular_momentum")
@@ -258,7 +258,7 @@ class Tree:
     def _add_body(self, k: int) -> None:
         """Go from the far body along joint k to body k."""
         num, model, far = self.num, self.model, self.far[k]
-        kind = KINDS[model.kind[k]]
+        kind = model.kinds[k]
         hang = self.joint_point(k, 0)
         above, w, arm, bend = self.one, self.zero, hang, self.zero
         P, v = hang, self.zero
@@ -345,7 +345,7 @@ class Tree:
 
         """
         num, J, model = self.num, self.inertia(k), self.model
-        if KINDS[model.kind[k]].holds_nothing:
+        if model.kinds[k].holds_nothing:
             return J
         s = num.cross_matrix(self.joint_point(k, 1))
         return J - num.mul(s, s) * num.scalar(model.mass[..., k])
@@ -418,7 +418,7 @@ class Tree:
         """Go along the scalar motions of joint k."""
         num, model = self.num, self.model
         A, swing, blocks = num.mul(above, self.joint_axes(k, 0)), self.zero, []
-        for i, (what, number) in enumerate(KINDS[model.kind[k]].motions):
+        for i, (what, number) in enumerate(model.kinds[k].motions):
             x, rate = self.coordinate(k, i)
             unit = num.vector(np.eye(3)[number])
             axis = num.mul(A, unit)
@@ -431,7 +431,7 @@ class Tree:
                 self._kinetic = self._kinetic + a * rate * rate / 2
                 self._potential = self._potential + stiffness * stretch * stretch / 2
             along, about = (axis, None) if what == "slide" else (None, axis)
-            if KINDS[model.kind[k]].has_pitch:
+            if model.kinds[k].has_pitch:
                 along = axis * num.scalar(model.length[..., k])
             blocks.append(_Single(num, axis, along, about, effort, armature))
             if along is not None:
@@ -594,7 +594,7 @@ class Tree:
         num, at, acceleration, turning = self.num, list[Any](), list[Any](), list[Any]()
         for k in range(self.model.n):
             a, alpha = self._carried(k, self.zero, at, turning)
-            if KINDS[self.model.kind[k]].holds_distance:
+            if self.model.kinds[k].holds_distance:
                 swing = self.blocks[k][0]
                 a = a + swing.u * swing.pull
             at.append(a)
@@ -834,7 +834,7 @@ class Tree:
         """Of each joint's rates in ν: where they are, and the velocities of the near point or the turns."""
         num, model, found, rods = self.num, self.model, list[list[tuple[int, Any, Any]]](), 0
         for k, own in enumerate(own_rates(model)):
-            kind, columns = KINDS[model.kind[k]], list[tuple[int, Any, Any]]()
+            kind, columns = model.kinds[k], list[tuple[int, Any, Any]]()
             if kind.holds_distance:
                 swing = self.blocks[k][0]
                 across = self.one - num.mul(swing.u, num.transpose(swing.u))
@@ -857,12 +857,12 @@ class Tree:
             for block, (at, _, turn) in zip(reversed(self.blocks[k]), reversed(columns[k]), strict=True):
                 if block.armature is None:
                     continue
-                if not KINDS[self.model.kind[k]].has_attitude:
+                if not self.model.kinds[k].has_attitude:
                     axis = block.axis  # of length 1: ½ a ẋ²
                     yield [(at, axis)], block.armature
                     continue
                 turns, j = [(at, turn)], self.far[k]
                 while j >= 0:
                     turns += [(place, -about) for place, _, about in columns[j] if about is not None]
-                    j = -1 if KINDS[self.model.kind[j]].has_attitude else self.far[j]
+                    j = -1 if self.model.kinds[j].has_attitude else self.far[j]
                 yield turns, block.armature

@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from plumbline.model.datatypes import KINDS, Array, Model, State
+from plumbline.model.datatypes import Array, Model, State
 from plumbline.model.kinematics import joint_coordinates, minimal_rates
 from plumbline.processes.exceptions import PlumblineError
 
@@ -172,7 +172,7 @@ class _Check:
 
     def _joint(self, k: int, given: list[Array]) -> tuple[Any, Any]:
         """Rows, coordinates and work of joint k; returns the energies of its rotor and its spring."""
-        model, kind = self.model, KINDS[self.model.kind[k]]
+        model, kind = self.model, self.model.kinds[k]
         (far, near), name = (self._body(int(body)) for body in model.body[k]), f"joint {k + 1}"
         s, t = (self._vector(point) for point in model.point[k, ::-1])
         d = [near.place[i] + near.turn[i] * s - far.place[i] - far.turn[i] * t for i in _AXES]
@@ -215,7 +215,7 @@ class _Check:
         spin = self.omega[k] - self._vector(state.omega[k])
         self._equal(name, turned, 1.0, self._deviation)
         self._equal(f"rates of body {k + 1}", spin, self.unit_sizes[1], self._deviation)
-        kind = KINDS[model.kind[k]]
+        kind = model.kinds[k]
         if kind.holds_distance:
             u, rate = (self._vector(x) for x in given[:2])
             u = u * (1 / self._dot(u, u).sqrt())
@@ -233,7 +233,7 @@ class _Check:
 
     def _work_at_point(self, k: int, axes: list[list[Any]], d: Any) -> tuple[Any, Any]:
         """Of a joint that leaves the attitude free: it holds its point, its distance or nothing."""
-        model, kind, name = self.model, KINDS[self.model.kind[k]], f"wrench of joint {k + 1}"
+        model, kind, name = self.model, self.model.kinds[k], f"wrench of joint {k + 1}"
         a, c, stiffness = (self.arb(float(x[k, 0])) for x in (model.armature, model.damping, model.stiffness))
         (wa, ra), (wb, rb) = (self._spin(int(body)) for body in model.body[k])
         spin = wb - wa
@@ -257,7 +257,7 @@ class _Check:
         self, k: int, coefficients: Any, axes: list[Any], given: list[Array], is_closing: bool
     ) -> tuple[Any, Any]:
         """Of a joint with scalar coordinates: their values, rates, second derivatives and power."""
-        model, motions, name = self.model, KINDS[self.model.kind[k]].motions, f"joint {k + 1}"
+        model, motions, name = self.model, self.model.kinds[k].motions, f"joint {k + 1}"
         turns = [axis for what, axis in motions if what == "turn"]
         for axis in {0: _AXES, 1: turns}.get(len(turns), ()):  # axes that the joint does not turn
             row = coefficients(_FAR[axis], _NEAR[axis])
@@ -281,7 +281,7 @@ class _Check:
                 value = value - x0
                 push, sizes, passed = self._dot(along, self.moment[k]), self.unit_sizes, passed + 1
                 push_size = self.moment_size
-                if KINDS[model.kind[k]].has_pitch:
+                if model.kinds[k].has_pitch:
                     pitch = self.arb(float(model.length[k]))
                     push += pitch * self._dot(along, self.force[k])
                     push_size += abs(float(model.length[k])) * self.scale["joint_reaction"]

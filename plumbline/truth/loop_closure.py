@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from plumbline.equations.arithmetic import balls as ball_arithmetic
 from plumbline.equations.arithmetic import entries, midpoints
 from plumbline.equations.tree import Solution, Tree
-from plumbline.model.datatypes import KINDS, ZERO_INERTIA, Array, Model, State
+from plumbline.model.datatypes import ZERO_INERTIA, Array, Model, State
 from plumbline.model.kinematics import path_to_world
 from plumbline.model.loops import CutMechanism, cut_open, independent_rows
 
@@ -81,9 +81,9 @@ class _LoopTree(Tree):
         """The matrix from ż to ν."""
         first = np.cumsum([0, *map(len, self.z)])
         rows = [[self.arb(int(i == j)) for j in range(first[-1])] for i in range(first[-1])]
-        for k, kind in enumerate(self.model.kind):
+        for k, kind in enumerate(self.model.kinds):
             blocks = [(int(first[k]), self.chart[k])] if k in self.chart else []
-            if KINDS[kind].has_attitude:
+            if kind.has_attitude:
                 d = self.mat(3, 1, self.z[k][-3:])
                 spin = self.A[k] * (self.one - self.num.cross_matrix(d)) * (2 / (1 + self.num.dot(d, d)))
                 blocks.append((int(first[k + 1]) - 3, spin.tolist()))
@@ -94,7 +94,7 @@ class _LoopTree(Tree):
 
     def motions(self, k: int) -> tuple[Any, Any]:
         """Velocities of the near point and angular velocities that each of joint k's rates gives."""
-        kind, num, zero = KINDS[self.model.kind[k]], self.num, self.zero
+        kind, num, zero = self.model.kinds[k], self.num, self.zero
         units = [self.mat(3, 1, [int(i == j) for i in range(3)]) for j in range(3)]
         pairs = [(e, zero) for e in units] if kind.holds_nothing else []
         if kind.holds_distance:
@@ -288,8 +288,8 @@ def _closed_rates(flint: Any, given: Tree, kept: Any, dependent: NDArray[np.intp
 def _relative_rates(c: Tree) -> list[Any]:
     """The rates ν of a tree's state."""
     num, found = c.num, list[Any]()
-    for k, name in enumerate(c.model.kind):
-        kind, far_w = KINDS[name], c.w[c.far[k]] if c.far[k] >= 0 else c.zero
+    for k, kind in enumerate(c.model.kinds):
+        far_w = c.w[c.far[k]] if c.far[k] >= 0 else c.zero
         if kind.holds_distance:
             u, udot = c.rod_direction(k)
             swing = udot - num.cross(far_w, u)

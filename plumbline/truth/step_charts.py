@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from plumbline.equations.arithmetic import floats, stacked
 from plumbline.equations.tree import Solution, Tree
-from plumbline.model.datatypes import KINDS, EngineFailure, Model, State
+from plumbline.model.datatypes import EngineFailure, Model, State
 from plumbline.model.kinematics import (
     cross,
     cross_matrix,
@@ -131,8 +131,8 @@ class StepCharts:
         self.joint_axes: dict[tuple[int, int], Array] = {}
         self.of_body: list[int] = []
         self.of_rod: dict[int, int] = {}
-        for k, name in enumerate(model.kind):
-            kind, far = KINDS[name], int(model.body[k, 0])
+        for k, kind in enumerate(model.kinds):
+            far = int(model.body[k, 0])
             before, w = np.tile(UNIT, (len(u), 1)), np.zeros_like(u[:, 0])
             if far >= 0:
                 before, w = attitudes[:, far], spins[:, far]
@@ -426,7 +426,7 @@ class StepCharts:
         for k in range(model.n):
             if np.any(model.armature[k]):
                 places = range(*self.own[self.of_body[k]].indices(self.nv))
-                of_all = KINDS[model.kind[k]].has_attitude
+                of_all = model.kinds[k].has_attitude
                 for i, place in enumerate(places):
                     M[..., place, place] += LongDouble(model.armature[k, 0 if of_all else i])
         return np.asarray(M)
@@ -510,10 +510,10 @@ class StepCharts:
         u, udot, x, xdot = (
             np.zeros((*lead, n, size), LongDouble) for size in (3, 3, *[self.model.columns] * 2)
         )
-        for k, (chart, name) in enumerate(zip(self.of_body, self.model.kind, strict=True)):
+        for k, (chart, kind) in enumerate(zip(self.of_body, self.model.kinds, strict=True)):
             if k in self.of_rod:
                 u[..., k, :], udot[..., k, :] = (part[..., 0] for part in tree.rod_direction(k))
-            if KINDS[name].motions:
+            if kind.motions:
                 own, rates = q[chart][..., self.given[k]], v[..., self.own[chart]][..., self.given[k]]
                 x[..., k, : own.shape[-1]], xdot[..., k, : own.shape[-1]] = own, rates
         kinetic, potential, momentum = tree.totals()
@@ -602,8 +602,8 @@ class _MovingTree(Tree):
     def velocity_rates(self, found: Solution) -> Array:
         """Return v̇ (..., nv) of accelerations."""
         out: list[Array] = []
-        for k, name in enumerate(self.model.kind):
-            kind, far = KINDS[name], self.far[k]
+        for k, kind in enumerate(self.model.kinds):
+            far = self.far[k]
             own, w, alpha = self.charts.of_body[k], self.zero, self.zero
             if far >= 0:
                 w, alpha = self.w[far], found.turning[far]

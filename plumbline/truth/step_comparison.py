@@ -804,7 +804,7 @@ def _is_momentum_free(model: Model) -> bool:
     """Whether no joint to the world has a moment about the origin: balls and rods there, free bodies."""
     roots = np.flatnonzero(model.body[: model.n, 0] < 0)
     return not model.has_loops and all(
-        KINDS[model.kind[k]].holds_nothing or (model.kinds[k].is_spherical and not np.any(model.point[k, 0]))
+        model.kinds[k].holds_nothing or (model.kinds[k].is_spherical and not np.any(model.point[k, 0]))
         for k in roots
     )
 

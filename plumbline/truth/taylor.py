@@ -418,13 +418,13 @@ class _ExpressionTree(tree.Tree):
         return self.num.matrix(self.model.inertia[k])
 
     def centripetal(self, k: int, point: Any, arm: Any) -> Any:
-        if not KINDS[self.model.kind[k]].has_attitude:
+        if not self.model.kinds[k].has_attitude:
             return super().centripetal(k, point, arm)
         squares = self.squares(k)
         return self.A[k] @ ((squares - self.one * np.trace(squares)) @ point)
 
     def gyroscopic(self, k: int, inertia: Any) -> Any:
-        if not KINDS[self.model.kind[k]].has_attitude:
+        if not self.model.kinds[k].has_attitude:
             return super().gyroscopic(k, inertia)
         return self.A[k] @ self.gyration(k)
 
@@ -472,7 +472,7 @@ class _ExpressionTree(tree.Tree):
 
     def _rates(self, k: int, found: tree.Solution) -> dict[str, Any]:
         """Rates of the coordinates of joint k by name."""
-        kind, own, blocks = KINDS[self.model.kind[k]], self.coordinates[k], found.rates[k]
+        kind, own, blocks = self.model.kinds[k], self.coordinates[k], found.rates[k]
         if not kind.has_attitude:
             return {"x": own.get("xdot"), "xdot": [rate.item() for rate in blocks]}
         wx, wy, wz = (0.5 * w for w in own["omega"])
