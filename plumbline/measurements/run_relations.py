@@ -135,7 +135,10 @@ def check_integrator_relations(
         else:  # the last row must be the first one with opposite rates
             there_and_back = state_at_sample(run, 0), state_at_sample(run, 2, -1.0)
             yield result(REVERSED_IN_TIME, there_and_back, 1, run.steps)
-    if not is_fixed or not (options := _options_of_runs(engine, integrator, model)):
+    ways = engine.options_for(model)
+    others = [way for way in ways if integrator.name in engine.motion_options.get(way, ())]
+    options = [*engine.linear_solvers, *others]  # other ways to the same steps
+    if not (is_fixed and options):
         return
     question = model, state, np.array([0.0, end]), integrator.name, step
     usual = run_or_refusal(engine, *question)
@@ -147,15 +150,6 @@ def check_integrator_relations(
             yield refused_result(name, integrator, other)
         else:
             yield result(name, (state_at_sample(usual, -1), state_at_sample(other, -1)), 2, RUN_STEPS)
-
-
-def _options_of_runs(engine: MetamorphicHooks, integrator: Integrator, model: Model) -> list[str]:
-    """Other ways of an engine to the same steps."""
-    others = engine.options_for(model)
-    return [
-        *engine.linear_solvers,
-        *(way for way in others if integrator.name in engine.motion_options.get(way, ())),
-    ]
 
 
 def fastest_rate(model: Model, state: State) -> float:
