@@ -125,6 +125,11 @@ def _unrotated(vectors: Sequence[str]) -> Callable[[StateQuantities], dict[str, 
     return lambda answers: unrotate(quantity_values(answers), vectors, Q)
 
 
+def _scaled(**factors: float) -> Callable[[StateQuantities], dict[str, Array]]:
+    """Answers multiplied by a number each."""
+    return lambda answers: quantity_values(answers, **factors)
+
+
 def _double_masses(model: Model, state: State) -> tuple[Model, State]:
     fields = ("mass", "inertia", "force", "moment", "drag_force", "drag_moment")
     elements = ("armature", "damping", "stiffness", "effort", "spring_stiffness", "spring_damping")
@@ -216,7 +221,7 @@ def _redescriptions(model: Model) -> Iterator[Relation]:
         yield Relation(SPRINGS_AS_LOADS, lambda m, state: (springs_as_loads(m, state), state), back, True)
 
 
-TIME_REVERSED = Relation("time reversed", _reverse_time, partial(quantity_values, angular_momentum=-1.0))
+TIME_REVERSED = Relation("time reversed", _reverse_time, _scaled(angular_momentum=-1.0))
 _OF_LENGTHS = {
     "angular_acceleration": 4.0, "joint_moment": 0.25, "kinetic_energy": 0.25, "potential_energy": 0.25,
     "angular_momentum": 0.125,
@@ -224,10 +229,8 @@ _OF_LENGTHS = {
 STATE_RELATIONS = (
     Relation("rotated world", partial(rotate_world, q=Q), _unrotated(WORLD_VECTORS)),
     Relation("re-chosen body frame", partial(rotate_body_frames, q=Q), _unrotated(BODY_VECTORS)),
-    Relation(
-        "masses doubled", _double_masses, partial(quantity_values, **dict.fromkeys(QUANTITIES[2:], 0.5))
-    ),
-    Relation("lengths × 4", _scale_lengths, partial(quantity_values, **_OF_LENGTHS)),
+    Relation("masses doubled", _double_masses, _scaled(**dict.fromkeys(QUANTITIES[2:], 0.5))),
+    Relation("lengths × 4", _scale_lengths, _scaled(**_OF_LENGTHS)),
     TIME_REVERSED,
 )
 

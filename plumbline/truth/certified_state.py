@@ -84,9 +84,9 @@ def certify_state(
     quantities = {name: ball for name, ball in balls.items() if name != "scale"}
     middle = {name: midpoints(ball) for name, ball in quantities.items()}
     radius = {name: max(float(x.rad()) for x in flatten(ball)) for name, ball in quantities.items()}
-    names = middle.keys() & {one.name for one in fields(StateQuantities)}
     energies = {name: float(middle[name][0]) for name in ("kinetic_energy", "potential_energy")}
-    found = StateQuantities(**{name: middle[name] for name in names} | energies)
+    own: dict[str, Any] = middle | energies
+    found = StateQuantities(**{x.name: own[x.name] for x in fields(StateQuantities) if x.name in own})
     if model.has_loops:
         found = determinate_part(model, state, found)
         if not model.has_joint_moments:  # as of trees

@@ -250,7 +250,7 @@ def _horizontal(axis: Array, up: Array) -> Array:
     """The axis of a plane of motion as a unit vector."""
     require(np.linalg.norm(axis) > 0, "an angular velocity or a torque that defines the plane")
     axis = axis / np.linalg.norm(axis)
-    require(abs(axis @ up) < CONDITION_RTOL, "a horizontal axis of rotation")
+    require(bool(abs(axis @ up) < CONDITION_RTOL), "a horizontal axis of rotation")
     return axis
 
 
