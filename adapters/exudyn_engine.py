@@ -56,6 +56,7 @@ from plumbline.model.datatypes import (
     Call,
     EngineFailure,
     Float,
+    Indices,
     Integrator,
     JointKind,
     Model,
@@ -119,24 +120,19 @@ class ExudynChain:
         self.piece_bodies: list[Any] = []
         self.joints: list[Any] = []
         self.welds: list[Any] = []
-        self.first_piece: list[int] = []
-        self.last_piece: list[int] = []
-        self.body_of_piece: list[int] = []
-        self.piece_centre = [part.centre for pieces in parts for part in pieces]
+        counts = [len(pieces) for pieces in parts]
+        self.body_of_piece = np.repeat(np.arange(model.n), counts)
+        self.last_piece = np.cumsum(counts) - 1
+        self.first_piece = self.last_piece - counts + 1
+        self.piece_centre = np.array([part.centre for pieces in parts for part in pieces])
         # spring-dampers of joints: joint, connector, whether it pushes, and the axis in the world along which
         # the body below gets the opposite of the connector's force
         self.x = joint_coordinates(model, state)[2]
         self.connectors: list[tuple[int, Any, bool, Array]] = []
         self.jacobian_rate = np.zeros((0, 0))  # d_t(C_q), where joints need it
-        self.qdot_of_pieces = list[Array]()
-        self.rates_of_pieces = list[Array]()  # B of θ̇ = B ω′, of the nodes' attitudes
-        attitude = rotation_matrix(state.p)
-        for k in range(model.n):
-            self.first_piece.append(len(self.piece_bodies))
-            for part in parts[k]:
-                self._add_piece(k, part, attitude[k])
-            self.last_piece.append(len(self.piece_bodies) - 1)
-            first, last = self.first_piece[k], self.last_piece[k]
+        motions, attitude = list[tuple[Array, Array]](), rotation_matrix(state.p)
+        for k, (first, last) in enumerate(zip(self.first_piece, self.last_piece, strict=True)):
+            motions += [self._add_piece(k, part, attitude[k]) for part in parts[k]]
             self._add_joint(k)
             if last > first:
                 middle = [self._add_marker(piece, np.zeros(3)) for piece in (first, last)]
@@ -149,11 +145,13 @@ class ExudynChain:
         for k in range(model.n, len(model.kind)):
             self._add_joint(k)
         self.probes = Probes(mbs, model, self.piece_bodies, self.nodes) if has_probes else None
-        self.qdot, self.rates = np.array(self.qdot_of_pieces), np.array(self.rates_of_pieces)
+        # q̇, and B of θ̇ = B ω′ of the nodes' attitudes
+        self.qdot, self.rates = (np.array(column) for column in zip(*motions, strict=True))
         self.width = self.qdot.shape[1]
         change.assemble(mbs)
 
-    def _add_piece(self, k: int, part: RigidPart, attitude: Array) -> None:
+    def _add_piece(self, k: int, part: RigidPart, attitude: Array) -> tuple[Array, Array]:
+        """Add a piece of body k; return the rates q̇ of its node, and B of θ̇ = B ω′."""
         mbs, state = self.mbs, self.state
         arm, arm_rate = attitude @ part.centre, attitude @ cross(state.omega[k], part.centre)
         velocity, gravity = state.v[k] + arm_rate, self.model.gravity
@@ -161,11 +159,9 @@ class ExudynChain:
         node, body = self.change.add_body(mbs, piece)
         own = np.array(mbs.GetNode(node)["referenceCoordinates"])[3:]
         rates = self.change.rates(own if len(own) == len(piece.turn) else piece.turn)  # p or −p
-        self.qdot_of_pieces.append(np.append(velocity, rates @ state.omega[k]))
-        self.rates_of_pieces.append(rates)
         self.nodes.append(node)
         self.piece_bodies.append(body)
-        self.body_of_piece.append(k)
+        return np.append(velocity, rates @ state.omega[k]), rates
 
     def _add_joint(self, k: int) -> None:
         model, kind, (far, near) = self.model, self.model.kinds[k], self.model.body[k]
@@ -348,9 +344,7 @@ class Exudyn(ExudynAdapter):
             chain = _chain_that_moves(model, state) if moves else ExudynChain(model, state)
             system = written_items(chain.mbs)  # as it is before a solver has it
             _, _, C = _system_matrices(chain)
-        used = np.flatnonzero(np.any(C != 0, axis=1))
-        if model.has_loops:
-            used = used[independent_rows(C[used])]
+        used = _used_rows(chain, C)
         rates = np.zeros((0, 0)) if model.has_loops else _coordinate_rate_map(chain)
         fields = {"qdot": chain.qdot.ravel(), "A": rotation_matrix(state.p), "used": used}
         fields |= {"elastic": np.array(elastic_energy(model, state)), "joint_rates": rates}
@@ -402,10 +396,7 @@ class Exudyn(ExudynAdapter):
 
     def _step(self, model: Model, state: State, times: Array, integrator: Integrator, step: float) -> StepRun:
         settings = self._settings(integrator)
-        newton = settings.timeIntegration.newton  # full iterations
-        newton.useModifiedNewton = False
-        newton.absoluteTolerance = STEP_SETTINGS["solver_atol"]
-        newton.relativeTolerance = STEP_SETTINGS["solver_rtol"]
+        settings.timeIntegration.newton.useModifiedNewton = False  # full iterations
         with silence_engine():
             chain = _chain_that_moves(model, state)
             samples, clock = self._run_samples(chain, times, settings, step)
@@ -503,27 +494,20 @@ def _evaluate_state(chain: ExudynChain) -> StateQuantities:
     mbs, data, n, w = chain.mbs, chain.mbs.systemData, len(chain.piece_bodies), chain.width
     M, f, C = _system_matrices(chain)
     gamma = _constraint_accelerations(chain, C)
-    used = np.any(C != 0, axis=1)  # a generic joint's free axes have none
-    if chain.model.has_loops:
-        some = np.flatnonzero(used)
-        used = np.zeros(len(C), bool)
-        used[some[independent_rows(C[some])]] = True
-    x = np.zeros(len(M) + len(C))
-    part = np.concatenate([np.ones(len(M), bool), used])
-    C_used, gamma = C[used], gamma[used]
-    x[part] = _solve(
-        np.block([[M, C_used.T], [C_used, np.zeros((len(C_used), len(C_used)))]]), np.concatenate([f, gamma])
+    used = _used_rows(chain, C)
+    C_used, multiplier = C[used], np.zeros(len(C))
+    x = _solve(
+        np.block([[M, C_used.T], [C_used, np.zeros((len(used), len(used)))]]),
+        np.concatenate([f, gamma[used]]),
     )
     data.SetODE2Coordinates_tt(x[: w * n])
-    multiplier = x[w * n :]
-    joint_rows = [chain.joint_rows(k) for k in range(len(chain.joints))]
-    pieces = [chain.first_piece[near] for near in chain.model.body[:, 1]]
-
-    def push(start: int, end: int) -> Array:
-        own = [slice(w * i + start, w * i + end) for i in pieces]
-        return np.array([-C[rows, at].T @ multiplier[rows] for at, rows in zip(own, joint_rows, strict=True)])
-
-    reaction, turning = push(0, 3), push(3, w)
+    multiplier[used] = x[w * n :]
+    pushes = []
+    for k, piece in enumerate(chain.first_piece[chain.model.body[:, 1]]):
+        rows, at = chain.joint_rows(k), w * piece
+        halves = C[rows, at : at + 3], C[rows, at + 3 : at + w]
+        pushes.append([-half.T @ multiplier[rows] for half in halves])
+    reaction, turning = (np.array(half) for half in zip(*pushes, strict=True))
     elements = _element_wrenches(chain)
     momentum = (M @ chain.qdot.ravel()).reshape(n, w)  # of θ̇ = B ω′: Bᵀ (…) = J ω′
     p = chain.state.p[chain.body_of_piece]
@@ -564,11 +548,9 @@ def _joint_moments(chain: ExudynChain, force: Array, of_p: Array) -> Array:
     With θ̇ = B ω′, A Bᵀ Q is the moment about the centre of the piece that the body hangs by.
     """
     near = chain.model.body[:, 1]
-    A = rotation_matrix(chain.state.p)[near]
-    rates = chain.rates[[chain.first_piece[i] for i in near]]
-    about_centre = rotate_vectors(rates.swapaxes(-1, -2), of_p)
-    centre = np.array([chain.piece_centre[chain.first_piece[i]] for i in near])
-    lever = rotate_vectors(A, chain.model.proximal - centre)
+    A, pieces = rotation_matrix(chain.state.p)[near], chain.first_piece[near]
+    about_centre = rotate_vectors(chain.rates[pieces].swapaxes(-1, -2), of_p)
+    lever = rotate_vectors(A, chain.model.proximal - chain.piece_centre[pieces])
     return np.asarray(rotate_vectors(A, about_centre) - cross(lever, force))
 
 
@@ -592,6 +574,12 @@ def _system_matrices(chain: ExudynChain) -> tuple[Array, Array, Array]:
         if not all(kind.has_attitude for kind in chain.model.kinds):
             chain.jacobian_rate = _rate_along_velocity(chain, constraint_jacobian)
         return M, f, C
+
+
+def _used_rows(chain: ExudynChain, C: Array) -> Indices:
+    """Return the rows of C to solve with: not the empty ones of free axes, nor those of loops that depend."""
+    used = np.flatnonzero(np.any(C != 0, axis=1))
+    return used[independent_rows(C[used])] if chain.model.has_loops else used
 
 
 def _rate_along_velocity(chain: ExudynChain, jacobian: Callable[[], Array]) -> Array:
