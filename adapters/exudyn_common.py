@@ -37,6 +37,11 @@ def changed_item(item: Mapping[str, Any], **given: Any) -> dict[str, Any]:
     return own | given
 
 
+def texts(owner: str, *names: str) -> str:
+    """The names of a class or module in one text."""
+    return " ".join(f"{owner}.{name}" for name in " ".join(names).split())
+
+
 LOADS = ("LoadForceVector", "LoadTorqueVector", "Force", "Torque")
 NEWTON_TOLERANCE = 1e-12  # relative and absolute; at the engine's defaults extrapolation stops at 2e-9
 MAX_NEWTON_TOLERANCE = 1e-10  # where positions of bodies far away are rounded more coarsely than the other

@@ -50,10 +50,10 @@ from adapters.exudyn_common import (
 from adapters.exudyn_surface import FEW_BODIES, Probes, pose_function
 from adapters.exudyn_variants import VARIANTS, Change, Joint, Piece
 from adapters.pose_functions import add_pose_answers
+from adapters.surface_record import Answer
 from plumbline.engines.variants import names_of_column, names_of_steps
 from plumbline.model.datatypes import (
     Array,
-    Call,
     EngineFailure,
     Float,
     Indices,
@@ -357,7 +357,7 @@ class Exudyn(ExudynAdapter):
         return parts | bodies | {"fields": fields}
 
     def _surface(self, model: Model, states: Sequence[State]) -> Sequence[SurfaceAnswer]:
-        found = list[dict[str, dict[Call, Array]]]()
+        found = list[Answer]()
         with silence_engine():
             for state in states:
                 chain = ExudynChain(model, state, has_probes=True)

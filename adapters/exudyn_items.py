@@ -25,11 +25,12 @@ from adapters.exudyn_common import (
     make_settings,
     make_system,
     sizes_of_body,
+    texts,
 )
 from adapters.pose_functions import Pose, about, turned
 from adapters.surface_record import SurfaceRecord
 from plumbline.engines.missing_names import add_parts
-from plumbline.model.datatypes import Array, Call, Float, Model, State
+from plumbline.model.datatypes import Array, Float, Model, State
 from plumbline.model.kinematics import (
     quaternion_exponential,
     quaternion_rate,
@@ -152,10 +153,6 @@ class _Items(SurfaceRecord):
         return [momenta[np.array(data.GetObjectLTGODE2(body))] for body in bodies]
 
 
-def _call(*names: str) -> Call:
-    return tuple(f"{ITEM}.{name}" for name in names)
-
-
 def add_item_answers(record: SurfaceRecord, model: Model, state: State) -> None:
     """Add what all items say of the bodies of a state."""
     bodies, anchor = bodies_at(model, state), anchor_point(model)
@@ -184,16 +181,16 @@ def _add_points(node_kind: str, body_kind: str, rows: Sequence[Sequence[int]]) -
                 along = {"referenceRotation": _to_x(own[0])} if rows is LINES else {}
                 points.append(s.body(body_kind, nodes[-1], mass=one.mass, **along))
         s.mbs.Assemble()
-        call = _call(node_kind, body_kind)
+        call = texts(ITEM, node_kind, body_kind)
         for quantity, output in (("body_position", "Position"), ("body_velocity", "Velocity")):
             values = np.array([s.of_body(point, output) for point in points])
             in_space = np.sum(values.reshape(-1, len(rows), 3), axis=1)  # of lines, which have directions
             s.add(quantity, call, _gathered(values, rows) if rows is PLANES else in_space)
-        s.add("body_velocity", (*call, MASS), _gathered(s.momenta(points), rows) / s.masses)
+        s.add("body_velocity", f"{call} {MASS}", _gathered(s.momenta(points), rows) / s.masses)
         if rows is SPACE:
             for output in ("Displacement", "Coordinates"):
                 halves = [s.mbs.GetNodeOutput(node, getattr(Output, output)) for node in nodes]
-                call = *_call(node_kind), f"OutputVariableType.{output}"
+                call = f"{ITEM}.{node_kind} OutputVariableType.{output}"
                 s.add("body_position", call, 2 * np.array(halves))
 
     return add
@@ -207,7 +204,7 @@ def _add_created_points(s: _Items) -> None:
     # before 1.10 with the node
     points = [point[-1] if isinstance(point, list) else point for point in points]
     s.mbs.Assemble()
-    call = ("MainSystem.CreateMassPoint",)
+    call = "MainSystem.CreateMassPoint"
     s.add("body_position", call, [s.of_body(point, "Position") for point in points])
     s.add("body_velocity", call, np.array(s.momenta(points)) / s.masses)
 
@@ -215,7 +212,7 @@ def _add_created_points(s: _Items) -> None:
 def _add_started_bodies(s: _Items) -> None:
     """Bodies that start elsewhere than at their reference, by half of their places and by a turn."""
     first, then = (rotation_matrix(quaternion_exponential(0.3 * axis)) for axis in AXES[:2])
-    call, bodies, attitude = ("MainSystem.CreateRigidBody",), [], first @ then
+    call, bodies, attitude = "MainSystem.CreateRigidBody", [], first @ then
     for one in s.bodies:
         given = {"referencePosition": one.place / 2, "initialDisplacement": one.place / 2}
         given |= {"referenceRotationMatrix": first, "initialRotationMatrix": then}
@@ -251,12 +248,12 @@ def _add_rotors(body_kind: str) -> Callable[[_Items], None]:
                 node = s.node("Node1D", **given)
                 rotors.append(s.body(body_kind, node, inertia=inertia, referenceRotation=frame))
         s.mbs.Assemble()
-        call = _call("Node1D", body_kind)
+        call = texts(ITEM, "Node1D", body_kind)
         turns = np.reshape([s.of_body(rotor, "RotationMatrix") for rotor in rotors], (-1, 3, 3, 3))
         s.add_axes(call, [x @ y @ z @ PROBE_TURN for x, y, z in turns @ np.array(frames).swapaxes(-1, -2)])
         spins = np.reshape([s.of_body(rotor, "AngularVelocity") for rotor in rotors], (-1, 3, 3))
         s.add("frame_angular_velocity", call, np.sum(spins, axis=1))
-        s.add("frame_angular_velocity", (*call, MASS), _gathered(s.momenta(rotors), LINES) / inertia)
+        s.add("frame_angular_velocity", f"{call} {MASS}", _gathered(s.momenta(rotors), LINES) / inertia)
 
     return add
 
@@ -287,7 +284,7 @@ def _add_plane_bodies(node_kind: str, body_kind: str, turning: str, sliding: str
         def read(output: str) -> list[Array]:
             return [s.of_body(body, output, point) for body, point in zip(bodies, points, strict=True)]
 
-        call, by = _call(node_kind, body_kind), "MainSystem.ComputeItem"
+        call, by = texts(ITEM, node_kind, body_kind), "MainSystem.ComputeItem"
         turns, momenta = np.tile(AXES, (len(bodies), 1, 1)), s.momenta(bodies)
         for i, turn in enumerate(read("RotationMatrix")):
             turns[i][np.ix_(PLANES[i % 3], PLANES[i % 3])] = turn.reshape(3, 3)[:2, :2]
@@ -296,15 +293,15 @@ def _add_plane_bodies(node_kind: str, body_kind: str, turning: str, sliding: str
         s.add("frame_velocity", call, 2 * _gathered(read("Velocity"), PLANES))
         spins = [spin[2] for spin in read("AngularVelocity")]
         s.add("frame_angular_velocity", call, np.reshape(spins, (-1, 3)))
-        s.add("body_velocity", (*call, MASS), 2 * _gathered(momenta, PLANES) / s.masses)
+        s.add("body_velocity", f"{call} {MASS}", 2 * _gathered(momenta, PLANES) / s.masses)
         spun = np.reshape([momentum[2] for momentum in momenta], (-1, 3))
-        s.add("frame_angular_velocity", (*call, MASS), spun / inertia)
+        s.add("frame_angular_velocity", f"{call} {MASS}", spun / inertia)
         held, first, second = np.reshape(s.jacobians(joints), (-1, 3, 2)).swapaxes(0, 1)
-        s.add("frame_velocity", (*_call(turning), by), 2 * _gathered(held, PLANES))
+        s.add("frame_velocity", f"{ITEM}.{turning} {by}", 2 * _gathered(held, PLANES))
         slid = np.stack([first[:, 0], second[:, 0]], axis=1)
-        s.add("frame_velocity", (*_call(sliding), by), 2 * _gathered(slid, PLANES))
+        s.add("frame_velocity", f"{ITEM}.{sliding} {by}", 2 * _gathered(slid, PLANES))
         turned = np.reshape(first[:, 1] - second[:, 1], (-1, 3)) / 2
-        s.add("frame_angular_velocity", (*_call(sliding), by), turned)
+        s.add("frame_angular_velocity", f"{ITEM}.{sliding} {by}", turned)
 
     return add
 
@@ -318,7 +315,7 @@ def _add_coordinate_constraints(s: _Items) -> None:
     points = [s.body("ObjectMassPoint", node, mass=1.0) for node in nodes]
     long, short = "ObjectConnectorCoordinate", "CoordinateConstraint"
     what, by_user = "OutputVariableType.ConstraintEquation", f"{long}OffsetUserFunction"
-    create, made = exudyn.MainSystem.CreateCoordinateConstraint, dict[Call, list[Any]]()
+    create, made = exudyn.MainSystem.CreateCoordinateConstraint, dict[str, list[Any]]()
     for node, point, one in zip(nodes, points, s.bodies, strict=True):
         halves = zip((one.place / 2).tolist(), (one.velocity / 2).tolist(), strict=True)
         for i, (place, velocity) in enumerate(halves):
@@ -328,21 +325,21 @@ def _add_coordinate_constraints(s: _Items) -> None:
                 "velocityLevel": True, "offsetUserFunction_t": lambda mbs, t, item, offset, x=velocity: x
             }  # fmt: skip
             for call, kind, given in (
-                ((*_call(long), what), long, {"factorValue1": 2.0}),
-                ((*_call(short), what), short, {}),
-                (_call(by_user), short, by_place),
-                (_call(f"{by_user}_t"), short, by_velocity),
+                (f"{ITEM}.{long} {what}", long, {"factorValue1": 2.0}),
+                (f"{ITEM}.{short} {what}", short, {}),
+                (f"{ITEM}.{by_user}", short, by_place),
+                (f"{ITEM}.{by_user}_t", short, by_velocity),
             ):
                 made.setdefault(call, []).append(s.object(kind, fixed, marker, **given))
             ends = items_argument(create, [None, point])
             joint = create(s.mbs, coordinates=[None, i], offset=place, **ends)
-            made.setdefault(("MainSystem.CreateCoordinateConstraint",), []).append(joint)
+            made.setdefault("MainSystem.CreateCoordinateConstraint", []).append(joint)
     s.mbs.Assemble()
     for (call, joints), factor in zip(made.items(), (0.5, 1.0, 2.0, 2.0, 2.0), strict=True):
-        quantity = "body_velocity" if call[0].endswith("_t") else "body_position"
+        quantity = "body_velocity" if call.endswith("_t") else "body_position"
         s.add(quantity, call, factor * s.of_objects(joints, "ConstraintEquation").reshape(-1, 3))
-    rates = s.jacobians(made[*_call(short), what]).reshape(-1, 3)
-    s.add("body_velocity", (*_call(short), "MainSystem.ComputeItem"), rates)
+    rates = s.jacobians(made[f"{ITEM}.{short} {what}"]).reshape(-1, 3)
+    s.add("body_velocity", f"{ITEM}.{short} MainSystem.ComputeItem", rates)
 
 
 def _add_vector_constraints(s: _Items) -> None:
@@ -362,9 +359,9 @@ def _add_vector_constraints(s: _Items) -> None:
     joints = {
         call: [s.object(kind, fixed, marker, **given) for marker in markers]
         for call, kind, markers, given in (
-            (_call(long, "MarkerNodeCoordinates"), long, of_nodes, own),
-            (_call(short, "MarkerObjectODE2Coordinates"), short, of_bodies, own),
-            (_call(f"{long}ConstraintUserFunction", f"{long}JacobianUserFunction"), long, of_nodes, law),
+            (texts(ITEM, long, "MarkerNodeCoordinates"), long, of_nodes, own),
+            (texts(ITEM, short, "MarkerObjectODE2Coordinates"), short, of_bodies, own),
+            (texts(ITEM, f"{long}ConstraintUserFunction {long}JacobianUserFunction"), long, of_nodes, law),
         )
     }
     s.mbs.Assemble()
@@ -391,14 +388,14 @@ def _add_relative_markers(s: _Items) -> None:
                 made.setdefault(kind, []).append(connector)
     s.mbs.Assemble()
     for kind, connectors in made.items():
-        call, is_shift = _call(kind), "Translation" in kind
-        call += ("MainSystem.CreateGround",) * is_shift
+        call, is_shift = f"{ITEM}.{kind}", "Translation" in kind
+        call += " MainSystem.CreateGround" * is_shift
         place, rate = (
             s.of_objects(connectors, output).reshape(-1, 3) for output in ("Displacement", "Velocity")
         )
         s.add("frame_velocity" if is_shift else "frame_angular_velocity", call, rate)
         if is_shift:
-            s.add("frame_position_from_anchor", (*call, "OutputVariableType.Displacement"), place)
+            s.add("frame_position_from_anchor", f"{call} OutputVariableType.Displacement", place)
         elif not kind.startswith(between):
             turns = np.array([turned(angles) @ PROBE_TURN for angles in place])
             s.add("frame_axes_by_angles", call, np.reshape(turns.swapaxes(-1, -2), (-1, 3)))
@@ -424,20 +421,20 @@ def _add_connectors(s: _Items) -> None:
     )
     s.mbs.Assemble()
     away, what = "frame_position_from_anchor", "OutputVariableType."
-    s.add(away, (*_call("SensorObject"), f"{what}Force"), s.sensed(forces) / 2)
-    s.add("frame_distance", (*_call("SensorObject"), f"{what}Distance"), s.sensed(distances).reshape(-1, 1))
+    s.add(away, f"itemInterface.SensorObject {what}Force", s.sensed(forces) / 2)
+    s.add("frame_distance", f"itemInterface.SensorObject {what}Distance", s.sensed(distances).reshape(-1, 1))
     for quantity, output, size in (
         (away, "DisplacementLocal", 1),
         ("frame_velocity", "ForceLocal", 3),
         ("frame_angular_velocity", "TorqueLocal", 3),
     ):
-        s.add(quantity, (f"{what}{output}",), s.of_objects(six, output) @ turn.T / size)
+        s.add(quantity, f"{what}{output}", s.of_objects(six, output) @ turn.T / size)
     energies = s.of_objects(spring, "PotentialEnergy")  # of a stiffness of 2 N/m
-    s.add("frame_distance", (f"{what}PotentialEnergy",), np.sqrt(energies)[:, None])
+    s.add("frame_distance", f"{what}PotentialEnergy", np.sqrt(energies)[:, None])
     poses = s.of_objects(six, "HomogeneousTransformationLocal").reshape(-1, 4, 4)
-    s.add(away, (f"{what}HomogeneousTransformationLocal",), poses[:, :3, 3] @ turn.T)
-    s.add_axes((f"{what}HomogeneousTransformationLocal",), turn @ poses[:, :3, :3] @ turn)
-    s.add(away, _call("ObjectJointGenericOffsetUserFunction"), s.equations(joint)[:, :3] + shift)
+    s.add(away, f"{what}HomogeneousTransformationLocal", poses[:, :3, 3] @ turn.T)
+    s.add_axes(f"{what}HomogeneousTransformationLocal", turn @ poses[:, :3, :3] @ turn)
+    s.add(away, "itemInterface.ObjectJointGenericOffsetUserFunction", s.equations(joint)[:, :3] + shift)
 
 
 def _add_loads(s: _Items) -> None:
@@ -459,11 +456,11 @@ def _add_loads(s: _Items) -> None:
     sensors = [s.sensor("SensorLoad", loadNumber=load) for load in loads]
     mbs.Assemble()
     for call, values in (
-        (("MainSystem.GetLoadValues",), [mbs.GetLoadValues(load) for load in loads]),
-        (_call("SensorLoad"), s.sensed(sensors)),
-        (("MainSystem.SetLoadParameter",), [mbs.GetLoadValues(load) for load in later]),
-        (("MainSystem.ModifyLoad",), [mbs.GetLoadValues(load) for load in changed]),
-        (("MainSystem.GetLoadParameter",), [mbs.GetLoadParameter(load, "loadVector") for load in later]),
+        ("MainSystem.GetLoadValues", [mbs.GetLoadValues(load) for load in loads]),
+        ("itemInterface.SensorLoad", s.sensed(sensors)),
+        ("MainSystem.SetLoadParameter", [mbs.GetLoadValues(load) for load in later]),
+        ("MainSystem.ModifyLoad", [mbs.GetLoadValues(load) for load in changed]),
+        ("MainSystem.GetLoadParameter", [mbs.GetLoadParameter(load, "loadVector") for load in later]),
     ):
         s.add("body_position", call, np.array(values) / s.masses)
 
@@ -495,10 +492,10 @@ def _add_parameters(s: _Items) -> None:
          [s.of_body(body, "Position", arm) for body, arm in zip(bodies, arms, strict=True)]),
         ("GetSensorParameter", [mbs.GetMarkerOutput(one, position) for one in read]),
     ):  # fmt: skip
-        s.add("frame_position", (f"MainSystem.{name}",), values)
+        s.add("frame_position", f"MainSystem.{name}", values)
     nodes = [mbs.GetObjectParameter(one, "nodeNumber") for one in bodies]
     places = [mbs.GetNodeParameter(node, "referenceCoordinates")[:3] for node in nodes]
-    s.add("body_position", ("MainSystem.GetNodeParameter",), places)
+    s.add("body_position", "MainSystem.GetNodeParameter", places)
 
 
 def _add_algebraic_coordinates(s: _Items) -> None:
@@ -508,7 +505,7 @@ def _add_algebraic_coordinates(s: _Items) -> None:
     s.mbs.Assemble()
     s.mbs.systemData.SetAECoordinates(s.places.ravel())
     found = np.array(s.mbs.GetNodeOutput(node, Output.Coordinates)).reshape(-1, 3)
-    s.add("body_position", (*_call("NodeGenericAE"), "SystemData.SetAECoordinates"), found)
+    s.add("body_position", "itemInterface.NodeGenericAE SystemData.SetAECoordinates", found)
 
 
 def _add_linear_systems(s: _Items) -> None:
@@ -528,7 +525,7 @@ def _add_linear_systems(s: _Items) -> None:
         solver.SetSystemJacobian(0 * K)
         solver.ComputeJacobianODE2RHS(s.mbs, scalarFactor_ODE2=-1.0, scalarFactor_ODE2_t=0.0)
         jacobian = np.array(solver.GetSystemJacobian())
-    call = *_call("ObjectGenericODE2JacobianUserFunction"), f"{IMPLICIT}.ComputeJacobianODE2RHS"
+    call = f"itemInterface.ObjectGenericODE2JacobianUserFunction {IMPLICIT}.ComputeJacobianODE2RHS"
     s.add("body_position", call, np.sign(s.places) * np.diag(jacobian).reshape(-1, 3) / 2)
     order, found = np.argsort(sizes, kind="stable"), np.zeros(len(sizes))
     module: Any = exudyn
@@ -536,7 +533,7 @@ def _add_linear_systems(s: _Items) -> None:
     for owner, function in (("", partial(module.ComputeODE2Eigenvalues, s.mbs)),
                             ("MainSystem.", s.mbs.ComputeODE2Eigenvalues)):  # fmt: skip
         found[order] = np.sort(function()[0])
-        s.add("body_position", (f"{owner}{name}",), np.sign(s.places) * found.reshape(-1, 3))
+        s.add("body_position", f"{owner}{name}", np.sign(s.places) * found.reshape(-1, 3))
 
 
 def _add_equations(s: _Items) -> None:
@@ -554,7 +551,7 @@ def _add_equations(s: _Items) -> None:
             solver.ComputeAlgebraicEquations(s.mbs, is_velocity)
             own = np.array(solver.GetSystemResidual())[solver.GetODE2size() :]
             found = [own[np.array(data.GetObjectLTGAE(joint))] for joint in joints]
-            s.add(quantity, (f"{IMPLICIT}.ComputeAlgebraicEquations",), found)
+            s.add(quantity, f"{IMPLICIT}.ComputeAlgebraicEquations", found)
 
 
 def _plucker_inertia(one: Body) -> Array:
@@ -600,7 +597,7 @@ def _add_inertias(s: _Items) -> None:
             np.cross(one.place - centre, one.mass * one.velocity) + one.turn @ J @ one.turn.T @ one.spin
             for one, J in zip(bodies, inertias, strict=True)
         )
-        s.add("centroidal_angular_momentum", (name,), total)
+        s.add("centroidal_angular_momentum", name, total)
 
     given = [one.inertia[[0, 1, 2, 1, 0, 0], [0, 1, 2, 2, 2, 1]] for one in bodies]
     add("rigidBodyUtilities.Inertia6D2InertiaTensor", [utilities.Inertia6D2InertiaTensor(x) for x in given])
@@ -630,7 +627,7 @@ def _add_robots(s: _Items) -> None:
         before = np.linalg.inv(base) @ _pose(one.turn, one.place) @ back
         robot.AddLink(robots.RobotLink(one.mass, [0.0] * 3, AXES, jointType="Rz", preHT=before))
         poses.append(np.array(robot.JointHT([angle])[0]) @ np.array(robot.GetToolHT()))
-    call, found = ("robotics.RobotBase", "robotics.RobotTool"), np.array(poses)
+    call, found = "robotics.RobotBase robotics.RobotTool", np.array(poses)
     s.add("frame_position", call, found[:, :3, 3])
     s.add_axes(call, found[:, :3, :3])
 

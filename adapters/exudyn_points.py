@@ -31,6 +31,7 @@ from adapters.exudyn_common import (
     set_explicit_method,
     set_linear_solver,
     sizes_of_body,
+    texts,
 )
 from adapters.exudyn_variants import INITIALISATION
 from adapters.surface_record import SurfaceRecord
@@ -69,55 +70,51 @@ RUNGE_KUTTA = {"solverType": "RK44"}
 LIE = "generalizedAlpha.lieGroup"
 
 
-def _names(owner: str, text: str) -> tuple[str, ...]:
-    return tuple(f"{owner}.{name}" for name in text.split())
-
-
-Step = tuple[tuple[str, ...], Mapping[str, Any], Factors]
+Step = tuple[str, Mapping[str, Any], Factors]
 # By names of settings their values, relative to those of time integration, and what the step makes of r.
 STEPS: Sequence[Step] = (
-    (_names("GeneralizedAlphaSettings", "newmarkBeta newmarkGamma"),
+    ("GeneralizedAlphaSettings.newmarkBeta GeneralizedAlphaSettings.newmarkGamma",
      NEWMARK | {"generalizedAlpha.newmarkBeta": 0.3, "generalizedAlpha.newmarkGamma": 0.6},
      _factors(0.6, 0.3)),
-    (_names("GeneralizedAlphaSettings", "resetAccelerations"),
+    ("GeneralizedAlphaSettings.resetAccelerations",
      NEWMARK | {"generalizedAlpha.computeInitialAccelerations": False,
                 "generalizedAlpha.resetAccelerations": True}, _factors(0.5, 0.25, first=0.0)),
-    (_names("TimeIntegrationSettings", "startTime"), NEWMARK | {"startTime": 0.5, "endTime": 1.5},
+    ("TimeIntegrationSettings.startTime", NEWMARK | {"startTime": 0.5, "endTime": 1.5},
      _factors(0.5, 0.25, 1.5, (1.5, 2.5))),
-    (_names("TimeIntegrationSettings", "reuseConstantMassMatrix"),
+    ("TimeIntegrationSettings.reuseConstantMassMatrix",
      NEWMARK | {"reuseConstantMassMatrix": False}, BY_NEWMARK),
-    (_names("TimeIntegrationSettings", "computeLoadsJacobian"), NEWMARK | {"computeLoadsJacobian": 1},
+    ("TimeIntegrationSettings.computeLoadsJacobian", NEWMARK | {"computeLoadsJacobian": 1},
      _pulled(0.5, 0.25)),
-    (_names("NewtonSettings", "active"), NEWMARK | {"newton.active": False, "newton.maxIterations": 1},
+    ("NewtonSettings.active", NEWMARK | {"newton.active": False, "newton.maxIterations": 1},
      BY_NEWMARK),
-    (_names("NewtonSettings", "useNewtonSolver"),
+    ("NewtonSettings.useNewtonSolver",
      NEWMARK | {"newton.useNewtonSolver": False, "newton.maxIterations": 1}, BY_NEWMARK),
-    (_names("ExplicitIntegrationSettings", "computeMassMatrixInversePerBody"),
+    ("ExplicitIntegrationSettings.computeMassMatrixInversePerBody",
      RUNGE_KUTTA | {"explicit.computeMassMatrixInversePerBody": True}, EXACT),
-    (_names("ExplicitIntegrationSettings", "useLieGroupIntegration"),
+    ("ExplicitIntegrationSettings.useLieGroupIntegration",
      RUNGE_KUTTA | {"explicit.useLieGroupIntegration": False}, EXACT),
-    (_names("TimeIntegrationSettings", "explicitIntegration"),
+    ("TimeIntegrationSettings.explicitIntegration",
      {"explicitIntegration.dynamicSolverType": "RK44",
       "explicitIntegration.computeMassMatrixInversePerBody": True}, EXACT),
-    *(((f"LinearSolverType.{name}",), {"linear solver": name} | RUNGE_KUTTA, EXACT)
+    *((f"LinearSolverType.{name}", {"linear solver": name} | RUNGE_KUTTA, EXACT)
       for name in ("EigenDense", "EXUdense")),
 )  # fmt: skip
 # By names of Newton's settings their values, at the search for the root of a cubic equation.
-ROOTS: Sequence[tuple[tuple[str, ...], Mapping[str, Any]]] = (
-    (("SolveStatic", "MainSystem.SolveStatic", "StaticSolverSettings"), {}),
-    (_names("NewtonSettings", "adaptInitialResidual"), {"adaptInitialResidual": True}),
-    (_names("NewtonSettings", "maximumSolutionNorm"), {"maximumSolutionNorm": 1e60}),
-    (_names("NewtonSettings", "weightTolerancePerCoordinate"), {"weightTolerancePerCoordinate": True}),
-    (_names("NewtonSettings", "residualMode"), {"residualMode": 1}),
-    (_names("NewtonSettings", "newtonResidualMode"), {"newtonResidualMode": 1}),
-    (("NewtonSettings.numericalDifferentiation", "NumericalDifferentiationSettings"),
+ROOTS: Sequence[tuple[str, Mapping[str, Any]]] = (
+    ("SolveStatic MainSystem.SolveStatic StaticSolverSettings", {}),
+    ("NewtonSettings.adaptInitialResidual", {"adaptInitialResidual": True}),
+    ("NewtonSettings.maximumSolutionNorm", {"maximumSolutionNorm": 1e60}),
+    ("NewtonSettings.weightTolerancePerCoordinate", {"weightTolerancePerCoordinate": True}),
+    ("NewtonSettings.residualMode", {"residualMode": 1}),
+    ("NewtonSettings.newtonResidualMode", {"newtonResidualMode": 1}),
+    ("NewtonSettings.numericalDifferentiation NumericalDifferentiationSettings",
      {"numericalDifferentiation.relativeEpsilon": 1e-6, "numericalDifferentiation.minimumCoordinateSize": 0.1,
       "numericalDifferentiation.doSystemWideDifferentiation": True}),
-    (_names("NewtonSettings", "modifiedNewtonContractivity maxModifiedNewtonIterations"),
+    ("NewtonSettings.modifiedNewtonContractivity NewtonSettings.maxModifiedNewtonIterations",
      {"useModifiedNewton": True, "modifiedNewtonContractivity": 0.1, "maxModifiedNewtonIterations": 3}),
-    (_names("NewtonSettings", "maxModifiedNewtonRestartIterations"),
+    ("NewtonSettings.maxModifiedNewtonRestartIterations",
      {"useModifiedNewton": True, "maxModifiedNewtonRestartIterations": 2}),
-    (_names("NewtonSettings", "modifiedNewtonJacUpdatePerStep"),
+    ("NewtonSettings.modifiedNewtonJacUpdatePerStep",
      {"useModifiedNewton": True, "modifiedNewtonJacUpdatePerStep": True}),
 )  # fmt: skip
 
@@ -174,11 +171,11 @@ class _Points:
         x, v = (np.reshape(x, (-1, 3)) for x in (data.GetODE2Coordinates(), data.GetODE2Coordinates_t()))
         return x, v
 
-    def add(self, names: Sequence[str], directions: Any) -> None:
+    def add(self, names: str, directions: Any) -> None:
         """Add positions of bodies, by their directions in a row."""
-        self.record.add("body_position", tuple(names), np.reshape(directions, (-1, 3)) * self.lengths)
+        self.record.add("body_position", names, np.reshape(directions, (-1, 3)) * self.lengths)
 
-    def add_results(self, names: Sequence[str], results: tuple[Array, Array], factors: Factors) -> None:
+    def add_results(self, names: str, results: tuple[Array, Array], factors: Factors) -> None:
         """Add the mean of what places and velocities give."""
         x, v = (value / factor for value, factor in zip(results, factors, strict=True))
         self.add(names, (x + v) / 2)
@@ -249,13 +246,13 @@ def add_point_answers(record: SurfaceRecord, state: State) -> None:
     )
 
 
-def _add_step(points: _Points, names: Any, options: Any, factors: Factors) -> None:
+def _add_step(points: _Points, names: str, options: Any, factors: Factors) -> None:
     mbs = points.system(pull=PULL * ("computeLoadsJacobian" in options))
     _solve(mbs, options)
     points.add_results(names, points.read(mbs), factors)
 
 
-def _add_root(points: _Points, names: Any, options: Mapping[str, Any]) -> None:
+def _add_root(points: _Points, names: str, options: Mapping[str, Any]) -> None:
     """Find the displacement x at which m (1 + |x|²) x / 2 is the load m u: it is u."""
 
     def spring(mbs: Any, markers: Any, k: int) -> None:
@@ -299,7 +296,7 @@ def _add_adaptive_steps(points: _Points) -> None:
         mbs = points.system(is_lawful=lambda: len(trials) > failures)  # noqa: B023
         mbs.SetPreStepUserFunction(count)
         found = _after_step(points, mbs, adaptive | options, step)
-        points.add_results(_names("TimeIntegrationSettings", names), found, _exact(time))
+        points.add_results(texts("TimeIntegrationSettings", names), found, _exact(time))
 
 
 def _exact(t: float) -> Factors:
@@ -342,7 +339,7 @@ def _add_automatic_steps(points: _Points) -> None:
     ):  # fmt: skip
         mbs = own.system()
         x, v = _after_step(own, mbs, {"solverType": "ODE23"} | options | more, 2)
-        signs, call = np.sign(points.places), _names("TimeIntegrationSettings", names)
+        signs, call = np.sign(points.places), texts("TimeIntegrationSettings", names)
         points.add_results(call, (signs * x, signs * v), _exact(h + second))
 
 
@@ -373,7 +370,7 @@ def _add_parts_of_a_step(points: _Points) -> None:
         )
         own = "alphaF alphaM factJacAlgorithmic newmarkBeta newmarkGamma spectralRadius"
         ends = x - change, v - gamma / beta * change
-        points.add_results(_names(IMPLICIT, f"{by} {own}"), ends, factors)
+        points.add_results(texts(IMPLICIT, f"{by} {own}"), ends, factors)
 
 
 def _add_whole_steps(points: _Points) -> None:
@@ -393,13 +390,13 @@ def _add_whole_steps(points: _Points) -> None:
         solver.SolveSteps(mbs, settings)
         mbs.SetPostStepUserFunction(0)
         factors = _factors(gamma, beta, forces=(1.0, last))
-        points.add_results(_names(IMPLICIT, "SolveSteps"), points.read(mbs), factors)
+        points.add_results(f"{IMPLICIT}.SolveSteps", points.read(mbs), factors)
         for name, value in (
             ("GetStartOfStepStateAAlgorithmic", kept[-1]),
             ("GetAAlgorithmic", np.array(solver.GetAAlgorithmic()) / last),
             ("GetNewtonSolution", -np.array(solver.GetNewtonSolution()) / (2 * beta * (1 - af) / (1 - am))),
         ):
-            points.add(_names(IMPLICIT, name), value)
+            points.add(texts(IMPLICIT, name), value)
 
 
 def _add_changed_newton(points: _Points) -> None:
@@ -411,7 +408,7 @@ def _add_changed_newton(points: _Points) -> None:
         solver.newton = newton
         solver.SolveSteps(mbs, settings)
         factors = _factors(0.5, 0.25, forces=(1.0, last))
-        points.add_results(_names(IMPLICIT, "newton"), points.read(mbs), factors)
+        points.add_results(f"{IMPLICIT}.newton", points.read(mbs), factors)
 
 
 def _add_changed_steps(points: _Points) -> None:
@@ -426,10 +423,10 @@ def _add_changed_steps(points: _Points) -> None:
                 solver.it.currentStepSize = start
                 getattr(solver, name)(mbs, settings, *arguments)
                 call_parts(solver, "UpdateCurrentTime InitializeStep Newton FinishStep", mbs, settings)
-                points.add_results(_names(kind, f"{name} {by}"), points.read(mbs), _exact(end))
+                points.add_results(texts(kind, f"{name} {by}"), points.read(mbs), _exact(end))
         with _initialized(points, options, kind) as (solver, *_):
             solver.SetSystemMassMatrix(np.diag(points.places.ravel()))
-            points.add(_names(kind, "SetSystemMassMatrix"), np.diag(solver.GetSystemMassMatrix()))
+            points.add(f"{kind}.SetSystemMassMatrix", np.diag(solver.GetSystemMassMatrix()))
 
 
 def _add_own_functions(points: _Points) -> None:
@@ -453,7 +450,7 @@ def _add_own_functions(points: _Points) -> None:
             solver.SolveSteps(mbs, settings)
         found = ends[-1] if "FinishStep" in functions else points.read(mbs)
         names = " ".join(f"SetUserFunction{name}" for name in functions if name != "PostNewton")
-        points.add_results(_names(IMPLICIT, names), found, EXACT)
+        points.add_results(texts(IMPLICIT, names), found, EXACT)
 
 
 def _own_time(solver: Any, mbs: Any, settings: Any) -> bool:
@@ -503,11 +500,11 @@ def _own_jacobian(masses: Array, solver: Any, mbs: Any, settings: Any) -> bool:
 
 def _add_initialisation(points: _Points) -> None:
     """Initialise an explicit solver, and call the parts of it again."""
-    parts = " ".join(x for x in INITIALISATION if x != "InitializeSolverOutput")
+    parts = INITIALISATION.replace(" InitializeSolverOutput", "")
     with _initialized(points, RUNGE_KUTTA, EXPLICIT) as (solver, mbs, settings):
         call_parts(solver, f"InitializeSolverPreChecks {parts}", mbs, settings)
         solver.SolveSteps(mbs, settings)
-    names = _names(EXPLICIT, f"InitializeSolverPreChecks {parts}")
+    names = texts(EXPLICIT, f"InitializeSolverPreChecks {parts}")
     points.add_results(names, points.read(mbs), EXACT)
 
 
@@ -520,7 +517,7 @@ def _add_stored(points: _Points) -> None:
     mbs.Assemble()
     _solve(mbs, LINEAR, stores=True)
     stored = np.array([mbs.GetSensorStoredData(sensor)[-1] for sensor in sensors])  # time and values
-    points.add(("MainSystem.GetSensorStoredData",), stored[:, 1:] / EXACT[1])
+    points.add("MainSystem.GetSensorStoredData", stored[:, 1:] / EXACT[1])
 
 
 def _add_held(points: _Points) -> None:
@@ -543,12 +540,12 @@ def _add_held(points: _Points) -> None:
     _set(settings.timeIntegration, "generalizedAlpha.storeInitialAlgebraicCoordinates", True)
     with initialized_solver(solver, mbs, settings):
         force = np.array(mbs.systemData.GetAECoordinates()).reshape(-1, 3)
-    call = ("GeneralizedAlphaSettings.storeInitialAlgebraicCoordinates", "itemInterface.CoordinateConstraint")
+    of_item = "itemInterface.CoordinateConstraint"
+    call = f"GeneralizedAlphaSettings.storeInitialAlgebraicCoordinates {of_item}"
     points.add(call, force / points.mass[:, None])
     _solve(mbs, RUNGE_KUTTA | {"explicit.eliminateConstraints": True})
     velocities = np.array(mbs.systemData.GetODE2Coordinates_t()).reshape(2, -1, 3)
-    call = "ExplicitIntegrationSettings.eliminateConstraints", "itemInterface.CoordinateConstraint"
-    points.add(call, np.sum(velocities, axis=0))
+    points.add(f"ExplicitIntegrationSettings.eliminateConstraints {of_item}", np.sum(velocities, axis=0))
 
 
 PARTS: Sequence[Callable[[_Points], None]] = (
@@ -562,11 +559,11 @@ def _add_turns(record: SurfaceRecord, state: State) -> None:
     before = [quaternion_product(p, quaternion_exponential(-TURN / 2)) for p in state.p]
     simplified = "GeneralizedAlphaSettings.lieGroupSimplifiedKinematicRelations"
     for names, options in (
-        ((simplified, "GeneralizedAlphaSettings.lieGroupAddTangentOperator"),
+        (f"{simplified} GeneralizedAlphaSettings.lieGroupAddTangentOperator",
          {f"{LIE}SimplifiedKinematicRelations": True, f"{LIE}AddTangentOperator": True,
           "linear solver": "EXUdense"}),
-        ((simplified,), {f"{LIE}SimplifiedKinematicRelations": False}),
-        (("ExplicitIntegrationSettings.useLieGroupIntegration",),
+        (simplified, {f"{LIE}SimplifiedKinematicRelations": False}),
+        ("ExplicitIntegrationSettings.useLieGroupIntegration",
          RUNGE_KUTTA | {"explicit.useLieGroupIntegration": True}),
     ):  # fmt: skip
         mbs, _container = make_system()

@@ -189,9 +189,9 @@ class Probes(SurfaceRecord):
             for name, quantity, of in outputs:
                 output, member = getattr(Output, name), f"OutputVariableType.{name}"
                 direct = [read(item, output, *point) for item, *point in (x.values() for x in places)]
-                self.add(quantity, (f"MainSystem.{function}", member), of(np.array(direct)))
+                self.add(quantity, f"MainSystem.{function} {member}", of(np.array(direct)))
                 sensed = [mbs.GetSensorValues(sensor) for sensor in self.sensors[kind, name, quantity]]
-                call = "MainSystem.GetSensorValues", f"itemInterface.{kind}", member
+                call = f"MainSystem.GetSensorValues itemInterface.{kind} {member}"
                 self.add(quantity, call, of(np.array(sensed)))
         add_parts(
             self.found,
@@ -203,12 +203,12 @@ class Probes(SurfaceRecord):
         for kind, markers in self.markers_of_centres.items():
             for name, quantity in (("Position", "body_position"), ("Velocity", "body_velocity")):
                 values = [mbs.GetMarkerOutput(marker, getattr(Output, name)) for marker in markers]
-                self.add(quantity, (f"itemInterface.{kind}",), values)
+                self.add(quantity, f"itemInterface.{kind}", values)
         # not GetODE2CoordinatesTotal, which corrupts memory (docs/surface/exudyn_coordinates_total.py)
         reference = exudyn.ConfigurationType.Reference
         total = np.array(data.GetODE2Coordinates(reference)) + data.GetODE2Coordinates()
         for kind in ("Node", "Object"):
-            by = f"SystemData.Get{kind}LTGODE2", "ConfigurationType.Reference"
+            by = f"SystemData.Get{kind}LTGODE2 ConfigurationType.Reference"
             self.add("body_position", by, self._own(total, kind))
 
     def add_once(self, model: Model, state: State) -> None:
@@ -222,7 +222,7 @@ class Probes(SurfaceRecord):
         name, module = "ComputeSystemDegreeOfFreedom", cast("Any", exudyn)
         for call, compute in ((name, partial(module.ComputeSystemDegreeOfFreedom, self.mbs)),
                               (f"MainSystem.{name}", self.mbs.ComputeSystemDegreeOfFreedom)):  # fmt: skip
-            self.add("degrees_of_freedom", (call,), compute()["degreeOfFreedom"])
+            self.add("degrees_of_freedom", call, compute()["degreeOfFreedom"])
 
     def _own(self, values: Any, kind: str = "Node") -> list[Array]:
         """The first three of each body's or node's own coordinates, of those of the system."""
@@ -232,17 +232,17 @@ class Probes(SurfaceRecord):
 
     def _add_coordinates(self, name: str, quantity: str) -> None:
         values = [self.mbs.GetNodeOutput(node, getattr(Output, name))[:3] for node in self.nodes]
-        self.add(quantity, ("MainSystem.GetNodeOutput", f"OutputVariableType.{name}"), values)
+        self.add(quantity, f"MainSystem.GetNodeOutput OutputVariableType.{name}", values)
 
     def _add_sums(self) -> None:
         values = np.array([self.mbs.GetSensorValues(sensor) for sensor in self.sums])
-        call = "itemInterface.SensorUserFunction", "itemInterface.SensorUserFunctionSensorUserFunction"
+        call = "itemInterface.SensorUserFunction itemInterface.SensorUserFunctionSensorUserFunction"
         self.add("frame_velocity", call, values / 2)
 
     def _add_configuration(self, name: str) -> None:
         rates = self.mbs.systemData.GetODE2Coordinates_t(getattr(exudyn.ConfigurationType, name))
-        self.add("body_velocity", (f"ConfigurationType.{name}",), self._own(rates))
+        self.add("body_velocity", f"ConfigurationType.{name}", self._own(rates))
 
     def _add_dictionary(self) -> None:
         rates = self.mbs.systemData.GetSystemStateDict()["ODE2Coords_t"]
-        self.add("body_velocity", ("SystemData.GetSystemStateDict",), self._own(rates))
+        self.add("body_velocity", "SystemData.GetSystemStateDict", self._own(rates))

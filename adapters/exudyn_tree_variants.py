@@ -23,8 +23,9 @@ from adapters.exudyn_common import (
     make_settings,
     set_explicit_method,
     set_linear_solver,
+    texts,
 )
-from adapters.exudyn_variants import is_open, of_ways, texts
+from adapters.exudyn_variants import is_open, of_ways
 from plumbline.engines.variants import both, has, variants_of
 from plumbline.model.datatypes import Array, EngineFailure, Float, Model
 
@@ -161,7 +162,7 @@ BEGIN, BY_NEWTON = "UpdateCurrentTime InitializeStep", "UpdateCurrentTime Initia
 STEPS: Mapping[str, Callable[[Any, Any], bool]] = {
     "SolveDynamic": lambda mbs, settings: bool(exudyn.SolveDynamic(mbs, settings, solverType=EULER)),
     "MainSystem.SolveDynamic": lambda mbs, settings: bool(mbs.SolveDynamic(settings, solverType=EULER)),
-    f"DynamicSolverType.ExplicitEuler {texts(EXPLICIT, *BY_NEWTON.split())}": _run_by_parts(BY_NEWTON),
+    f"DynamicSolverType.ExplicitEuler {texts(EXPLICIT, BY_NEWTON)}": _run_by_parts(BY_NEWTON),
     f"{EXPLICIT}.DiscontinuousIteration": _run_by_parts(f"{BEGIN} DiscontinuousIteration FinishStep"),
     f"{EXPLICIT}.SolveSteps": _run_by_parts("SolveSteps"),
 }

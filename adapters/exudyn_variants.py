@@ -26,6 +26,7 @@ from adapters.exudyn_common import (
     known_arguments,
     make_rigid_body,
     sizes_of_body,
+    texts,
 )
 from adapters.pose_functions import Pose, rate_maps
 from plumbline.engines.variants import Variant, both, has, variants_of
@@ -217,7 +218,7 @@ def _ball_of_generic(mbs: Any, joint: Joint) -> Any:
 
 
 def _assemble_by_parts(mbs: Any) -> None:
-    call_parts(mbs, " ".join(ASSEMBLY))
+    call_parts(mbs, ASSEMBLY)
     mbs.systemIsConsistent = True  # which only Assemble finds out
 
 
@@ -230,10 +231,7 @@ def _assemble_and_set_state(mbs: Any) -> None:
     data.SetSystemState(state)
 
 
-ASSEMBLY = (
-    "AssembleCoordinates", "AssembleLTGLists", "AssembleInitializeSystemCoordinates",
-    "AssembleSystemInitialize",
-)  # fmt: skip
+ASSEMBLY = "AssembleCoordinates AssembleLTGLists AssembleInitializeSystemCoordinates AssembleSystemInitialize"
 
 
 @dataclass(frozen=True)
@@ -460,14 +458,14 @@ def _initialize_by_parts(solver: Any, mbs: Any, settings: Any) -> bool:
     """Initialise, and call the parts of it again: without the whole before them they are refused later."""
     if not solver.InitializeSolver(mbs, settings) or not solver.InitializeSolverPreChecks(mbs, settings):
         return False
-    call_parts(solver, " ".join(INITIALISATION), mbs, settings)
+    call_parts(solver, INITIALISATION, mbs, settings)
     return True
 
 
 INITIALISATION = (
-    "InitializeSolverData", "PreInitializeSolverSpecific", "InitializeSolverOutput",
-    "InitializeSolverInitialConditions", "PostInitializeSolverSpecific",
-)  # fmt: skip
+    "InitializeSolverData PreInitializeSolverSpecific InitializeSolverOutput "
+    "InitializeSolverInitialConditions PostInitializeSolverSpecific"
+)
 
 
 def _mass_matrix_of_items(chain: Any, M: Array) -> Array:
@@ -501,11 +499,6 @@ def _is_rod(kind: JointKind) -> bool:
     return kind.holds_distance
 
 
-def texts(owner: str, *names: str) -> str:
-    """The names of a class or module."""
-    return " ".join(f"{owner}.{name}" for name in names)
-
-
 VARIANTS = (
     _spelling(
         "itemInterface.NodeRigidBodyRxyz",
@@ -536,11 +529,11 @@ VARIANTS = (
         "MainSystem.SetNodeParameter MainSystem.SetObjectParameter", add_body=_set_later(modifies=False)
     ),
     _spelling("MainSystem.ModifyNode MainSystem.ModifyObject", add_body=_set_later(modifies=True)),
-    _option(texts("MainSystem", *ASSEMBLY, "systemIsConsistent"), assemble=_assemble_by_parts),
+    _option(texts("MainSystem", ASSEMBLY, "systemIsConsistent"), assemble=_assemble_by_parts),
     _option("SystemData.GetSystemState SystemData.SetSystemState", assemble=_assemble_and_set_state),
     *of_ways(_spelling),
     _option(
-        texts(IMPLICIT, "InitializeSolverPreChecks", *INITIALISATION), initialize=_initialize_by_parts
+        texts(IMPLICIT, "InitializeSolverPreChecks", INITIALISATION), initialize=_initialize_by_parts
     ),
     _option("MainSolverStatic", solver=lambda: exudyn.MainSolverStatic()),
     _option(

@@ -44,19 +44,19 @@ def _add_motions(s: Probed) -> None:
         ("cdof_dot", rates, "acceleration", turned),
     ):
         spin, at = _at_point(s, vectors)
-        s.add(f"frame_{moving}", (f"MjData.{name}",), at + added)
-        s.add(f"frame_angular_{moving.removeprefix('proper_')}", (f"MjData.{name}",), spin)
+        s.add(f"frame_{moving}", f"MjData.{name}", at + added)
+        s.add(f"frame_angular_{moving.removeprefix('proper_')}", f"MjData.{name}", spin)
     moved, roots = np.zeros((len(s.links), 6)), d.subtree_com[m.body_rootid[s.links]]
     for body, site, old, out in zip(s.links, s.sites, roots, moved, strict=True):
         mujoco.mju_transformSpatial(out, d.cvel[body], 0, d.site_xpos[site], old, d.site_xmat[site])
     quantities = "frame_angular_velocity_local", "frame_velocity_local"
-    s.add_halves(quantities, ("mju_transformSpatial",), moved)
+    s.add_halves(quantities, "mju_transformSpatial", moved)
 
 
 def _add_views(s: Probed) -> None:
     """Read by named views, and the sensors from the array of all."""
-    s.add("body_position", ("MjData.body",), [s.d.body(b).xpos for b in s.links])
-    s.add("frame_position", ("MjData.site",), [s.d.site(site).xpos for site in s.sites])
+    s.add("body_position", "MjData.body", [s.d.body(b).xpos for b in s.links])
+    s.add("frame_position", "MjData.site", [s.d.site(site).xpos for site in s.sites])
     for kind, quantity, read, size in (
         ("geom", "frame_position", "xpos", 1.0),
         ("camera", "frame_position", "xpos", 1.0),
@@ -66,8 +66,8 @@ def _add_views(s: Probed) -> None:
         ("actuator", "frame_distance", "length", 3.0),
     ):
         views = [getattr(getattr(s.d, kind)(f"probe {k}"), read) for k in range(len(s.links))]
-        s.add(quantity, (f"MjData.{kind}",), np.array([np.ravel(view) for view in views]) / size)
-    s.add("frame_position", ("MjData.sensor",), s.sensors("FRAMEPOS"))
+        s.add(quantity, f"MjData.{kind}", np.array([np.ravel(view) for view in views]) / size)
+    s.add("frame_position", "MjData.sensor", s.sensors("FRAMEPOS"))
 
 
 def _at_point(s: Probed, vectors: Array) -> tuple[Array, Array]:
@@ -80,7 +80,7 @@ def _at_point(s: Probed, vectors: Array) -> tuple[Array, Array]:
 def _add_attitudes(s: Probed) -> None:
     d, inertial = s.d, rotation_matrix(s.m.body_iquat[s.links]).swapaxes(-1, -2) @ PROBE_TURN
     places, turns = np.zeros((len(s.links), 3)), np.zeros((len(s.links), 9))
-    same, call = mujoco.mjtSameFrame.mjSAMEFRAME_NONE, ("mj_local2Global", "mjtSameFrame")
+    same, call = mujoco.mjtSameFrame.mjSAMEFRAME_NONE, "mj_local2Global mjtSameFrame"
     for site, body, place, turn in zip(s.sites, s.links, places, turns, strict=True):
         mujoco.mj_local2Global(d, place, turn, s.m.site_pos[site], s.m.site_quat[site], body, same)
     s.add_attitudes(call, turns)
@@ -88,7 +88,7 @@ def _add_attitudes(s: Probed) -> None:
     for name in ("xquat", "xmat", "ximat", "xiquat", "site_xquat"):  # older versions lack the last
         of = None if name == "site_xquat" else inertial if name[1] == "i" else PROBE_TURN
         ids = s.sites if name == "site_xquat" else s.links
-        s.add_attitudes((f"MjData.{name}",), getattr(d, name)[ids], of)
+        s.add_attitudes(f"MjData.{name}", getattr(d, name)[ids], of)
 
 
 def _own_motion(m: Any, d: Any, b: int, sensors: set[str]) -> tuple[Array, Array, list[Array]]:
@@ -147,14 +147,16 @@ def _add_joint_frames(s: Probed) -> None:
                 along[b] = along[b] + d.qvel[m.jnt_dofadr[j]] * d.xaxis[j]
             elif m.jnt_type[j] != mujoco.mjtJoint.mjJNT_SLIDE:
                 along[b] = along[b] + turn[b] @ rates[-1]
-    by = tuple(f"mjtSensor.mjSENS_{kind}" for kind in sorted(sensors))
-    positions = tuple(x for x in by if x.endswith(("POS", "QUAT")))
+    by = [f"mjtSensor.mjSENS_{kind}" for kind in sorted(sensors)]
+    positions, turnings = (
+        " ".join(x for x in by if x.endswith(("POS", "QUAT")) == is_position) for is_position in (True, False)
+    )
     if by:
         s.add("body_position", positions, place[links])
         s.add_axes(positions, turn[links] @ PROBE_TURN)
-        s.add("frame_angular_velocity", tuple(x for x in by if x not in positions), spin[links])
+        s.add("frame_angular_velocity", turnings, spin[links])
     if np.any(m.jnt_type == mujoco.mjtJoint.mjJNT_HINGE):
-        s.add("frame_angular_velocity", ("MjData.xaxis",), along[links])
+        s.add("frame_angular_velocity", "MjData.xaxis", along[links])
     has_joint = m.body_jntnum[links] > 0
     if np.any(has_joint):
         _add_joint_views(s)
@@ -165,7 +167,7 @@ def _add_joint_frames(s: Probed) -> None:
         is_moved = m.jnt_type[last] == mujoco.mjtJoint.mjJNT_SLIDE
         anchored[has_joint] = np.where(is_moved[:, None], anchored[has_joint], d.xanchor[last] - arms)
         if not np.all(is_moved):
-            s.add("body_position", ("MjData.xanchor",), anchored)
+            s.add("body_position", "MjData.xanchor", anchored)
 
 
 def _add_joint_views(s: Probed) -> None:
@@ -177,7 +179,7 @@ def _add_joint_views(s: Probed) -> None:
             for j in _joints(s.m, b):
                 one = getattr(s.d, kind)(j)
                 velocity[b] += np.ravel(one.qvel) @ np.reshape(one.cdof, (-1, 6))
-        s.add("frame_angular_velocity", (f"MjData.{kind}",), velocity[s.links, :3])
+        s.add("frame_angular_velocity", f"MjData.{kind}", velocity[s.links, :3])
 
 
 def spatial_inertia(ten: Float[Array, "10"]) -> Float[Array, "6 6"]:
@@ -194,7 +196,7 @@ def _add_inertias(s: Probed) -> None:
     m, d, v = s.m, s.d, s.d.qvel
     rotors = float(m.dof_armature @ v**2)
     total = sum(d.cvel[b] @ spatial_inertia(d.cinert[b]) @ d.cvel[b] for b in range(1, m.nbody))
-    s.add("kinetic_energy", ("MjData.cinert",), (total + rotors) / 2)
+    s.add("kinetic_energy", "MjData.cinert", (total + rotors) / 2)
     total, d.crb[:] = rotors, 0.0
     mujoco.mj_crb(m, d)
     for i in range(m.nv):
@@ -202,13 +204,13 @@ def _add_inertias(s: Probed) -> None:
         total += momentum @ d.cdof[i] * v[i]
         while (j := m.dof_parentid[j]) >= 0:
             total += 2 * momentum @ d.cdof[j] * v[j]
-    s.add("kinetic_energy", ("mj_crb", "MjData.crb"), total / 2)
+    s.add("kinetic_energy", "mj_crb MjData.crb", total / 2)
     total, of = 0.0, structure_of(m, d, "M")
     for i, (at, count) in enumerate(zip(of.M_rowadr, of.M_rownnz, strict=True)):
         of_row = slice(at, at + count - 1)
         pivot = v[i] + d.qLD[of_row] @ v[of.M_colind[of_row]]
         total += d.qLD[at + count - 1] * pivot**2
-    s.add("kinetic_energy", ("MjData.qLD",), total / 2)
+    s.add("kinetic_energy", "MjData.qLD", total / 2)
 
 
 def _add_wrenches(s: Probed) -> None:
@@ -224,8 +226,8 @@ def _add_wrenches(s: Probed) -> None:
     lever = d.subtree_com[m.body_rootid[s.links]] - d.site_xpos[s.sites]
     local, force = d.site_xmat[s.sites].reshape(-1, 3, 3).swapaxes(-1, -2), wrench[s.links, 3:]
     moment = wrench[s.links, :3] + cross(lever, force)
-    s.add("joint_force_local", ("MjData.cfrc_ext",), rotate_vectors(local, force))
-    s.add("joint_moment_local", ("MjData.cfrc_ext",), rotate_vectors(local, moment))
+    s.add("joint_force_local", "MjData.cfrc_ext", rotate_vectors(local, force))
+    s.add("joint_moment_local", "MjData.cfrc_ext", rotate_vectors(local, moment))
 
 
 # Add all after `mj_forward` and `mj_rnePostConstraint`.

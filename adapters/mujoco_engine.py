@@ -83,12 +83,12 @@ from adapters.mujoco_variants import (
     is_constrained,
 )
 from adapters.pose_functions import add_pose_answers
+from adapters.surface_record import Answer
 from plumbline.engines.metamorphic_hooks import MetamorphicHooks
 from plumbline.model import kinematics
 from plumbline.model.datatypes import (
     ROD,
     Array,
-    Call,
     EngineFailure,
     Float,
     Indices,
@@ -270,7 +270,7 @@ class Mujoco(MetamorphicHooks):
     def _surface(self, model: Model, states: Sequence[State]) -> Sequence[SurfaceAnswer]:
         if self.is_soft(model):
             return []
-        chain, found = _MujocoChain(model, has_probes=True), list[dict[str, dict[Call, Array]]]()
+        chain, found = _MujocoChain(model, has_probes=True), list[Answer]()
         with _raise_on_warnings(chain.d):
             for state in states:
                 rates = chain.evaluate_forward(state)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from adapters.surface_record import SurfaceRecord
-from plumbline.model.datatypes import Array, Call, Float, Indices, Int
+from plumbline.model.datatypes import Array, Float, Indices, Int
 from plumbline.model.kinematics import rotation_matrix
 
 ANCHOR = "anchor"  # site of the world, with the attitude of probe frames
@@ -31,8 +31,8 @@ class Probed(SurfaceRecord):
         return np.array([(data or self.d).sensor(f"{name} {k}").data.copy() for k in range(len(self.links))])
 
     def add_attitudes(
-        self, call: Call, attitudes: Float[Array, "bodies d"], of: Float[Array, "bodies 3 3"] | None = None
+        self, names: str, attitudes: Float[Array, "bodies d"], of: Float[Array, "bodies 3 3"] | None = None
     ) -> None:
         """Add the axes of the probe frames by quaternions or matrices: theirs, or those times others."""
         turns = rotation_matrix(attitudes) if attitudes.shape[-1] == 4 else attitudes.reshape(-1, 3, 3)
-        self.add_axes(call, turns if of is None else turns @ of)
+        self.add_axes(names, turns if of is None else turns @ of)

@@ -33,14 +33,14 @@ from adapters.mujoco_common import (
 from adapters.mujoco_probes import ANCHOR, Probed
 from adapters.pose_functions import Pose, rate_maps
 from plumbline.engines.missing_names import add_parts
-from plumbline.model.datatypes import Array, Call, Model
+from plumbline.model.datatypes import Array, Model
 from plumbline.model.kinematics import quaternion_product, rotation_matrix
 from plumbline.model.probe_frames import PROBE_ATTITUDE, anchor_point, probe_points
 
 SITE, BODY = "SITE", "BODY"
-SENSOR_CLASSES = ("MjsSensor", "mjtSensor")
-TENDON_CLASSES = ("MjsTendon", "MjsTendonPath", "MjsWrap", "mjtWrap")
-WRAPS = ("mjtWrap.mjWRAP_SITE", "mjtWrap.mjWRAP_PULLEY")
+SENSOR_CLASSES = "MjsSensor mjtSensor"
+TENDON_CLASSES = "MjsTendon MjsTendonPath MjsWrap mjtWrap"
+WRAPS = "mjtWrap.mjWRAP_SITE mjtWrap.mjWRAP_PULLEY"
 # By sensor that refers to the first probe frame its quantity.
 RELATIVE_SENSORS = {
     "FRAMEPOS": "frame_position_in_first",
@@ -106,18 +106,18 @@ class Clamp(NamedTuple):
     limit: tuple[str, str]  # arrays of the model: the ranges and their flags; of early forces the flags alone
     is_of_actuators: bool  # whether these are of the actuators, or of what they act on
     transmission: str  # of the dampers
-    names: Call  # that only a step with it uses
+    names: str  # that only a step with it uses
 
 
 CLAMPS = (
     Clamp(("actuator_forcerange", "actuator_forcelimited"), True, "mjtTrn.mjTRN_TENDON",
-          ("mjtBias.mjBIAS_AFFINE", "mjtTrn.mjTRN_TENDON")),
+          "mjtBias.mjBIAS_AFFINE mjtTrn.mjTRN_TENDON"),
     Clamp(("tendon_actfrcrange", "tendon_actfrclimited"), False, "mjtTrn.mjTRN_TENDON",
-          ("mjtBias.mjBIAS_AFFINE", "mjtObj.mjOBJ_TENDON")),
+          "mjtBias.mjBIAS_AFFINE mjtObj.mjOBJ_TENDON"),
     Clamp(("jnt_actfrcrange", "jnt_actfrclimited"), False, "mjtTrn.mjTRN_JOINT",
-          ("mjtBias.mjBIAS_AFFINE", "mjtTrn.mjTRN_JOINT")),
+          "mjtBias.mjBIAS_AFFINE mjtTrn.mjTRN_JOINT"),
     Clamp(("", "actuator_actearly"), True, "mjtTrn.mjTRN_TENDON",
-          ("mjtGain.mjGAIN_AFFINE", "mjtDyn.mjDYN_INTEGRATOR")),
+          "mjtGain.mjGAIN_AFFINE mjtDyn.mjDYN_INTEGRATOR"),
 )  # fmt: skip
 SENSOR_STAGES = ("mj_sensorPos", "mj_sensorVel", "mj_sensorAcc")
 SIZES = {"p": 4, "R": 9, "r": 3, "phi": 3, "w": 3, "pdot": 4, "2pdot": 4}
@@ -216,29 +216,29 @@ def _add_sensors(s: Probed) -> None:
     for name, (_, quantity) in SENSORS.items():
         if quantity != "frame_axes":
             stage = SENSOR_STAGES[s.m.sensor_needstage[s.m.sensor(f"{name} 0").id] - 1]
-            s.add(quantity, (f"mjtSensor.mjSENS_{name}", stage), s.sensors(name))
-    s.add_attitudes(("mjtSensor.mjSENS_FRAMEQUAT",), s.sensors("FRAMEQUAT"))
+            s.add(quantity, f"mjtSensor.mjSENS_{name} {stage}", s.sensors(name))
+    s.add_attitudes("mjtSensor.mjSENS_FRAMEQUAT", s.sensors("FRAMEQUAT"))
     axes = np.stack([s.sensors(name) for name in AXES], 1)
-    s.add("frame_axes", tuple(f"mjtSensor.mjSENS_{name}" for name in AXES), axes.reshape(-1, 3))
+    s.add("frame_axes", " ".join(f"mjtSensor.mjSENS_{name}" for name in AXES), axes.reshape(-1, 3))
     places = np.array([int(s.m.sensor(f"FRAMEPOS {k}").adr[0]) for k in range(len(s.links))])
     values = s.d.sensordata[places[:, None] + np.arange(3)]
-    s.add("frame_position", ("MjData.sensordata", *SENSOR_CLASSES), values)
+    s.add("frame_position", f"MjData.sensordata {SENSOR_CLASSES}", values)
 
 
 def _add_energies(s: Probed) -> None:
     for name, quantity in (("E_KINETIC", "kinetic_energy"), ("E_POTENTIAL", "potential_energy")):
         _ = member(f"mjtSensor.mjSENS_{name}")
-        s.add(quantity, (f"mjtSensor.mjSENS_{name}",), s.d.sensor(name).data)
+        s.add(quantity, f"mjtSensor.mjSENS_{name}", s.d.sensor(name).data)
 
 
 def _add_frames(s: Probed) -> None:
     m, d, geoms = s.m, s.d, s.ids("geom")
     ids: dict[str, Any] = {"SITE": s.sites, "GEOM": geoms, "CAMERA": s.ids("camera"), "XBODY": s.links}
     for name in ("xpos", "xipos"):
-        s.add("body_position", (f"MjData.{name}",), getattr(d, name)[s.links])
+        s.add("body_position", f"MjData.{name}", getattr(d, name)[s.links])
     for name, kind in (("site", "SITE"), ("geom", "GEOM"), ("cam", "CAMERA")):
-        s.add("frame_position", (f"MjData.{name}_xpos",), getattr(d, f"{name}_xpos")[ids[kind]])
-        s.add_attitudes((f"MjData.{name}_xmat",), getattr(d, f"{name}_xmat")[ids[kind]])
+        s.add("frame_position", f"MjData.{name}_xpos", getattr(d, f"{name}_xpos")[ids[kind]])
+        s.add_attitudes(f"MjData.{name}_xmat", getattr(d, f"{name}_xmat")[ids[kind]])
     for kind, own in ids.items():
         for function, quantities in OBJECT_MOTIONS.items():
             for is_local, suffix in enumerate(("", "_local") if kind != "XBODY" else ("",)):
@@ -249,9 +249,9 @@ def _add_frames(s: Probed) -> None:
                 if kind == "XBODY":  # the body's centre
                     vectors[:, 3:] += m.opt.gravity * ("proper" in moving)
                     moving = moving.replace("frame_", "body_").replace("proper_", "")
-                s.add_halves((turning + suffix, moving + suffix), (function, f"mjtObj.mjOBJ_{kind}"), vectors)
+                s.add_halves((turning + suffix, moving + suffix), f"{function} mjtObj.mjOBJ_{kind}", vectors)
     _add_jacobians(s)
-    s.add_attitudes(("MjData.geom_xquat",), d.geom_xquat[geoms])
+    s.add_attitudes("MjData.geom_xquat", d.geom_xquat[geoms])
 
 
 def _add_relative(s: Probed) -> None:
@@ -261,9 +261,9 @@ def _add_relative(s: Probed) -> None:
         value = s.sensors(f"{name} in first")
         if name == "FRAMEQUAT":
             value = rotation_matrix(value).swapaxes(-1, -2).reshape(-1, 3)
-        s.add(quantity, (f"mjtSensor.mjSENS_{name}",), value)
+        s.add(quantity, f"mjtSensor.mjSENS_{name}", value)
     for name, (_, quantity, size) in DISTANCE_SENSORS.items():
-        s.add(quantity, (f"mjtSensor.mjSENS_{name}",), s.sensors(name) / size)
+        s.add(quantity, f"mjtSensor.mjSENS_{name}", s.sensors(name) / size)
     tendons, on_tendons = s.ids("tendon"), s.ids("actuator")
     jacobian = dense_rows(d.ten_J, m, d, "ten_J")[tendons]
     ends = d.wrap_xpos.reshape(-1, 3)[d.ten_wrapadr[tendons][:, None] + np.arange(2)]
@@ -271,21 +271,21 @@ def _add_relative(s: Probed) -> None:
     # a spatial tendon has a row of both points per straight piece or pulley
     away, by = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=-1), "mjtTrn.mjTRN_TENDON"
     for quantity, call, value in (
-        ("", ("MjData.ten_length", *WRAPS, *TENDON_CLASSES), d.ten_length[tendons] / 1.5),
-        ("", ("MjData.wrap_xpos",), away),
-        ("_rate", ("MjData.ten_velocity", *WRAPS), d.ten_velocity[tendons] / 1.5),
-        ("_rate", ("MjData.ten_J",), jacobian @ d.qvel / 1.5),
-        ("", ("MjData.actuator_length", by), d.actuator_length[on_tendons] / 3.0),
-        ("_rate", ("MjData.actuator_velocity", by), d.actuator_velocity[on_tendons] / 3.0),
-        ("_rate", ("MjData.actuator_moment", by), moment[on_tendons] @ d.qvel / 3.0),
+        ("", f"MjData.ten_length {WRAPS} {TENDON_CLASSES}", d.ten_length[tendons] / 1.5),
+        ("", "MjData.wrap_xpos", away),
+        ("_rate", f"MjData.ten_velocity {WRAPS}", d.ten_velocity[tendons] / 1.5),
+        ("_rate", "MjData.ten_J", jacobian @ d.qvel / 1.5),
+        ("", f"MjData.actuator_length {by}", d.actuator_length[on_tendons] / 3.0),
+        ("_rate", f"MjData.actuator_velocity {by}", d.actuator_velocity[on_tendons] / 3.0),
+        ("_rate", f"MjData.actuator_moment {by}", moment[on_tendons] @ d.qvel / 3.0),
     ):
         s.add(f"frame_distance{quantity}", call, value[:, None])
     on_sites = np.stack([s.ids("actuator", f" {i}") for i in range(3)], 1)
     turn, by = d.site_xmat[m.site(ANCHOR).id].reshape(3, 3), "mjtTrn.mjTRN_SITE"
     length, speeds = d.actuator_length[on_sites] @ turn.T, d.actuator_velocity[on_sites] @ turn.T
-    s.add("frame_position_from_anchor", ("MjData.actuator_length", by), length)
-    s.add("frame_velocity", ("MjData.actuator_velocity", by), speeds)
-    s.add("frame_velocity", ("MjData.actuator_moment", by), (moment @ d.qvel)[on_sites] @ turn.T)
+    s.add("frame_position_from_anchor", f"MjData.actuator_length {by}", length)
+    s.add("frame_velocity", f"MjData.actuator_velocity {by}", speeds)
+    s.add("frame_velocity", f"MjData.actuator_moment {by}", (moment @ d.qvel)[on_sites] @ turn.T)
 
 
 def _add_still(s: Probed) -> None:
@@ -295,11 +295,11 @@ def _add_still(s: Probed) -> None:
     for name, is_local in STILL_SENSORS.items():
         own = [d.sensor(f"{name} {ANCHOR}").data.copy(), *s.sensors(name)]
         still, *moving = (turn @ x if is_local else x for turn, x in zip(turns, own, strict=True))
-        s.add("frame_acceleration", (f"mjtSensor.mjSENS_{name}",), np.array(moving) - still)
+        s.add("frame_acceleration", f"mjtSensor.mjSENS_{name}", np.array(moving) - still)
     vectors = np.zeros((len(turns), 6))
     for site, out in zip((anchor, *s.sites), vectors, strict=True):
         mujoco.mj_objectAcceleration(m, d, mujoco.mjtObj.mjOBJ_SITE, site, out, 0)
-    call = "mj_objectAcceleration", "mjtObj.mjOBJ_SITE"
+    call = "mj_objectAcceleration mjtObj.mjOBJ_SITE"
     s.add("frame_acceleration", call, vectors[1:, 3:] - vectors[0, 3:])
 
 
@@ -315,10 +315,10 @@ def _add_cranks(s: Probed) -> None:
     rest = along - other.actuator_length[cranks]
     distance, by = np.sqrt(L**2 + along**2 - rest**2), "mjtTrn.mjTRN_SLIDERCRANK"
     moment = dense_rows(other.actuator_moment, own, other, "moment")
-    s.add("frame_distance", ("MjData.actuator_length", by), distance[:, None])
+    s.add("frame_distance", f"MjData.actuator_length {by}", distance[:, None])
     for name, rate in (("velocity", other.actuator_velocity[cranks]), ("moment", moment[cranks] @ s.d.qvel)):
         change = (along * speed - rest * (speed - rate)) / distance
-        s.add("frame_distance_rate", (f"MjData.actuator_{name}", by), change[:, None])
+        s.add("frame_distance_rate", f"MjData.actuator_{name} {by}", change[:, None])
 
 
 def _add_tendon_limits(s: Probed) -> None:
@@ -333,11 +333,11 @@ def _add_tendon_limits(s: Probed) -> None:
     rows = rows[np.argsort(other.efc_id[rows])]
     place, speed = (s.sensors(f"TENDONLIMIT{x}", other) for x in ("POS", "VEL"))
     away, margin, rate = (other.efc_pos[rows, None], other.efc_margin[rows, None], other.efc_vel[rows, None])
-    s.add("frame_distance", ("MjData.efc_pos", limit), away / 1.5)
-    s.add("frame_distance", ("MjData.efc_margin", limit), (place + margin) / 1.5)
-    s.add("frame_distance_rate", ("MjData.efc_vel", limit), rate / 1.5)
-    s.add("frame_distance", ("mjtSensor.mjSENS_TENDONLIMITPOS", limit), (place + far) / 1.5)
-    s.add("frame_distance_rate", ("mjtSensor.mjSENS_TENDONLIMITVEL", limit), speed / 1.5)
+    s.add("frame_distance", f"MjData.efc_pos {limit}", away / 1.5)
+    s.add("frame_distance", f"MjData.efc_margin {limit}", (place + margin) / 1.5)
+    s.add("frame_distance_rate", f"MjData.efc_vel {limit}", rate / 1.5)
+    s.add("frame_distance", f"mjtSensor.mjSENS_TENDONLIMITPOS {limit}", (place + far) / 1.5)
+    s.add("frame_distance_rate", f"mjtSensor.mjSENS_TENDONLIMITVEL {limit}", speed / 1.5)
 
 
 def _add_asleep(s: Probed) -> None:
@@ -349,8 +349,7 @@ def _add_asleep(s: Probed) -> None:
     other = data_like(own, s.d)
     for _ in range(MAX_AWAKE):
         mujoco.mj_step(own, other)
-    call = "mj_energyPos", "mjtSleepPolicy"
-    s.add("potential_energy", call, other.energy[0])
+    s.add("potential_energy", "mj_energyPos mjtSleepPolicy", other.energy[0])
 
 
 def _add_jacobians(s: Probed) -> None:
@@ -377,19 +376,19 @@ def _add_jacobians(s: Probed) -> None:
             for quantity, value in zip(JACOBIANS[call], values, strict=False):
                 rows[quantity, call].append(value)
     for (quantity, call), vectors in rows.items():
-        s.add(quantity, (call,), vectors)
+        s.add(quantity, call, vectors)
 
 
 def _add_momenta(s: Probed) -> None:
-    s.add("total_mass", ("mj_getTotalmass",), mujoco.mj_getTotalmass(s.m))
+    s.add("total_mass", "mj_getTotalmass", mujoco.mj_getTotalmass(s.m))
     for name, of_subtree, of_all in (
         ("subtree_com", "subtree_centre", "centre_of_mass"),
         ("subtree_linvel", "subtree_velocity", "centre_of_mass_velocity"),
         ("subtree_angmom", "subtree_angular_momentum", "centroidal_angular_momentum"),
     ):
-        values, by = getattr(s.d, name), () if name == "subtree_com" else ("mj_subtreeVel",)
-        s.add(of_subtree, (f"MjData.{name}", *by), values[s.links])
-        s.add(of_all, (f"MjData.{name}",), values[0])
+        values, by = getattr(s.d, name), "" if name == "subtree_com" else "mj_subtreeVel"
+        s.add(of_subtree, f"MjData.{name} {by}", values[s.links])
+        s.add(of_all, f"MjData.{name}", values[0])
 
 
 def _add_factors(s: Probed) -> None:
@@ -398,9 +397,9 @@ def _add_factors(s: Probed) -> None:
     mujoco.mj_mulM2(m, d, root, d.qvel)
     diagonal = (np.sqrt(d.qLDiagInv),) if not hasattr(d, "qLDiagSqrtInv") else ()  # of older versions
     mujoco.mj_solveM2(m, d, back[None], times_mass(m, d, d.qvel)[None], *diagonal)
-    s.add("kinetic_energy", ("mj_mulM2",), root @ root / 2)
-    s.add("kinetic_energy", ("mj_solveM2", "MjData.qLDiagInv"), back @ back / 2)
-    s.add("kinetic_energy", ("MjData.energy",), d.energy[1])
+    s.add("kinetic_energy", "mj_mulM2", root @ root / 2)
+    s.add("kinetic_energy", "mj_solveM2 MjData.qLDiagInv", back @ back / 2)
+    s.add("kinetic_energy", "MjData.energy", d.energy[1])
 
 
 def _add_sum(s: Probed) -> None:
@@ -411,7 +410,7 @@ def _add_sum(s: Probed) -> None:
     columns[: len(of.M_colind)] = of.M_colind
     mujoco.mj_addM(m, s.d, added, of.M_rownnz.copy(), of.M_rowadr.copy(), columns)
     lower = dense_rows(added, m, s.d, "M")
-    s.add("kinetic_energy", ("mj_addM",), v @ (lower @ v + np.tril(lower, -1).T @ v) / 2)
+    s.add("kinetic_energy", "mj_addM", v @ (lower @ v + np.tril(lower, -1).T @ v) / 2)
 
 
 def _add_torques(s: Probed) -> None:
@@ -423,19 +422,19 @@ def _add_torques(s: Probed) -> None:
     through = times_mass(m, d, through_inverse(m, d, momentum))
     mujoco.mj_rne(m, d, 1, tau)
     bias = d.qfrc_bias + times_mass(m, d, a) - rotors
-    dynamics: dict[Call, Array] = {("mj_rne",): tau.copy(), ("MjData.qfrc_bias",): bias}
+    dynamics = {"mj_rne": tau.copy(), "MjData.qfrc_bias": bias}
     for function, stage in (("mj_inverse", ()), ("mj_inverseSkip", (mujoco.mjtStage.mjSTAGE_NONE, 1))):
         d.qfrc_inverse[:] = 0.0
         getattr(mujoco, function)(m, d, *stage)
-        dynamics[function, "MjData.qfrc_inverse"] = d.qfrc_inverse + d.qfrc_passive - rotors
+        dynamics[f"{function} MjData.qfrc_inverse"] = d.qfrc_inverse + d.qfrc_passive - rotors
     dynamics |= _joint_forces(m, d)
-    dynamics[INVERSE_STAGES] = _inverse_by_stages(m, d)
+    dynamics[" ".join(INVERSE_STAGES)] = _inverse_by_stages(m, d)
     add_parts(s.found, partial(_add_implicit_steps, s), partial(_add_sum, s))
     if not np.any(m.dof_damping):
         flags = m.opt.enableflags
         m.opt.enableflags = flags | int(mujoco.mjtEnableBit.mjENBL_INVDISCRETE)
         mujoco.mj_inverse(m, d)
-        dynamics["mjtEnableBit.mjENBL_INVDISCRETE",] = d.qfrc_inverse + d.qfrc_passive - rotors
+        dynamics["mjtEnableBit.mjENBL_INVDISCRETE"] = d.qfrc_inverse + d.qfrc_passive - rotors
         m.opt.enableflags = flags
     d.qvel[:] = 0.0
     mujoco.mj_fwdVelocity(m, d)
@@ -443,12 +442,12 @@ def _add_torques(s: Probed) -> None:
     for b in range(1, m.nbody):
         weight = -m.body_mass[b] * m.opt.gravity
         mujoco.mj_applyFT(m, d, weight, np.zeros(3), d.xipos[b], b, pulls)
-    of_gravity: dict[Call, Array] = {
-        ("mj_rne",): gravity, ("MjData.qfrc_bias", "mj_fwdVelocity"): d.qfrc_bias, ("mj_applyFT",): pulls,
-        ("mj_setTotalmass",): _gravity_of_twice_the_mass(m, d) / 2,
+    of_gravity = {
+        "mj_rne": gravity, "MjData.qfrc_bias mj_fwdVelocity": d.qfrc_bias, "mj_applyFT": pulls,
+        "mj_setTotalmass": _gravity_of_twice_the_mass(m, d) / 2,
     }  # fmt: skip
-    s.add_forces("generalized_momentum", {("mj_mulM",): momentum})
-    s.add_forces("momentum_through_inverse", {("mj_solveM",): through})
+    s.add_forces("generalized_momentum", {"mj_mulM": momentum})
+    s.add_forces("momentum_through_inverse", {"mj_solveM": through})
     s.add_forces("generalized_gravity", of_gravity)
     s.add_forces("inverse_dynamics", dynamics)
 
@@ -462,21 +461,21 @@ def _gravity_of_twice_the_mass(m: Any, d: Any) -> Array:
     return force
 
 
-def _joint_forces(m: Any, d: Any) -> dict[Call, Array]:
+def _joint_forces(m: Any, d: Any) -> dict[str, Array]:
     """What acts on the bodies by the arrays of forces, without what rotors take."""
     pushes, rotors = np.zeros(m.nv), m.dof_armature * d.qacc
     for b in range(1, m.nbody):
         mujoco.mj_applyFT(m, d, d.xfrc_applied[b, :3], d.xfrc_applied[b, 3:], d.xipos[b], b, pushes)
-    found: dict[Call, Array] = {
-        ("MjData.qfrc_smooth",): d.qfrc_bias + d.qfrc_smooth - rotors,
-        ("MjData.qacc_smooth",): d.qfrc_bias + times_mass(m, d, d.qacc_smooth) - rotors,
-        ("MjData.qfrc_applied", "MjData.xfrc_applied"): d.qfrc_passive + d.qfrc_applied + pushes - rotors,
+    found = {
+        "MjData.qfrc_smooth": d.qfrc_bias + d.qfrc_smooth - rotors,
+        "MjData.qacc_smooth": d.qfrc_bias + times_mass(m, d, d.qacc_smooth) - rotors,
+        "MjData.qfrc_applied MjData.xfrc_applied": d.qfrc_passive + d.qfrc_applied + pushes - rotors,
     }
     parts = {"spring": (m.jnt_stiffness, m.tendon_stiffness), "damper": (m.dof_damping, m.tendon_damping)}
-    names = tuple(f"MjData.qfrc_{part}" for part, own in parts.items() if any(map(np.any, own)))
+    names = " ".join(f"MjData.qfrc_{part}" for part, own in parts.items() if any(map(np.any, own)))
     if names:
         passive = d.qfrc_spring + d.qfrc_damper
-        found[*names, "MjData.qfrc_passive"] = passive + d.qfrc_applied + pushes - rotors
+        found[f"{names} MjData.qfrc_passive"] = passive + d.qfrc_applied + pushes - rotors
     return found
 
 
@@ -510,28 +509,28 @@ def _add_implicit_steps(s: Probed) -> None:
             mujoco.mj_Euler(own, other)
             L = dense_rows(other.qH, m, other, "M")
             pivots, added = v + (L - np.diag(np.diag(L))) @ v, h * m.dof_damping @ v**2
-            s.add("kinetic_energy", ("MjData.qH",), (np.diag(L) @ pivots**2 - added) / 2)
-            s.add("kinetic_energy", ("MjData.qHDiagInv",), ((pivots / other.qHDiagInv) @ pivots - added) / 2)
+            s.add("kinetic_energy", "MjData.qH", (np.diag(L) @ pivots**2 - added) / 2)
+            s.add("kinetic_energy", "MjData.qHDiagInv", ((pivots / other.qHDiagInv) @ pivots - added) / 2)
             continue
         mujoco.mj_implicit(own, other)
         D = dense_rows(other.qDeriv, m, other, "D")
         if name == "IMPLICIT":
             LU = dense_rows(other.qLU, m, other, "D")
             twice = ((np.triu(LU, 1) + np.eye(m.nv)).T @ v) @ (np.tril(LU) @ v) + h * v @ D @ v
-            s.add("kinetic_energy", ("MjData.qLU",), twice / 2)
-        call = "mj_implicit", f"mjtIntegrator.mjINT_{name}"
-        _add_force_of_step(s, (*call, "MjData.qDeriv", "mjtDisableBit.mjDSBL_ACTUATION"), other, D, h)
+            s.add("kinetic_energy", "MjData.qLU", twice / 2)
+        call = f"mj_implicit mjtIntegrator.mjINT_{name}"
+        _add_force_of_step(s, f"{call} MjData.qDeriv mjtDisableBit.mjDSBL_ACTUATION", other, D, h)
         add_parts(s.found, *(partial(_add_clamped_step, s, own, clamp, call, D) for clamp in CLAMPS))
 
 
-def _add_force_of_step(s: Probed, call: Call, end: Any, D: Array, h: float) -> None:
+def _add_force_of_step(s: Probed, call: str, end: Any, D: Array, h: float) -> None:
     """Add the force by the change of the velocities in an implicit step, of the matrix M − h D."""
     m, d, change = s.m, s.d, end.qvel - s.d.qvel
     force = d.qfrc_bias + times_mass(m, d, change / h) - D @ change - m.dof_armature * d.qacc
     s.add_forces("inverse_dynamics", {call: force})
 
 
-def _add_clamped_step(s: Probed, usual: Any, clamp: Clamp, call: Call, D: Array) -> None:
+def _add_clamped_step(s: Probed, usual: Any, clamp: Clamp, call: str, D: Array) -> None:
     """Take an implicit step with dampers on tendons or joints whose force is zero.
 
     By a limit, or by activations that are zero at the end of the step, from where the force comes early.
@@ -553,4 +552,4 @@ def _add_clamped_step(s: Probed, usual: Any, clamp: Clamp, call: Call, D: Array)
     other.act[:], other.ctrl[:] = 1.0, -1.0 / own.opt.timestep
     mujoco.mj_forward(own, other)
     mujoco.mj_implicit(own, other)
-    _add_force_of_step(s, (*call, *clamp.names), other, D, own.opt.timestep)
+    _add_force_of_step(s, f"{call} {clamp.names}", other, D, own.opt.timestep)

@@ -66,12 +66,12 @@ from adapters.pinocchio_probes import Probed, add_probe_frames
 from adapters.pinocchio_surface import add_composites, add_surface, pose_function
 from adapters.pinocchio_variants import VARIANTS, Change, Spelling
 from adapters.pose_functions import add_pose_answers
+from adapters.surface_record import Answer
 from plumbline.engines.integrators import dop853, rkmk4, sample_steps, semi_implicit_euler
 from plumbline.engines.missing_names import add_parts
 from plumbline.engines.variants import names_of_column
 from plumbline.model.datatypes import (
     Array,
-    Call,
     Float,
     Integrator,
     Model,
@@ -840,7 +840,7 @@ class Pinocchio(PinocchioAdapter):
         if single.njoints != chain.pin_model.njoints:
             for s, of_composites in zip(probed, ask(chain.pin_model, loops, EARLY_STATES), strict=False):
                 add_composites(s, of_composites)
-        found: list[dict[str, dict[Call, Array]]] = [s.found for s in probed]
+        found: list[Answer] = [s.found for s in probed]
         add_pose_answers(found, states, "pinocchio", pose_function)
         return found
 

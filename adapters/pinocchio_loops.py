@@ -17,7 +17,7 @@ import numpy as np
 import pinocchio as pin
 
 from adapters.pinocchio_common import init_constraint_dynamics, translation
-from plumbline.model.datatypes import Array, Call, Float
+from plumbline.model.datatypes import Array, Float
 
 # μ over the largest entry of J M⁻¹ Jᵀ, and how often the step is taken.  Measured on squeezer: with 1e-5 the
 # twelve steps do not converge (771 rad/s² off), with 1e-7 they end 5e-7 off, with 1e-8 within the bound.
@@ -100,37 +100,37 @@ class _Rows:
 
 def closed_accelerations(
     loops: Loops, q: Float[Array, "nq"], v: Float[Array, "nv"]
-) -> Iterator[tuple[bool, Call, Any]]:
-    """Return by call the accelerations, and whether they come from analytical derivatives."""
+) -> Iterator[tuple[bool, str, Any]]:
+    """Return by names of the engine the accelerations, and whether they come from analytical derivatives."""
     rows = _Rows(loops, q, v)
     m, J, solved, by = rows.m, rows.J, rows.solved, "constraintDynamics"
     each = zip(loops.welds, loops.data, strict=True)
     one_by_one = np.vstack(list(starmap(lambda w, d: pin.getConstraintJacobian(m, rows.still, w, d), each)))
-    yield False, ("getConstraintsJacobian",), rows.by_rows(J, rows.bias)
-    yield False, ("getConstraintJacobian",), rows.by_rows(one_by_one, rows.bias)
-    yield False, (by, "Data.primal_rhs_contact"), rows.by_rows(J, -np.array(solved.primal_rhs_contact))
+    yield False, "getConstraintsJacobian", rows.by_rows(J, rows.bias)
+    yield False, "getConstraintJacobian", rows.by_rows(one_by_one, rows.bias)
+    yield False, f"{by} Data.primal_rhs_contact", rows.by_rows(J, -np.array(solved.primal_rhs_contact))
     solution = np.array(solved.primal_dual_contact_solution)
-    yield False, (by, "Data.primal_dual_contact_solution"), solution[len(J) :]
-    yield False, (by, "Data.lambda_c"), rows.by_force(np.array(solved.lambda_c))
-    yield False, (by, "Data.lambda_c_prox"), rows.by_force(np.array(solved.lambda_c_prox))
+    yield False, f"{by} Data.primal_dual_contact_solution", solution[len(J) :]
+    yield False, f"{by} Data.lambda_c", rows.by_force(np.array(solved.lambda_c))
+    yield False, f"{by} Data.lambda_c_prox", rows.by_force(np.array(solved.lambda_c_prox))
     yield from _by_derivatives(rows)
     # of version 3, with another name
     factors = solved.constraint_chol if hasattr(solved, "constraint_chol") else solved.contact_chol
     a = rows.by(lambda b: np.ravel(factors.solve(b[:, None])), rows.bias, rows.settings.mu)
-    yield False, (by, "Data.constraint_chol"), a
+    yield False, f"{by} Data.constraint_chol", a
     yield from _by_anchors(rows)
 
 
-def _by_derivatives(rows: _Rows) -> Iterator[tuple[bool, Call, Any]]:
+def _by_derivatives(rows: _Rows) -> Iterator[tuple[bool, str, Any]]:
     loops, m, v, J, solved = rows.loops, rows.m, rows.v, rows.J, rows.solved
     derivatives = pin.computeConstraintDynamicsDerivatives(m, solved, loops.welds, loops.data, rows.settings)
     _, a_v, a_tau, _, f_v, f_tau = (np.array(x) for x in derivatives)
     pushed = loops.push - pin.computeGeneralizedGravity(m, m.createData(), rows.q)
     by = "computeConstraintDynamicsDerivatives"
     if rows.are_independent:  # they have no proximal iterations
-        yield True, (by, "Data.ddq_dv", "Data.ddq_dtau"), a_v @ v / 2 + a_tau @ pushed
+        yield True, f"{by} Data.ddq_dv Data.ddq_dtau", a_v @ v / 2 + a_tau @ pushed
         force = f_v @ v / 2 + f_tau @ pushed
-        yield True, (by, "Data.dlambda_dv", "Data.dlambda_dtau"), rows.by_force(force)
+        yield True, f"{by} Data.dlambda_dv Data.dlambda_dtau", rows.by_force(force)
         pin.computeAllTerms(m, rows.still, rows.q, v)
         pin.forwardDynamics(m, rows.still, rows.q, v, loops.push, J, rows.bias, rows.damping)
         inverse, nv = np.array(pin.getKKTContactDynamicMatrixInverse(m, rows.still, J)), m.nv
@@ -139,10 +139,10 @@ def _by_derivatives(rows: _Rows) -> Iterator[tuple[bool, Call, Any]]:
             return np.roll(inverse @ np.roll(b, nv), -nv)  # it has v̇ first
 
         a = rows.by(by_inverse, rows.bias, rows.damping)
-        yield False, ("forwardDynamics", "getKKTContactDynamicMatrixInverse"), a
+        yield False, "forwardDynamics getKKTContactDynamicMatrixInverse", a
     of_a, of_v, of_q = (np.array(x) for x in (solved.dac_da, solved.dac_dv, solved.dvc_dq))
-    yield True, (by, "Data.dac_da", "Data.dac_dv"), rows.by_rows(of_a, of_v @ v / 2)
-    yield True, (by, "Data.dvc_dq"), rows.by_rows(of_a, of_q @ v)
+    yield True, f"{by} Data.dac_da Data.dac_dv", rows.by_rows(of_a, of_v @ v / 2)
+    yield True, f"{by} Data.dvc_dq", rows.by_rows(of_a, of_q @ v)
 
 
 def _still(m: pin.Model, q: Array, v: Array) -> pin.Data:
@@ -169,7 +169,7 @@ def _bias(data: pin.Data, welds: Any) -> Array:
     return np.concatenate(rows)
 
 
-def _by_anchors(rows: _Rows) -> Iterator[tuple[bool, Call, Any]]:
+def _by_anchors(rows: _Rows) -> Iterator[tuple[bool, str, Any]]:
     """Close the loops by the constraints of version 4: frames, and three points of each."""
     loops, m, still = rows.loops, rows.m, _still(rows.m, rows.q, rows.v)
     frames, data = pin.StdVec_ConstraintModel(), pin.StdVec_ConstraintData()
@@ -191,20 +191,19 @@ def _by_anchors(rows: _Rows) -> Iterator[tuple[bool, Call, Any]]:
             point.calc(m, still, own)
             points.append(np.array(point.jacobian(m, still, own)))
             of_points.append(_of_point(still, point))
-    names = "FrameAnchorConstraintModel", "FrameAnchorConstraintData"
+    names = "FrameAnchorConstraintModel FrameAnchorConstraintData ConstraintModel ConstraintData"
     J = -np.array(pin.getConstraintsJacobian(m, still, frames, data))
-    lists = "ConstraintModel", "ConstraintData"
-    yield False, ("getConstraintsJacobian", *names, *lists), rows.by_rows(J, rows.bias)
-    by = "PointAnchorConstraintModel", "PointAnchorConstraintData"
+    yield False, f"getConstraintsJacobian {names}", rows.by_rows(J, rows.bias)
+    by = "PointAnchorConstraintModel PointAnchorConstraintData"
     yield False, by, rows.by_rows(np.vstack(points), np.concatenate(of_points))
     solved = m.createData()
     init_constraint_dynamics(m, solved, rigid, rigid_data)
     a = pin.constraintDynamics(m, solved, rows.q, rows.v, loops.push, rigid, rigid_data, rows.settings).copy()
-    yield False, ("convertToRigidConstraintModel",), a
+    yield False, "convertToRigidConstraintModel", a
     yield from _by_factors(rows, still, frames, data)
 
 
-def _by_factors(rows: _Rows, still: pin.Data, frames: Any, data: Any) -> Iterator[tuple[bool, Call, Any]]:
+def _by_factors(rows: _Rows, still: pin.Data, frames: Any, data: Any) -> Iterator[tuple[bool, str, Any]]:
     """Solve with factors of the whole matrix, and with those of J M⁻¹ Jᵀ."""
     factors = pin.ConstraintCholeskyDecomposition(rows.m, still, frames, data)
     factors.compute(rows.m, still, frames, data, rows.damping)
@@ -213,12 +212,12 @@ def _by_factors(rows: _Rows, still: pin.Data, frames: Any, data: Any) -> Iterato
     def solve(b: Array) -> Array:
         return np.asarray(signs * np.ravel(factors.solve((signs * b)[:, None])))
 
-    yield False, ("ConstraintCholeskyDecomposition",), rows.by(solve, rows.bias, rows.damping)
+    yield False, "ConstraintCholeskyDecomposition", rows.by(solve, rows.bias, rows.damping)
     delassus, multipliers = factors.getDelassusOperatorCholeskyExpression(), np.zeros(len(rows.bias))
     free = rows.J @ np.linalg.solve(rows.mass, rows.force) + rows.bias
     for _ in range(STEPS):
         multipliers = -np.ravel(delassus.solve((free - rows.damping * multipliers)[:, None]))
-    yield False, ("DelassusOperatorCholeskyExpression",), rows.by_force(multipliers)
+    yield False, "DelassusOperatorCholeskyExpression", rows.by_force(multipliers)
 
 
 def _of_point(data: pin.Data, point: Any) -> Array:

@@ -10,7 +10,7 @@ import pinocchio as pin
 
 from adapters.pinocchio_common import WORLD_ALIGNED, joint_of
 from adapters.surface_record import SurfaceRecord
-from plumbline.model.datatypes import Array, Call, Float, Model
+from plumbline.model.datatypes import Array, Float, Model
 from plumbline.model.probe_frames import PROBE_TURN, probe_points
 
 
@@ -79,34 +79,34 @@ class Probed(SurfaceRecord):
         """The rate of something whose derivatives by q and v these are."""
         return self.square(by_q) @ (self.v if v is None else v) + self.square(by_v) @ self.a
 
-    def add_poses(self, call: Call, poses: Iterable[pin.SE3]) -> None:
+    def add_poses(self, names: str, poses: Iterable[pin.SE3]) -> None:
         """Add those of the probe frames."""
         own = [pose.homogeneous for pose in poses]
-        self.add("frame_position", call, [H[:3, 3] for H in own])
-        self.add_axes(call, [H[:3, :3] for H in own])
+        self.add("frame_position", names, [H[:3, 3] for H in own])
+        self.add_axes(names, [H[:3, :3] for H in own])
 
-    def add_twists(self, quantities: tuple[str, str], call: Call, twists: Iterable[Any]) -> None:
+    def add_twists(self, quantities: tuple[str, str], names: str, twists: Iterable[Any]) -> None:
         """Add the linear and the angular parts of spatial vectors."""
-        self.add_halves(quantities, call, [getattr(twist, "vector", twist) for twist in twists])
+        self.add_halves(quantities, names, [getattr(twist, "vector", twist) for twist in twists])
 
-    def add_velocities(self, velocities: Mapping[Call, Any]) -> None:
+    def add_velocities(self, velocities: Mapping[str, Any]) -> None:
         """Add the velocities of the probe frames by other v."""
         data = self.workspace()
-        for call, v in velocities.items():
+        for names, v in velocities.items():
             pin.forwardKinematics(self.m, data, self.q, v)
             pin.updateFramePlacements(self.m, data)
             twists = [pin.getFrameVelocity(self.m, data, f, WORLD_ALIGNED).copy() for f in self.frames]
-            self.add_twists(("frame_velocity", "frame_angular_velocity"), call, twists)
+            self.add_twists(("frame_velocity", "frame_angular_velocity"), names, twists)
 
-    def add_accelerations(self, call: Call, a: Any, suffix: str = "by_derivative") -> None:
+    def add_accelerations(self, names: str, a: Any, suffix: str = "by_derivative") -> None:
         """Add the accelerations of the probe frames by another v̇."""
         data = self.moved(a)
         quantities = f"frame_acceleration_{suffix}", f"frame_angular_acceleration_{suffix}"
         classical = pin.getFrameClassicalAcceleration
         twists = [classical(self.m, data, f, WORLD_ALIGNED).copy() for f in self.frames]
-        self.add_twists(quantities, call, twists)
+        self.add_twists(quantities, names, twists)
 
-    def add_momentum(self, call: Call, twist: Any, suffix: str = "") -> None:
+    def add_momentum(self, names: str, twist: Any, suffix: str = "") -> None:
         """Add the momentum of the mechanism about its centre of mass, or its rate."""
-        names = f"momentum{suffix}", f"centroidal_angular_momentum{suffix}"
-        self.add_twists(names, call, [twist])
+        quantities = f"momentum{suffix}", f"centroidal_angular_momentum{suffix}"
+        self.add_twists(quantities, names, [twist])

@@ -25,7 +25,7 @@ import pinocchio as pin
 from adapters.pinocchio_common import armature
 from adapters.pinocchio_probes import Probed
 from plumbline.engines.missing_names import add_parts
-from plumbline.model.datatypes import Array, Call
+from plumbline.model.datatypes import Array
 
 SHORT = 3  # joints up to which articulated bodies keep their digits (pinocchio-aba-loses-digits)
 STEP = 0.2  # rad, and of translations this share of the distance of the bodies
@@ -58,30 +58,28 @@ def _add_configurations(s: Probed) -> None:
     def led(tangent: Array) -> Array:
         return np.asarray(pin.integrate(m, before, tangent))
 
-    reached: dict[Call, Callable[[], Any]] = {
-        ("difference", "integrate"): lambda: led(pin.difference(m, before, q)),
-        ("distance",): lambda: led(step * (pin.distance(m, before, q) / length)),
-        ("squaredDistance",): lambda: led(step * np.sqrt(np.sum(pin.squaredDistance(m, before, q))) / length),
-        ("interpolate",): lambda: pin.interpolate(m, before, after, 0.5),
-        ("isSameConfiguration", "isNormalized"): lambda: (
+    reached: dict[str, Callable[[], Any]] = {
+        "difference integrate": lambda: led(pin.difference(m, before, q)),
+        "distance": lambda: led(step * (pin.distance(m, before, q) / length)),
+        "squaredDistance": lambda: led(step * np.sqrt(np.sum(pin.squaredDistance(m, before, q))) / length),
+        "interpolate": lambda: pin.interpolate(m, before, after, 0.5),
+        "isSameConfiguration isNormalized": lambda: (
             q if pin.isNormalized(m, q) and pin.isSameConfiguration(m, q, q.copy(), 1e-9) else before
         ),
-        ("lieGroup", "LieGroup"): lambda: pin.lieGroup(m).integrate(
-            before, pin.lieGroup(m).difference(before, q)
-        ),
-        ("normalize", "framesForwardKinematics"): lambda: pin.normalize(m, q),
-        ("Model", "Model.idx_qs", "Model.nqs"): lambda: np.concatenate(
+        "lieGroup LieGroup": lambda: pin.lieGroup(m).integrate(before, pin.lieGroup(m).difference(before, q)),
+        "normalize framesForwardKinematics": lambda: pin.normalize(m, q),
+        "Model Model.idx_qs Model.nqs": lambda: np.concatenate(
             [q[at : at + n] for at, n in zip(m.idx_qs, m.nqs, strict=True)]
         ),
     }
 
-    def add(call: Call, configuration: Callable[[], Any]) -> None:
+    def add(call: str, configuration: Callable[[], Any]) -> None:
         pin.framesForwardKinematics(m, data, np.ravel(configuration()))
         s.add_poses(call, [data.oMf[f] for f in s.frames])
 
     def add_robot() -> None:
         robot = pin.RobotWrapper(m)
-        s.add_poses(("RobotWrapper",), [robot.framePlacement(q, f).copy() for f in s.frames])
+        s.add_poses("RobotWrapper", [robot.framePlacement(q, f).copy() for f in s.frames])
 
     add_parts(s.found, *(partial(add, *one) for one in reached.items()), add_robot)
 
@@ -92,15 +90,15 @@ def _add_velocities(s: Probed) -> None:
     of_q, of_step = (s.square(pin.dIntegrate(m, q, step, at)) for at in (ARG0, ARG1))
     to_here = s.square(pin.dIntegrate(m, before, step, ARG1))
     from_here = s.square(pin.dDifference(m, q, after, ARG0))
-    found: dict[Call, Any] = {
-        ("dDifference", "ArgumentPosition", "ArgumentPosition.ARG1"): to_here
+    found = {
+        "dDifference ArgumentPosition ArgumentPosition.ARG1": to_here
         @ s.square(pin.dDifference(m, before, q, ARG1))
         @ v,
-        ("dDifference", "ArgumentPosition.ARG0"): np.linalg.solve(of_q, -of_step @ from_here @ v),
+        "dDifference ArgumentPosition.ARG0": np.linalg.solve(of_q, -of_step @ from_here @ v),
     }
     for at, matrix in ((ARG0, of_q), (ARG1, of_step)):
         moved = np.ravel(pin.dIntegrateTransport(m, q, step, v[:, None], at))
-        call = "dIntegrateTransport", "dIntegrate", f"ArgumentPosition.{at}"
+        call = f"dIntegrateTransport dIntegrate ArgumentPosition.{at}"
         found[call] = np.linalg.solve(matrix, moved)
     s.add_velocities(found)
 
@@ -113,9 +111,9 @@ def _add_tangent_maps(s: Probed) -> None:
     sizes, starts = map(list, pin.getTangentToConfigurationSparsitySegment(m))
     rows = [row[:n] @ v[at : at + n] for row, at, n in zip(compact, starts, sizes, strict=True)]
     s.add_velocities({
-        ("tangentMap", "tangentMapProduct"): inverse @ rate,
-        ("compactTangentMap", "getTangentToConfigurationSparsitySegment"): inverse @ np.array(rows),
-        ("tangentMapTransposeProduct",): np.linalg.solve(T.T @ T, back),
+        "tangentMap tangentMapProduct": inverse @ rate,
+        "compactTangentMap getTangentToConfigurationSparsitySegment": inverse @ np.array(rows),
+        "tangentMapTransposeProduct": np.linalg.solve(T.T @ T, back),
     })  # fmt: skip
 
 
@@ -137,11 +135,11 @@ def _add_spatial(s: Probed) -> None:
         pin.computeJointJacobian(m, chain, s.q, j)
         base = next(i for i in m.supports[j] if i)
         ends.append(data.oMi[base] * chain.iMf[base] * place)
-    s.add("frame_acceleration_local", ("classicAcceleration",), classic)
-    s.add("frame_acceleration", ("skewSquare",), square)
-    by = "computeRNEADerivatives", "Data.dAdv", "Model.idx_vs", "Model.nvs"
+    s.add("frame_acceleration_local", "classicAcceleration", classic)
+    s.add("frame_acceleration", "skewSquare", square)
+    by = "computeRNEADerivatives Data.dAdv Model.idx_vs Model.nvs"
     s.add("frame_spatial_acceleration_at_origin_by_derivative", by, spatial)
-    s.add_poses(("computeJointJacobian", "Data.iMf"), ends)
+    s.add_poses("computeJointJacobian Data.iMf", ends)
 
 
 def _add_momenta(s: Probed) -> None:
@@ -156,21 +154,21 @@ def _add_momenta(s: Probed) -> None:
     by = "computeCentroidalDynamicsDerivatives"
     rate, turned = pin.Force(of_rate @ a + of_step @ v / 2), pin.Force(of_rate @ a + of_q @ v)
     for suffix, call, force in (  # at the world's origin
-        ("", (by, "Data.oh"), derived.oh[0]),
-        ("", ("computeCentroidalMomentum", "Data.h"), data.h[0]),
-        ("", (by, "Data.dFda"), pin.Force(of_rate @ v)),
-        ("", ("crba", "Data.Fcrb"),
+        ("", f"{by} Data.oh", derived.oh[0]),
+        ("", "computeCentroidalMomentum Data.h", data.h[0]),
+        ("", f"{by} Data.dFda", pin.Force(of_rate @ v)),
+        ("", "crba Data.Fcrb",
          sum((_root_momentum(s, composite, j) for j in roots), pin.Force.Zero())),
-        ("_rate_by_derivative", (by, "Data.of"), derived.of[0]),
-        ("_rate_by_derivative", (by, "Data.dFdv"), rate),
-        ("_rate_by_derivative", (by, "Data.dHdq"), turned),
+        ("_rate_by_derivative", f"{by} Data.of", derived.of[0]),
+        ("_rate_by_derivative", f"{by} Data.dFdv", rate),
+        ("_rate_by_derivative", f"{by} Data.dHdq", turned),
     ):  # fmt: skip
         s.add_momentum(call, to_centre.actInv(force), suffix)
     pin.ccrba(m, data, q, v)
-    s.add("total_mass", ("ccrba", "Data.Ig"), data.Ig.mass)
+    s.add("total_mass", "ccrba Data.Ig", data.Ig.mass)
     parameters = np.concatenate([x.toDynamicParameters()[:4] for x in m.inertias[1:]])
     regressor = np.reshape(pin.computeStaticRegressor(m, data, q), (3, -1))
-    s.add("centre_of_mass", ("computeStaticRegressor", "Data.staticRegressor"), regressor @ parameters)
+    s.add("centre_of_mass", "computeStaticRegressor Data.staticRegressor", regressor @ parameters)
 
 
 def _root_momentum(s: Probed, data: pin.Data, joint: int) -> pin.Force:
@@ -191,7 +189,7 @@ def _add_body_forces(s: Probed) -> None:
     for j, place in zip(s.joints, s.places, strict=True):
         force = data.oMi[j].act(m.inertias[j]) * data.oa_gf[j] + pin.Force(own[j] @ data.ov[j].vector)
         forces.append((data.oMi[j] * place).actInv(force))
-    s.add_twists(("body_force_local", "body_moment_local"), ("computeCoriolisMatrix", "Data.B"), forces)
+    s.add_twists(("body_force_local", "body_moment_local"), "computeCoriolisMatrix Data.B", forces)
 
 
 def mimics(s: Probed) -> Sequence[Callable[[Probed], None]]:
@@ -201,7 +199,7 @@ def mimics(s: Probed) -> Sequence[Callable[[Probed], None]]:
     return [partial(part, along_axis=given) for part in parts for given in (False, True)]
 
 
-def _with_mimics(s: Probed, along_axis: bool) -> tuple[Call, pin.Model]:
+def _with_mimics(s: Probed, along_axis: bool) -> tuple[str, pin.Model]:
     """The model, and the names that it uses; slides may be those along a given axis."""
     m, other, last, slides = s.m, pin.Model(), [0], list[tuple[int, int, float]]()
     other.gravity = m.gravity
@@ -222,8 +220,8 @@ def _with_mimics(s: Probed, along_axis: bool) -> tuple[Call, pin.Model]:
         last.append(number)
     for turn, beyond, pitch in slides:
         other = pin.transformJointIntoMimic(other, turn, beyond, pitch, 0.0)
-    kinds = ("JointModelPrismaticUnaligned",) if along_axis else ()
-    return ("transformJointIntoMimic", "JointModelMimic", "JointDataMimic", *kinds), other
+    kinds = "JointModelPrismaticUnaligned" if along_axis else ""
+    return f"transformJointIntoMimic JointModelMimic JointDataMimic {kinds}", other
 
 
 def _add_mimic_torques(s: Probed, along_axis: bool) -> None:
@@ -244,14 +242,14 @@ def _add_forward_derivatives(s: Probed) -> None:
     _, by_v, by_tau = pin.computeABADerivatives(m, data, q, v, tau)
     inverse = np.triu(s.square(by_tau))
     inverse = inverse + np.triu(inverse, 1).T
-    by = "computeABADerivatives", "Data.ddq_dtau"
+    by = "computeABADerivatives Data.ddq_dtau"
     s.add_forces("momentum_through_inverse_by_aba", {by: M @ (inverse @ (M @ v))})
     velocity_terms = np.linalg.solve(inverse, s.square(by_v) @ v / 2)
-    by = "computeABADerivatives", "Data.ddq_dv"
+    by = "computeABADerivatives Data.ddq_dv"
     s.add_accelerations(by, np.linalg.solve(M, velocity_terms + tau - g), "by_inverse")
 
 
 def _add_batch(s: Probed) -> None:
     tau = pin.rnea(s.m, s.workspace(), *s.motion).copy()
     a = pin.abaInParallel(1, pin.ModelPool(s.m, 1), *(x[:, None] for x in (s.q, s.v, tau)))
-    s.add_accelerations(("abaInParallel",), a, "by_aba")
+    s.add_accelerations("abaInParallel", a, "by_aba")

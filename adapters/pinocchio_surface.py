@@ -24,7 +24,7 @@ from adapters.pinocchio_common import armature, joint_of
 from adapters.pinocchio_probes import Probed
 from adapters.pinocchio_relations import mimics, relations
 from plumbline.engines.missing_names import FAILED_PARTS, MISSING_NAMES, add_parts
-from plumbline.model.datatypes import Array, Call
+from plumbline.model.datatypes import Array
 from plumbline.model.kinematics import cross
 
 SPATIAL = "spatial_acceleration"
@@ -153,7 +153,7 @@ def _add_readings(s: Probed, name: str, data: pin.Data, derived: pin.Data, read:
             found[function, what, by].append(twist)
     for (function, what, by), twists in found.items():
         of_point, of_rotation = f"frame_{what}{frame.of_point}{by}", f"{ANGULAR[what]}{frame.of_rotation}{by}"
-        call = *function.split(), f"ReferenceFrame.{name}"
+        call = f"{function} ReferenceFrame.{name}"
         s.add_twists((of_point, f"frame_angular_{of_rotation}"), call, twists)
 
 
@@ -233,7 +233,7 @@ def _add_points(s: Probed, derived: pin.Data, name: str) -> None:
         rows[what, "getPointVelocityDerivatives"].append(s.rate(by_q, by_v))
         rows["acceleration", "getPointClassicAccelerationDerivatives"].append(s.rate(of_v, of_a, s.v / 2))
     for (what, function), values in rows.items():
-        s.add(f"frame_{what}{FRAMES[name].of_point}_by_derivative", (function,), values)
+        s.add(f"frame_{what}{FRAMES[name].of_point}_by_derivative", function, values)
 
 
 def _add_data(s: Probed) -> None:
@@ -249,20 +249,20 @@ def _add_data(s: Probed) -> None:
     for joint in range(1, m.njoints):
         chained.append(chained[m.parents[joint]] * data.liMi[joint])
     places = list(zip(s.joints, s.places, strict=True))
-    s.add_poses(("forwardKinematics", "Data.oMi"), [data.oMi[j] * place for j, place in places])
-    s.add_poses(("Data.liMi",), [chained[j] * place for j, place in places])
-    s.add_poses(("updateFramePlacements", "Data.oMf"), [data.oMf[f] for f in s.frames])
-    s.add_poses(("updateFramePlacement",), [pin.updateFramePlacement(m, data, f).copy() for f in s.frames])
-    s.add_poses(("updateGlobalPlacements",), [data.oMi[j] * place for j, place in places])
+    s.add_poses("forwardKinematics Data.oMi", [data.oMi[j] * place for j, place in places])
+    s.add_poses("Data.liMi", [chained[j] * place for j, place in places])
+    s.add_poses("updateFramePlacements Data.oMf", [data.oMf[f] for f in s.frames])
+    s.add_poses("updateFramePlacement", [pin.updateFramePlacement(m, data, f).copy() for f in s.frames])
+    s.add_poses("updateGlobalPlacements", [data.oMi[j] * place for j, place in places])
     weight = pin.Motion(m.gravity.linear, np.zeros(3))
     for what, at, by, values in (
-        ("velocity", "_local", ("forwardKinematics", "Data.v"), data.v),
-        (SPATIAL, "_local", ("forwardKinematics", "Data.a"), data.a),
-        (SPATIAL, "_local", ("rnea", "Data.a_gf"),
+        ("velocity", "_local", "forwardKinematics Data.v", data.v),
+        (SPATIAL, "_local", "forwardKinematics Data.a", data.a),
+        (SPATIAL, "_local", "rnea Data.a_gf",
          [x + pose.actInv(weight) for x, pose in zip(data.a_gf, data.oMi, strict=True)]),
-        ("velocity", "_at_origin", ("computeRNEADerivatives", "Data.ov"), derived.ov),
-        (SPATIAL, "_at_origin", ("computeRNEADerivatives", "Data.oa"), derived.oa),
-        (SPATIAL, "_at_origin", ("computeRNEADerivatives", "Data.oa_gf"),
+        ("velocity", "_at_origin", "computeRNEADerivatives Data.ov", derived.ov),
+        (SPATIAL, "_at_origin", "computeRNEADerivatives Data.oa", derived.oa),
+        (SPATIAL, "_at_origin", "computeRNEADerivatives Data.oa_gf",
          [x + weight for x in derived.oa_gf]),
     ):  # fmt: skip
         is_local = at == "_local"
@@ -273,69 +273,69 @@ def _add_data(s: Probed) -> None:
     columns = [s.columns(j) for j in s.joints]
     velocity = [J[:3, own] @ s.v[own] for own in columns]
     rate = [dJ[:3, own] @ s.v[own] + J[:3, own] @ s.a[own] for own in columns]
-    s.add("frame_velocity_at_origin", ("computeJointJacobians", "Data.J"), velocity)
-    by = "computeJointJacobiansTimeVariation", "Data.dJ"
+    s.add("frame_velocity_at_origin", "computeJointJacobians Data.J", velocity)
+    by = "computeJointJacobiansTimeVariation Data.dJ"
     s.add("frame_spatial_acceleration_at_origin_by_jacobian_rate", by, rate)
 
 
 def _add_centres(s: Probed) -> None:
     m, (q, v, a), data, derived = s.m, s.motion, s.workspace(), s.workspace()
-    s.add("total_mass", ("computeTotalMass",), pin.computeTotalMass(m))
+    s.add("total_mass", "computeTotalMass", pin.computeTotalMass(m))
     pin.centerOfMass(m, data, q, v, a)
     pin.forwardKinematics(m, derived, q, v, a)
     for quantity, name, level in (
         ("", "com", "POSITION"), ("_velocity", "vcom", "VELOCITY"), ("_acceleration", "acom", "ACCELERATION"),
     ):  # fmt: skip
-        s.add(f"centre_of_mass{quantity}", ("centerOfMass", f"Data.{name}"), getattr(data, name)[0])
+        s.add(f"centre_of_mass{quantity}", f"centerOfMass Data.{name}", getattr(data, name)[0])
         pin.centerOfMass(m, derived, getattr(pin.KinematicLevel, level))
-        call = "centerOfMass", "KinematicLevel", f"KinematicLevel.{level}"
+        call = f"centerOfMass KinematicLevel KinematicLevel.{level}"
         s.add(f"centre_of_mass{quantity}", call, getattr(derived, name)[0])
     jacobian = s.square(pin.jacobianCenterOfMass(m, data, q))
-    s.add("centre_of_mass_velocity", ("jacobianCenterOfMass", "Data.Jcom"), s.square(data.Jcom) @ v)
+    s.add("centre_of_mass_velocity", "jacobianCenterOfMass Data.Jcom", s.square(data.Jcom) @ v)
     pin.computeForwardKinematicsDerivatives(m, derived, q, v, a)
     pin.centerOfMass(m, derived, q, v)
     function = "getCenterOfMassVelocityDerivatives"
     rate = s.rate(getattr(pin, function)(m, derived), jacobian)
-    s.add("centre_of_mass_acceleration_by_derivative", (function,), rate)
+    s.add("centre_of_mass_acceleration_by_derivative", function, rate)
     if s.rates is not None and len(set(s.joints)) == len(s.joints):  # no joint carries two bodies
         _add_subtrees(s)
     momentum = pin.computeCentroidalMomentum(m, data, q, v).copy()
-    s.add_momentum(("computeCentroidalMomentum", "Data.hg"), momentum)
+    s.add_momentum("computeCentroidalMomentum Data.hg", momentum)
     by_map = s.square(pin.computeCentroidalMap(m, data, q)) @ v
-    s.add_momentum(("computeCentroidalMap", "Data.Ag"), by_map)
-    s.add_momentum(("ccrba",), s.square(pin.ccrba(m, data, q, v)) @ v)
+    s.add_momentum("computeCentroidalMap Data.Ag", by_map)
+    s.add_momentum("ccrba", s.square(pin.ccrba(m, data, q, v)) @ v)
     variation = pin.computeCentroidalMomentumTimeVariation(m, data, q, v, a).copy()
-    s.add_momentum(("computeCentroidalMomentumTimeVariation", "Data.dhg"), variation, "_rate")
+    s.add_momentum("computeCentroidalMomentumTimeVariation Data.dhg", variation, "_rate")
     rate = s.rate(np.array(pin.computeCentroidalMapTimeVariation(m, data, q, v)), data.Ag)
-    s.add_momentum(("computeCentroidalMapTimeVariation", "Data.dAg"), rate, "_rate_by_map_rate")
-    s.add_momentum(("dccrba",), s.rate(pin.dccrba(m, data, q, v), data.Ag), "_rate_by_map_rate")
+    s.add_momentum("computeCentroidalMapTimeVariation Data.dAg", rate, "_rate_by_map_rate")
+    s.add_momentum("dccrba", s.rate(pin.dccrba(m, data, q, v), data.Ag), "_rate_by_map_rate")
     pin.computeRNEADerivatives(m, data, q, v, a)
     for name, (h_q, _, of_v, of_a) in (
         ("compute", pin.computeCentroidalDynamicsDerivatives(m, derived, q, v, a)),
         ("get", pin.getCentroidalDynamicsDerivatives(m, data)),
     ):
         rate = (s.rate(h_q, of_a) + s.rate(of_v, of_a, v / 2)) / 2
-        s.add_momentum((f"{name}CentroidalDynamicsDerivatives",), rate, "_rate_by_derivative")
+        s.add_momentum(f"{name}CentroidalDynamicsDerivatives", rate, "_rate_by_derivative")
 
 
 def _add_subtrees(s: Probed) -> None:
     m, (q, v, a), data, other = s.m, s.motion, s.workspace(), s.workspace()
     pin.centerOfMass(m, data, q, v, a, True)
     poses = [(j, data.oMi[j].copy()) for j in s.joints]
-    s.add("subtree_centre", ("centerOfMass",), [pose.act(data.com[j]) for j, pose in poses])
+    s.add("subtree_centre", "centerOfMass", [pose.act(data.com[j]) for j, pose in poses])
     for quantity, values in (("velocity", data.vcom), ("acceleration", data.acom)):
-        s.add(f"subtree_{quantity}", ("centerOfMass",), [pose.rotation @ values[j] for j, pose in poses])
+        s.add(f"subtree_{quantity}", "centerOfMass", [pose.rotation @ values[j] for j, pose in poses])
     pin.computeSubtreeMasses(m, data)
-    s.add("subtree_mass", ("computeSubtreeMasses", "Data.mass"), [[data.mass[j]] for j in s.joints])
+    s.add("subtree_mass", "computeSubtreeMasses Data.mass", [[data.mass[j]] for j in s.joints])
     velocities = [s.square(pin.jacobianSubtreeCenterOfMass(m, other, q, j)) @ v for j in s.joints]
-    s.add("subtree_velocity", ("jacobianSubtreeCenterOfMass",), velocities)
+    s.add("subtree_velocity", "jacobianSubtreeCenterOfMass", velocities)
     pin.jacobianCenterOfMass(m, other, q)
     velocities = [s.square(pin.getJacobianSubtreeCenterOfMass(m, other, j)) @ v for j in s.joints]
-    s.add("subtree_velocity", ("getJacobianSubtreeCenterOfMass",), velocities)
+    s.add("subtree_velocity", "getJacobianSubtreeCenterOfMass", velocities)
     pin.crba(m, other, q, pin.Convention.LOCAL)
-    s.add("subtree_centre", ("Data.Ycrb",), [pose.act(other.Ycrb[j].lever) for j, pose in poses])
+    s.add("subtree_centre", "Data.Ycrb", [pose.act(other.Ycrb[j].lever) for j, pose in poses])
     pin.ccrba(m, other, q, v)
-    s.add("subtree_centre", ("Data.oYcrb",), [other.oYcrb[j].lever.copy() for j in s.joints])
+    s.add("subtree_centre", "Data.oYcrb", [other.oYcrb[j].lever.copy() for j in s.joints])
 
 
 def _add_regressors(s: Probed, bodies: Sequence[pin.Inertia]) -> None:
@@ -361,9 +361,9 @@ def _add_regressors(s: Probed, bodies: Sequence[pin.Inertia]) -> None:
         of_frame = pin.computeFrameKinematicRegressor(m, moved, f, local) @ turns
         velocities["computeFrameKinematicRegressor"].append(of_frame)
     for function, values in forces.items():
-        s.add_twists(("body_force_local", "body_moment_local"), (function,), values)
+        s.add_twists(("body_force_local", "body_moment_local"), function, values)
     for function, values in velocities.items():
-        s.add_twists(("frame_velocity_local", "frame_angular_velocity_local"), (function,), values)
+        s.add_twists(("frame_velocity_local", "frame_angular_velocity_local"), function, values)
 
 
 def _add_torques(s: Probed) -> None:
@@ -373,8 +373,8 @@ def _add_torques(s: Probed) -> None:
     M, none = _add_products(s, terms), pin.StdVec_Force()
     none.extend([pin.Force.Zero()] * m.njoints)
     g = pin.computeGeneralizedGravity(m, data, q).copy()
-    static: dict[Call, Array] = {("computeStaticTorque",): pin.computeStaticTorque(m, data, q, none).copy()}
-    s.add_forces("generalized_gravity", {("computeGeneralizedGravity", "Data.g"): g} | static)
+    static = {"computeStaticTorque": pin.computeStaticTorque(m, data, q, none).copy()}
+    s.add_forces("generalized_gravity", {"computeGeneralizedGravity Data.g": g} | static)
     tau, rotors = pin.rnea(m, data, q, v, a).copy(), armature(m) * a
     parameters = np.concatenate([inertia.toDynamicParameters() for inertia in m.inertias[1:]])
     _add_energies(s, parameters, g, none)
@@ -383,19 +383,19 @@ def _add_torques(s: Probed) -> None:
     _, of_v, of_a = pin.computeRNEADerivatives(m, derived, q, v, a)
     by_regressor = np.reshape(pin.computeJointTorqueRegressor(m, data, q, v, a), (-1, len(parameters)))
     again = pin.rnea(m, data, q, v, pin.aba(m, data, q, v, tau).copy())
-    dynamics: dict[str, dict[Call, Array]] = {  # with the rotors
+    dynamics = {  # with the rotors
         "": {
-            ("rnea", "Data.tau"): tau,
-            ("nonLinearEffects",): pin.nonLinearEffects(m, data, q, v) + M @ a,
-            ("nle", "Data.nle"): pin.nle(m, data, q, v) + M @ a,
-            ("computeAllTerms", "Data.nle"): terms.nle + M @ a,
-            ("computeJointTorqueRegressor", "Data.jointTorqueRegressor"): by_regressor @ parameters + rotors,
+            "rnea Data.tau": tau,
+            "nonLinearEffects": pin.nonLinearEffects(m, data, q, v) + M @ a,
+            "nle Data.nle": pin.nle(m, data, q, v) + M @ a,
+            "computeAllTerms Data.nle": terms.nle + M @ a,
+            "computeJointTorqueRegressor Data.jointTorqueRegressor": by_regressor @ parameters + rotors,
         },
-        "_by_derivative": {("computeRNEADerivatives", "Data.dtau_dv"): s.rate(of_v, of_a, v / 2) + g},
-        "_by_aba": {("aba", "Data.ddq"): again},
+        "_by_derivative": {"computeRNEADerivatives Data.dtau_dv": s.rate(of_v, of_a, v / 2) + g},
+        "_by_aba": {"aba Data.ddq": again},
         "_by_coriolis_matrix": {
-            ("computeCoriolisMatrix", "Data.C"): coriolis,
-            ("getCoriolisMatrix",): s.square(pin.getCoriolisMatrix(m, derived)) @ v + rest,
+            "computeCoriolisMatrix Data.C": coriolis,
+            "getCoriolisMatrix": s.square(pin.getCoriolisMatrix(m, derived)) @ v + rest,
         },
     }
     for by, values in dynamics.items():
@@ -405,7 +405,7 @@ def _add_torques(s: Probed) -> None:
 def _add_batch(s: Probed) -> None:
     """Add what batched calls return, which the wheels of some versions lack."""
     tau = np.ravel(pin.rneaInParallel(1, pin.ModelPool(s.m, 1), *(x[:, None] for x in s.motion)))
-    s.add_forces("inverse_dynamics", {("rneaInParallel", "ModelPool"): tau - armature(s.m) * s.a})
+    s.add_forces("inverse_dynamics", {"rneaInParallel ModelPool": tau - armature(s.m) * s.a})
 
 
 def _add_products(s: Probed, terms: pin.Data) -> Array:
@@ -416,20 +416,20 @@ def _add_products(s: Probed, terms: pin.Data) -> Array:
     pin.cholesky.decompose(m, data)
     U, D, upper = s.square(data.U), np.ravel(data.D), np.triu(s.square(terms.M))
     world = s.square(pin.crba(m, s.workspace(), q, pin.Convention.WORLD))
-    momenta: dict[Call, Array] = {
-        ("crba", "Data.M"): momentum,
-        ("crba", "Convention", "Convention.WORLD"): world @ v,
-        ("cholesky.decompose", "Data.U", "Data.D"): U @ (D * (U.T @ v)),
-        ("computeAllTerms", "Data.M"): upper @ v + np.triu(upper, 1).T @ v,
+    momenta = {
+        "crba Data.M": momentum,
+        "crba Convention Convention.WORLD": world @ v,
+        "cholesky.decompose Data.U Data.D": U @ (D * (U.T @ v)),
+        "computeAllTerms Data.M": upper @ v + np.triu(upper, 1).T @ v,
     }
-    through: dict[Call, Array] = {
-        ("cholesky.decompose", "cholesky.solve"): M @ np.ravel(pin.cholesky.solve(m, data, momentum)),
-        ("cholesky.computeMinv",): M @ (s.square(pin.cholesky.computeMinv(m, data)) @ momentum),
+    through = {
+        "cholesky.decompose cholesky.solve": M @ np.ravel(pin.cholesky.solve(m, data, momentum)),
+        "cholesky.computeMinv": M @ (s.square(pin.cholesky.computeMinv(m, data)) @ momentum),
     }
     by_aba = M @ (s.square(pin.computeMinverse(m, data, q)) @ momentum)
     s.add_forces("generalized_momentum", momenta)
     s.add_forces("momentum_through_inverse", through)
-    s.add_forces("momentum_through_inverse_by_aba", {("computeMinverse", "Data.Minv"): by_aba})
+    s.add_forces("momentum_through_inverse_by_aba", {"computeMinverse Data.Minv": by_aba})
     return M
 
 
@@ -442,19 +442,19 @@ def _add_energies(s: Probed, parameters: Array, g: Array, none: pin.StdVec_Force
     by_torque = pin.computeStaticTorqueDerivatives(m, data, q, none).copy()
     by_rnea = pin.computeRNEADerivatives(m, data, q, zero, zero)[0].copy()
     for quantity, call, value in (
-        ("kinetic_energy", ("computeKineticEnergy", "Data.kinetic_energy"),
+        ("kinetic_energy", "computeKineticEnergy Data.kinetic_energy",
          pin.computeKineticEnergy(m, data, q, v)),
-        ("kinetic_energy", ("computeKineticEnergyRegressor", "Data.kineticEnergyRegressor"), kinetic),
-        ("gravity_energy", ("computePotentialEnergy", "Data.potential_energy"),
+        ("kinetic_energy", "computeKineticEnergyRegressor Data.kineticEnergyRegressor", kinetic),
+        ("gravity_energy", "computePotentialEnergy Data.potential_energy",
          pin.computePotentialEnergy(m, data, q)),
-        ("gravity_energy", ("computePotentialEnergyRegressor", "Data.potentialEnergyRegressor"), gravity),
-        ("mechanical_energy", ("computeMechanicalEnergy", "Data.mechanical_energy"), both),
+        ("gravity_energy", "computePotentialEnergyRegressor Data.potentialEnergyRegressor", gravity),
+        ("mechanical_energy", "computeMechanicalEnergy Data.mechanical_energy", both),
         *(
             ("gravity_energy_second_rate_by_derivative", call, v @ s.square(matrix) @ v + g @ a)
             for call, matrix in (
-                (("computeGeneralizedGravityDerivatives",), by_gravity),
-                (("computeStaticTorqueDerivatives",), by_torque),
-                (("computeRNEADerivatives", "Data.dtau_dq"), by_rnea),
+                ("computeGeneralizedGravityDerivatives", by_gravity),
+                ("computeStaticTorqueDerivatives", by_torque),
+                ("computeRNEADerivatives Data.dtau_dq", by_rnea),
             )
         ),
     ):  # fmt: skip

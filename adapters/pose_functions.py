@@ -41,9 +41,10 @@ from typing import Any
 
 import numpy as np
 
+from adapters.surface_record import Answer
 from plumbline.engines.missing_names import add_parts
 from plumbline.layout import ROOT
-from plumbline.model.datatypes import Array, Call, Float, State
+from plumbline.model.datatypes import Array, Float, State
 from plumbline.model.kinematics import (
     angular_velocity,
     cross_matrix,
@@ -286,18 +287,22 @@ POSE_TABLES: Mapping[str, Mapping[str, str]] = json.loads(
 )
 
 
+# Takes a name, the values that it is given and the forms of the results to the results.
+PoseFunction = Callable[[str, Sequence[Any], Sequence[str]], Sequence[Any]]
+
+
 def add_pose_answers(
-    answers: Sequence[dict[str, dict[Call, Array]]],
+    answers: Sequence[Answer],
     states: Sequence[State],
     engine: str,
-    call: Callable[[str, Sequence[Any], Sequence[str]], Sequence[Any]],
+    call: PoseFunction,
 ) -> None:
     """Call all functions of an engine on all bodies at the first states; add what they say to the answers.
 
     Args:
         answers: of the surface, at these states.
         engine: whose table it is.
-        call: takes a name, the values that it is given and the forms of the results to the results.
+        call: calls a function of it.
 
     """
     for answer, state in zip(answers, states[:POSE_STATES], strict=False):
@@ -314,9 +319,9 @@ def _bodies(state: State) -> list[_Body]:
 
 
 def _add_pose_answer(
-    answer: dict[str, dict[Call, Array]],
+    answer: Answer,
     function: tuple[str, str],
-    call: Callable[[str, Sequence[Any], Sequence[str]], Sequence[Any]],
+    call: PoseFunction,
     bodies: Callable[[], Sequence[_Body]],
 ) -> None:
     """Call a function, whose name and forms are given, on all bodies."""
