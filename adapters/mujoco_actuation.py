@@ -28,29 +28,29 @@ from plumbline.model.datatypes import Array
 from plumbline.model.kinematics import rotation_matrix
 
 J = mujoco.mjtJoint
+Ways = Mapping[str, Mapping[str, str]]  # by way of an effort what its actuators have besides a gear
 GEAR, COEFFICIENT = -2.0, 0.5  # of actuators; of joints in fixed tendons
-# By way of an effort what its actuators have besides a gear.
-STATELESS: Mapping[str, Mapping[str, str]] = {
+STATELESS: Ways = {
     "motor": {}, "affine": {"gaintype": "mjtGain.mjGAIN_AFFINE"},
     "parent": {"trntype": "mjtTrn.mjTRN_JOINTINPARENT"},
 }  # fmt: skip
-WITH_STATE: Mapping[str, Mapping[str, str]] = {
+WITH_STATE: Ways = {
     "integrator": {"dyntype": "mjtDyn.mjDYN_INTEGRATOR"}, "filter": {"dyntype": "mjtDyn.mjDYN_FILTER"},
     "exact": {"dyntype": "mjtDyn.mjDYN_FILTEREXACT"},
 }  # fmt: skip
-BY_CALLBACK: Mapping[str, Mapping[str, str]] = {
+BY_CALLBACK: Ways = {
     "user": {"gaintype": "mjtGain.mjGAIN_USER", "biastype": "mjtBias.mjBIAS_USER"},
     "own state": {"dyntype": "mjtDyn.mjDYN_USER"},
 }
-PID: Mapping[str, Mapping[str, str]] = {"pid": {"gaintype": "mjtGain.mjGAIN_PID"}}
+PID: Ways = {"pid": {"gaintype": "mjtGain.mjGAIN_PID"}}
 PID_GAINS = np.array([3.0, 2.0, 4.0])  # of position, velocity and integral
 CALLBACKS = ("set_mjcb_act_gain", "set_mjcb_act_bias", "set_mjcb_act_dyn")
-SERVO: Mapping[str, Mapping[str, str]] = {"servo": {"biastype": "mjtBias.mjBIAS_AFFINE"}, "motor": {}}
+SERVO: Ways = {"servo": {"biastype": "mjtBias.mjBIAS_AFFINE"}, "motor": {}}
 GROUP_OFF = 3  # of actuators that are off
 FAR = 1e6  # of limits that are never reached [rad, m, N or N m]
 
 
-def with_actuators(ways: Mapping[str, Mapping[str, str]], read: str = "") -> Callable[[Any], Any]:
+def with_actuators(ways: Ways, read: str = "") -> Callable[[Any], Any]:
     """Add to every rate of every joint an actuator of each way, without a force so far.
 
     Args:
@@ -93,27 +93,32 @@ def _add_sensors(spec: Any, kind: str) -> None:
         add_sensor(spec, kind, of, one.name)
 
 
+def _dofs(m: Any, j: int) -> int:
+    """Count the rates of a joint."""
+    return DOFS[J(m.jnt_type[j])]
+
+
 def _actuators(m: Any, way: str) -> Iterator[tuple[int, int, int]]:
     """The actuators of a way, with joint and rate."""
     for j in range(m.njnt):
-        for i in range(DOFS[J(m.jnt_type[j])]):
+        for i in range(_dofs(m, j)):
             yield m.actuator(f"{way} of {m.joint(j).name} {i}").id, j, i
 
 
-def _set_efforts(m: Any, d: Any, ways: Mapping[str, Mapping[str, str]], effort: Array) -> None:
+def _set_efforts(m: Any, d: Any, ways: Ways, effort: Array) -> None:
     """Share the efforts of all joints equally among the ways."""
     for way, members in ways.items():
         share = effort / len(ways)
         for a, j, i in _actuators(m, way):
             at, rate = m.jnt_qposadr[j], m.jnt_dofadr[j] + i
             wanted = share[rate]
-            turned = DOFS[J(m.jnt_type[j])] - 3  # where the attitude of a free joint starts
+            turned = _dofs(m, j) - 3  # where the attitude of a free joint starts
             if way == "parent" and 0 <= turned <= i:
                 first = m.jnt_dofadr[j] + turned
                 q = d.qpos[at + turned : at + turned + 4]
                 wanted = (rotation_matrix(q / np.linalg.norm(q)) @ share[first : first + 3])[i - turned]
             if way == "affine":
-                length = GEAR * d.qpos[at] if DOFS[J(m.jnt_type[j])] == 1 else 0.0
+                length = GEAR * d.qpos[at] if _dofs(m, j) == 1 else 0.0
                 speed = GEAR * d.qvel[rate]
                 gain = 2.0, 0.5 / (1 + abs(length)), 0.5 / (1 + abs(speed))
                 m.actuator_gainprm[a, :3] = gain if length else (2.0, 0.0, 0.5 / (1 + abs(speed)))
@@ -130,7 +135,7 @@ def _set_pid(m: Any, d: Any, a: int, force: float, place: tuple[int, int]) -> No
     """Let a quarter of a force come from each of position, velocity, feedforward and integral."""
     j, rate = place
     at = m.actuator_ctrladr[a]
-    if DOFS[J(m.jnt_type[j])] > 1:  # whose lengths are another matter
+    if _dofs(m, j) > 1:  # whose lengths are another matter
         m.actuator_biasprm[a] = m.actuator_gainprm[a] = 0.0
         d.ctrl[at : at + 3] = 0.0, 0.0, force
         return
@@ -145,7 +150,7 @@ def _control(m: Any, a: int) -> int:
     return int(m.actuator_ctrladr[a]) if hasattr(m, "actuator_ctrladr") else a
 
 
-def forward_by_actuators(ways: Mapping[str, Mapping[str, str]], read: str = "") -> Callable[[Any, Any], None]:
+def forward_by_actuators(ways: Ways, read: str = "") -> Callable[[Any, Any], None]:
     """Let actuators exert the efforts, and servos be springs and dampers, for one evaluation.
 
     Args:
@@ -174,7 +179,7 @@ def _set_servos(m: Any, d: Any) -> None:
     for a, j, i in _actuators(m, "servo"):
         rate = m.jnt_dofadr[j] + i
         m.actuator_biasprm[a, 2] = -m.dof_damping[rate] / GEAR**2
-        if DOFS[J(m.jnt_type[j])] == 1:  # a ball's spring stays
+        if _dofs(m, j) == 1:  # a ball's spring stays
             stiffness = float(np.ravel(m.jnt_stiffness[j])[0]) / GEAR**2
             m.actuator_gainprm[a, 0], m.actuator_biasprm[a, 1] = stiffness, -stiffness
             d.ctrl[_control(m, a)] = GEAR * m.qpos_spring[m.jnt_qposadr[j]]
@@ -189,7 +194,7 @@ def _accelerate_by_sensors(m: Any, d: Any, kind: str) -> None:
     force = d.qfrc_actuator.copy()
     if kind == "JOINTACTFRC":
         for j in range(m.njnt):
-            if DOFS[J(m.jnt_type[j])] == 1:
+            if _dofs(m, j) == 1:
                 force[m.jnt_dofadr[j]] = d.sensor(f"{kind} {m.joint(j).name}").data[0]
     else:
         moment = dense_rows(d.actuator_moment, m, d, "moment")
@@ -250,7 +255,7 @@ def elements_on_tendons(m: Any, d: Any) -> tuple[Any, Any]:
 
 def _tendons(m: Any) -> list[tuple[int, int]]:
     """Pairs of hinge or slide and tendon."""
-    scalar = [j for j in range(m.njnt) if DOFS[J(m.jnt_type[j])] == 1]
+    scalar = [j for j in range(m.njnt) if _dofs(m, j) == 1]
     return [(j, m.tendon(f"of {m.joint(j).name}").id) for j in scalar]
 
 
@@ -328,6 +333,6 @@ def with_gravcomp_of_attached(spec: Any) -> Any:
     return spec
 
 
-def names_of(ways: Mapping[str, Mapping[str, str]]) -> tuple[str, ...]:
+def names_of(ways: Ways) -> tuple[str, ...]:
     """The members that ways have."""
     return tuple(dict.fromkeys(member for members in ways.values() for member in members.values()))

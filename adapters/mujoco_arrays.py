@@ -12,11 +12,12 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from adapters.mujoco_common import structure_of
+from adapters.mujoco_common import structure_of, symmetric
 from adapters.mujoco_probes import Probed
 from plumbline.model.datatypes import Array, Float
 from plumbline.model.kinematics import (
     cross,
+    cross_matrix,
     quaternion_exponential,
     quaternion_product,
     rotate_vectors,
@@ -24,7 +25,7 @@ from plumbline.model.kinematics import (
 )
 from plumbline.model.probe_frames import PROBE_TURN
 
-SCALAR = {mujoco.mjtJoint.mjJNT_HINGE: "HINGE", mujoco.mjtJoint.mjJNT_SLIDE: "SLIDE"}
+SensorKinds = tuple[str, str]  # of a joint: what report its position and its rate
 
 
 def _add_motions(s: Probed) -> None:
@@ -91,7 +92,7 @@ def _add_attitudes(s: Probed) -> None:
         s.add_attitudes(f"MjData.{name}", getattr(d, name)[ids], of)
 
 
-def _own_motion(m: Any, d: Any, b: int, sensors: set[str]) -> tuple[Array, Array, list[Array]]:
+def _own_motion(m: Any, d: Any, b: int, sensors: set[SensorKinds]) -> tuple[Array, Array, list[Array]]:
     """A body in its parent by what sensors report of its joints, whose kinds are noted.
 
     Returns:
@@ -101,25 +102,22 @@ def _own_motion(m: Any, d: Any, b: int, sensors: set[str]) -> tuple[Array, Array
     quat, moved = m.body_quat[b].copy(), m.body_pos[b].copy()
     rates = [np.zeros(3)]
     for j in _joints(m, b):
-        name = SCALAR.get(mujoco.mjtJoint(m.jnt_type[j]))
         if m.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE:  # it has no sensor
             at = m.jnt_qposadr[j]
             moved, quat = d.qpos[at : at + 3], d.qpos[at + 3 : at + 7]
             rates.append(d.qvel[m.jnt_dofadr[j] + 3 :][:3])
             continue
-        if name is None:
-            sensors |= {"BALLQUAT", "BALLANGVEL"}
-            own, w = (d.sensor(f"{kind} {m.joint(j).name}").data for kind in ("BALLQUAT", "BALLANGVEL"))
-            rates = [rotation_matrix(own).T @ x for x in rates] + [w]
-        else:
-            sensors |= {"JOINTPOS", "JOINTVEL"}
-            q, v = (float(d.sensor(f"{kind} {m.joint(j).name}").data[0]) for kind in ("JOINTPOS", "JOINTVEL"))
-            q -= m.qpos0[m.jnt_qposadr[j]]
-            if name == "SLIDE":
-                moved = moved + rotation_matrix(quat) @ (q * m.jnt_axis[j])
+        is_ball = m.jnt_type[j] == mujoco.mjtJoint.mjJNT_BALL
+        kinds = ("BALLQUAT", "BALLANGVEL") if is_ball else ("JOINTPOS", "JOINTVEL")
+        sensors.add(kinds)
+        own, w = (d.sensor(f"{kind} {m.joint(j).name}").data for kind in kinds)
+        if not is_ball:
+            shift = (own[0] - m.qpos0[m.jnt_qposadr[j]]) * m.jnt_axis[j]
+            if m.jnt_type[j] == mujoco.mjtJoint.mjJNT_SLIDE:
+                moved = moved + rotation_matrix(quat) @ shift
                 continue
-            own = quaternion_exponential(q * m.jnt_axis[j] / 2)
-            rates = [rotation_matrix(own).T @ x for x in rates] + [v * m.jnt_axis[j]]
+            own, w = quaternion_exponential(shift / 2), w[0] * m.jnt_axis[j]
+        rates = [rotation_matrix(own).T @ x for x in rates] + [w]
         near = moved + rotation_matrix(quat) @ m.jnt_pos[j]
         quat = quaternion_product(quat, own)
         moved = near - rotation_matrix(quat) @ m.jnt_pos[j]
@@ -134,7 +132,7 @@ def _add_joint_frames(s: Probed) -> None:
     """Go from joint to joint by what sensors report of each, and by the frames of the joints."""
     m, d, links = s.m, s.d, s.links
     turn, (spin, place, along) = np.tile(np.eye(3), (m.nbody, 1, 1)), np.zeros((3, m.nbody, 3))
-    sensors = set[str]()
+    sensors = set[SensorKinds]()
     for b in range(1, m.nbody):
         up = m.body_parentid[b]
         moved, quat, rates = _own_motion(m, d, b, sensors)
@@ -147,11 +145,11 @@ def _add_joint_frames(s: Probed) -> None:
                 along[b] = along[b] + d.qvel[m.jnt_dofadr[j]] * d.xaxis[j]
             elif m.jnt_type[j] != mujoco.mjtJoint.mjJNT_SLIDE:
                 along[b] = along[b] + turn[b] @ rates[-1]
-    by = [f"mjtSensor.mjSENS_{kind}" for kind in sorted(sensors)]
-    positions, turnings = (
-        " ".join(x for x in by if x.endswith(("POS", "QUAT")) == is_position) for is_position in (True, False)
-    )
-    if by:
+    if sensors:
+        positions, turnings = (
+            " ".join(f"mjtSensor.mjSENS_{kind}" for kind in kinds)
+            for kinds in zip(*sorted(sensors), strict=True)
+        )
         s.add("body_position", positions, place[links])
         s.add_axes(positions, turn[links] @ PROBE_TURN)
         s.add("frame_angular_velocity", turnings, spin[links])
@@ -184,11 +182,8 @@ def _add_joint_views(s: Probed) -> None:
 
 def spatial_inertia(ten: Float[Array, "10"]) -> Float[Array, "6 6"]:
     """The matrix of one of ``cinert`` or ``crb``."""
-    xx, yy, zz, xy, xz, yz, *moment, mass = ten
-    x, y, z = moment
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    J = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    return np.block([[J, cross], [cross.T, mass * np.eye(3)]])
+    moment = cross_matrix(ten[6:9])
+    return np.block([[symmetric(ten[:6]), moment], [moment.T, ten[9] * np.eye(3)]])
 
 
 def _add_inertias(s: Probed) -> None:

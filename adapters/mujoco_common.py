@@ -139,6 +139,11 @@ def principal_inertia(J: Float[Array, "3 3"]) -> tuple[Float[Array, "3"], Float[
     return values, q
 
 
+def symmetric(six: Float[Array, "6"]) -> Float[Array, "3 3"]:
+    """Return the matrix whose entries xx, yy, zz, xy, xz, yz these are."""
+    return np.asarray(six)[[[0, 3, 4], [3, 1, 5], [4, 5, 2]]]
+
+
 @contextmanager
 def warnings_to(receive: Callable[[str], Any]) -> Iterator[None]:
     """Give MuJoCo's warnings to a function; else they go to a log file in the current folder."""

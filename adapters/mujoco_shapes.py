@@ -7,7 +7,14 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from adapters.mujoco_common import bodies_of, children_of, compiler_of, principal_inertia, set_attributes
+from adapters.mujoco_common import (
+    bodies_of,
+    children_of,
+    compiler_of,
+    principal_inertia,
+    set_attributes,
+    symmetric,
+)
 from plumbline.model.datatypes import Array, Float
 from plumbline.model.kinematics import quaternion_conjugate, quaternion_product, rotation_matrix
 
@@ -25,8 +32,7 @@ def of_shapes(spec: Any) -> Any:
     for k, body in enumerate(bodies_of(spec)):
         if np.isnan(body.fullinertia[0]):
             continue
-        xx, yy, zz, xy, xz, yz = body.fullinertia
-        moments, quat = principal_inertia(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
+        moments, quat = principal_inertia(symmetric(body.fullinertia))
         mass, body.explicitinertial, body.fullinertia = body.mass, False, np.full(6, np.nan)
         body.ipos = np.full(3, np.nan)
         round_part = ROUND * (np.sum(moments) - 2 * np.max(moments))

@@ -444,7 +444,7 @@ def _of_shapes(by: str, describe: Callable[[Any], Any], suits: Callable[[Model],
 
 
 def _actuated(
-    ways: Mapping[str, Mapping[str, str]],
+    ways: actuation.Ways,
     read: str = "",
     names: str = "",
     suits: Callable[[Model], bool] = has("effort"),  # noqa: B008
