@@ -93,16 +93,6 @@ SLIDES = tuple(getattr(exudyn.JointType, name) for name in ("PrismaticX", "Prism
 MIN_COS_MIDDLE_ANGLE = 0.1
 
 
-@dataclass(frozen=True, eq=False)
-class _RevoluteGroup:
-    """Two or three revolutes in a row (Z, Y and, for a ball, X) whose angles start at 0."""
-
-    first_angle: int  # index of the first angle
-    angle_count: int  # 2 for a rod, 3 for a ball
-    axes: Float[Array, "3 3"]  # world axes of the link at the start, columns x, y, z
-    body: int  # the body that hangs by it, for messages
-
-
 @dataclass(eq=False)
 class _Link:
     """A link of the kinematic tree, on a revolute or a slide."""
@@ -112,6 +102,7 @@ class _Link:
     axes_in_parent: Float[Array, "3 3"]
     offset: Float[Array, "3"]  # m, in the parent
     axis: Float[Array, "3"]  # of the joint at the start, world frame
+    start: float  # where its coordinate of 0 is, as `Trajectory` counts it
     centre: Array = field(default_factory=lambda: np.zeros(3))  # of mass, m
     inertia: Array = field(default_factory=lambda: np.zeros((3, 3)))  # kg m², about the centre of mass
     mass: float = 0.0  # kg
@@ -128,7 +119,8 @@ class _Linkage:
         self.attitude = rotation_matrix(state.p)
         self.nu = minimal_rates(model, state)
         self.links: list[_Link] = []
-        self.revolute_groups: list[_RevoluteGroup] = []
+        self.middle_angles: list[tuple[int, int]] = []  # number of the link, and the body that hangs by it
+        self.angle_axes: list[Array] = []  # of revolutes that carry balls and rods, world
         self.link_of_body: list[int] = []
         self.origins: list[Array] = []
         self.W = np.zeros((0, len(self.nu)))
@@ -151,23 +143,12 @@ class _Linkage:
             if kind.holds_distance:
                 self._add_rod(k)
             if kind.holds_nothing:
-                self._add_shifts(own)
+                self._add_shifts(k, own)
             if kind.has_attitude:
                 self._add_turned_body(k)
             else:
                 self._add_jointed_body(k, own)
-        self.start = self._coordinates_at_start()
         self.body_axes = self.attitude.swapaxes(-1, -2) @ np.array(self.link_axes)
-
-    def _coordinates_at_start(self) -> Array:
-        """Where the links' coordinates of 0 are, as `Trajectory` counts them."""
-        x = [
-            [0.0] * (2 * kind.holds_distance)
-            + ([*self.state.r[k]] if kind.holds_nothing else [])
-            + ([0.0] * 3 if kind.has_attitude else [*self.state.x[k, : len(kind.motions)]])
-            for k, kind in enumerate(self.model.kinds)
-        ]
-        return np.concatenate(x)
 
     def _go_to_far_body(self, k: int) -> None:
         """Continue from the link that joint k is attached to."""
@@ -191,11 +172,11 @@ class _Linkage:
         self._add_revolutes(2, axes, relative, k)
         self._hang = np.array([self.model.length[k], 0.0, 0.0])
 
-    def _add_shifts(self, own: slice) -> None:
+    def _add_shifts(self, k: int, own: slice) -> None:
         """Add three massless slides along the world's axes, for the centre of mass of a free body."""
-        self._hang = self.state.r[len(self.link_of_body)]
-        for axis, name in enumerate(("PrismaticX", "PrismaticY", "PrismaticZ")):
-            self._add_link(name, np.eye(3), own.start + axis)
+        self._hang = self.state.r[k]
+        for i, x in enumerate(self.state.r[k]):
+            self._add_link(f"Prismatic{'XYZ'[i]}", np.eye(3), x, self._rate(own.start + i))
 
     def _add_turned_body(self, k: int) -> None:
         model, A = self.model, self.attitude[k]
@@ -223,16 +204,29 @@ class _Linkage:
             name = ("Revolute" if what == "turn" else "Prismatic") + "XYZ"[axis]
             is_carried = what == "slide" and not kind.is_about_z  # by the far body, as the turn comes later
             link_axes = above @ rotation_matrix(self.model.turn[k, 0]) if is_carried else axes
-            self._add_link(name, link_axes, own.start + i)
+            self._add_link(name, link_axes, self.state.x[k, i], self._rate(own.start + i))
             self.motions.append((self._last, k, i))
         self._carry_body(k, self.model.proximal[k])
 
-    def _add_link(self, joint: str, axes: Array, rate: int) -> None:
-        """Add a link with these axes in the world on a joint whose rate is that one of ν."""
+    def _rate(self, i: int) -> Array:
+        """The row of W of a joint whose rate is that one of ν."""
+        return np.asarray(np.eye(len(self.nu))[i])
+
+    def _add_link(
+        self, joint: str, axes: Array, start: float, row: Array, twist: Array | None = None
+    ) -> None:
+        """Add a massless link with these axes in the world on a joint, and its row of W.
+
+        Args:
+            start: where the joint's coordinate of 0 is.
+            twist: of its axes in the link before, where they are known without rounding.
+
+        """
         kind, along = getattr(exudyn.JointType, joint), axes[:, "XYZ".index(joint[-1])]
-        self.links.append(_Link(kind, self._last, self._axes.T @ axes, self._hang, along))
+        twist = self._axes.T @ axes if twist is None else twist
+        self.links.append(_Link(kind, self._last, twist, self._hang, along, start))
         self._last, self._axes, self._hang = len(self.links) - 1, axes, np.zeros(3)
-        self.W = np.vstack([self.W, np.eye(len(self.nu))[rate]])
+        self.W = np.vstack([self.W, row])
 
     def _carry_body(self, k: int, origin: Array) -> None:
         """Give the last link, whose origin is there in body k, the mass of the body besides its own."""
@@ -249,15 +243,12 @@ class _Linkage:
 
     def _add_revolutes(self, count: int, axes: Array, relative: Array, body: int) -> None:
         """Add massless revolutes that turn ``axes`` against the link before at the rate ``relative`` ν."""
-        self.revolute_groups.append(_RevoluteGroup(len(self.links), count, axes, body))
-        twist, offset = self._axes.T @ axes, self._hang
-        for i, joint in enumerate(("RevoluteZ", "RevoluteY", "RevoluteX")[:count]):
+        self.middle_angles.append((len(self.links) + 1, body))
+        for i, letter in enumerate("ZYX"[:count]):
             axis = axes[:, 2 - i]
-            self.links.append(_Link(getattr(exudyn.JointType, joint), self._last, twist, offset, axis))
-            self._last, twist, offset = len(self.links) - 1, np.eye(3), np.zeros(3)
-            self.W = np.vstack([self.W, axis @ relative])
+            self._add_link(f"Revolute{letter}", axes, 0.0, axis @ relative, np.eye(3) if i else None)
+            self.angle_axes.append(axis)
             self._spin = self._spin + np.outer(axis, axis @ relative)
-        self._axes = axes
 
 
 class _KinematicTree:
@@ -266,7 +257,6 @@ class _KinematicTree:
     def __init__(self, model: Model, state: State, change: TreeChange = TreeChange()) -> None:  # noqa: B008
         self.model, self.state, self.change = model, state, change
         self.linkage = _Linkage(model, state)
-        self.revolute_groups = self.linkage.revolute_groups
         self.initial_angle_rates = self.linkage.W @ self.linkage.nu
         self.mbs, self.container = make_system()
         given = self.linkage.links, model.gravity, self.initial_angle_rates
@@ -327,10 +317,8 @@ class _KinematicTree:
         """Return the quaternions (T, N, 4) at the angles (T, ·): continuous, and the state's own at 0."""
         turned: list[Array] = []
         for link, angle in zip(self.linkage.links, angles.T, strict=True):
-            half, turn = 0.5 * angle[:, None], np.zeros((len(angles), 4))
-            turn[:, :1], turn[:, 1:] = np.cos(half), np.sin(half) * link.axis
-            if link.joint in SLIDES:
-                turn[:] = 1.0, 0.0, 0.0, 0.0
+            half = 0.5 * angle[:, None] * (link.joint not in SLIDES)
+            turn = np.hstack([np.cos(half), np.sin(half) * link.axis])
             turned.append(quaternion_product(turned[link.parent], turn) if link.parent >= 0 else turn)
         links = self.linkage.link_of_body
         moved = [turned[link] if link >= 0 else np.array([1.0, 0.0, 0.0, 0.0]) for link in links]
@@ -349,11 +337,11 @@ class _KinematicTree:
     def check_singularity(self, t: float) -> None:
         """Raise Unsupported once a middle angle is near ±90°."""
         angles = self.mbs.systemData.GetODE2Coordinates()
-        for group in self.revolute_groups:
-            middle = angles[group.first_angle + 1]
+        for number, body in self.linkage.middle_angles:
+            middle = angles[number]
             if cos(middle) < MIN_COS_MIDDLE_ANGLE:
                 raise Unsupported(
-                    f"the angles of body {group.body + 1} come near their singularity at "
+                    f"the angles of body {body + 1} come near their singularity at "
                     f"t = {t:.6g} s (middle angle {np.degrees(remainder(middle, tau)):.1f}°)",
                     "angles",
                 )
@@ -470,14 +458,12 @@ class ExudynTree(ExudynAdapter):
         angles, rates, r, v, omega = (np.array(column) for column in zip(*samples, strict=True))
         p = tree.quaternions_at(angles)
         pdot, steps = quaternion_rate(p, omega), round(float(times[-1] / resolution))
-        coordinates = angles + tree.linkage.start
+        coordinates = angles + [link.start for link in tree.linkage.links]
         return Trajectory(clock, r, p, v, pdot, steps, coordinates=coordinates, velocities=rates)
 
     def _step(self, model: Model, state: State, times: Array, integrator: Integrator, step: float) -> StepRun:
-        groups = _Linkage(model, state).revolute_groups
-        axes = [group.axes[:, 2 - i] for group in groups for i in range(group.angle_count)]
         run = self._simulate(model, state, times, integrator, step)
-        return StepRun(run, angle_axes=np.array(axes).reshape(-1, 3))
+        return StepRun(run, angle_axes=np.reshape(_Linkage(model, state).angle_axes, (-1, 3)))
 
 
 def _settings(method: str = "RK44") -> Any:
