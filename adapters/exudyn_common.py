@@ -5,9 +5,9 @@ from __future__ import annotations
 import contextlib
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import cache
+from functools import cache, partial
 from inspect import Parameter, signature
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import exudyn
 import numpy as np
@@ -15,7 +15,7 @@ import numpy as np
 from plumbline.engines.metamorphic_hooks import MetamorphicHooks
 from plumbline.model.datatypes import Array, EngineFailure, Float, Model
 
-Sample = TypeVar("Sample")
+Sample = tuple[Array, ...]
 items: Any = exudyn.itemInterface  # its constructors are untyped
 Output: Any = exudyn.OutputVariableType
 IMPLICIT, EXPLICIT = "MainSolverImplicitSecondOrder", "MainSolverExplicit"
@@ -23,18 +23,26 @@ IMPLICIT, EXPLICIT = "MainSolverImplicitSecondOrder", "MainSolverExplicit"
 Ways = Mapping[str, Callable[..., Any]]  # by kind of item what adds one in another way, with its parameters
 
 
-def add_item(mbs: Any, ways: Ways, kind: str, **given: Any) -> Any:
-    """Add a load, connector or joint of a kind, in another way where there is one."""
-    if kind in ways:
-        return ways[kind](mbs, **given)
+def add_plain(kind: str, mbs: Any, **given: Any) -> Any:
+    """Add a load, connector or joint of a kind."""
     add = mbs.AddLoad if kind in LOADS else mbs.AddObject
     return add(getattr(items, kind)(**given))
 
 
-def changed_item(item: Mapping[str, Any], **given: Any) -> dict[str, Any]:
-    """Return the parameters of an item that are given once, and not for drawing, some of them others."""
-    own = {name: value for name, value in item.items() if not name.startswith("V") and "HT" not in name}
-    return own | given
+def add_item(mbs: Any, ways: Ways, kind: str, **given: Any) -> Any:
+    """Add the same, in another way where there is one."""
+    return ways.get(kind, partial(add_plain, kind))(mbs, **given)
+
+
+def change_item(mbs: Any, kind: str, number: Any, modifies: bool, **given: Any) -> None:
+    """Change parameters of an item: one by one, or with all others but those for drawing."""
+    if modifies:
+        item = getattr(mbs, f"Get{kind}")(number)
+        own = {name: value for name, value in item.items() if not name.startswith("V") and "HT" not in name}
+        getattr(mbs, f"Modify{kind}")(number, own | given)
+        return
+    for name, value in given.items():
+        getattr(mbs, f"Set{kind}Parameter")(number, name, value)
 
 
 def texts(owner: str, *names: str) -> str:
@@ -58,7 +66,8 @@ class ExudynAdapter(MetamorphicHooks):
 
     def version(self) -> str:
         """Return the version of the Exudyn that is loaded."""
-        return _version()
+        config = getattr(exudyn, "config", None)  # since 1.10
+        return str(exudyn.GetVersionString() if config is None else config.Version())
 
 
 def make_system() -> tuple[Any, Any]:
@@ -146,19 +155,21 @@ def _code(value: Any) -> str:
     return f"exu.{value}" if hasattr(value, "__members__") else repr(int(value))
 
 
+def initialize(solver: Any, mbs: Any, settings: Any) -> bool:
+    """Initialise a solver as usual; returns whether it succeeded."""
+    return bool(solver.InitializeSolver(mbs, settings))
+
+
 @contextlib.contextmanager
 def initialized_solver(
-    solver: Any,
-    mbs: Any,
-    settings: Any,
-    initialize: Callable[[Any, Any, Any], bool] = lambda solver, *rest: bool(solver.InitializeSolver(*rest)),
+    solver: Any, mbs: Any, settings: Any, by: Callable[[Any, Any, Any], bool] = initialize
 ) -> Iterator[None]:
     """Initialise a solver for a single evaluation, and finalise it at the end.
 
     Args:
         solver: one of Exudyn's main solvers, not initialised.
         mbs: the assembled system.
-        initialize: takes these and the settings.
+        by: takes these and the settings.
 
     Yields:
         Nothing.
@@ -167,7 +178,7 @@ def initialized_solver(
         EngineFailure: the solver could not be initialised.
 
     """
-    if not initialize(solver, mbs, settings):
+    if not by(solver, mbs, settings):
         raise EngineFailure(f"Exudyn could not initialise its solver: {solver.GetErrorString()}")
     try:
         yield
@@ -188,7 +199,7 @@ def mass_matrix_and_force(solver: Any, mbs: Any) -> tuple[Float[Array, "nq nq"],
     return M, np.array(solver.GetSystemResidual())[: len(M)]
 
 
-class _StepRecorder(Generic[Sample]):
+class _StepRecorder:
     """The function that Exudyn calls after every step: checks, samples, and carries exceptions out."""
 
     def __init__(
@@ -271,11 +282,6 @@ def run_solver(
 ENGINE_ERROR: type[Exception] = getattr(exudyn, "ExudynError", RuntimeError)  # its own errors, since 1.12
 
 
-def _version() -> str:
-    config = getattr(exudyn, "config", None)  # since 1.10
-    return str(exudyn.GetVersionString() if config is None else config.Version())
-
-
 @contextlib.contextmanager
 def silence_engine() -> Iterator[None]:
     """Run in a scratch working directory without console output: Exudyn writes to both.
@@ -336,10 +342,14 @@ def known_arguments(function: Callable[..., Any], given: Mapping[str, Any]) -> M
     return {name: value for name, value in given.items() if name in _parameters(own)}
 
 
+def first_known(function: Callable[..., Any], names: str, value: Any) -> Mapping[str, Any]:
+    """Give a value by the first of the names that this version of a function has."""
+    return dict([*known_arguments(function, dict.fromkeys(names.split(), value)).items()][:1])
+
+
 def items_argument(function: Callable[..., Any], ends: Sequence[Any]) -> Mapping[str, Any]:
     """Give the items that a function connects by their name in this version."""
-    names = dict.fromkeys(("itemNumbers", "bodyNumbers", "bodyOrNodeList"), ends)
-    return dict([*known_arguments(function, names).items()][:1])
+    return first_known(function, "itemNumbers bodyNumbers bodyOrNodeList", ends)
 
 
 @cache

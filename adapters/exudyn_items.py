@@ -17,7 +17,7 @@ from exudyn import kinematicTree, rigidBodyUtilities, robotics
 from adapters.exudyn_common import (
     IMPLICIT,
     Output,
-    changed_item,
+    change_item,
     initialized_solver,
     items,
     items_argument,
@@ -451,8 +451,8 @@ def _add_loads(s: _Items) -> None:
         loads.append(mbs.AddLoad(items.Force(markerNumber=marker, loadVectorUserFunction=law)))
         later.append(mbs.AddLoad(items.Force(markerNumber=marker)))
         changed.append(mbs.AddLoad(items.Force(markerNumber=marker)))
-        mbs.SetLoadParameter(later[-1], "loadVector", push)
-        mbs.ModifyLoad(changed[-1], changed_item(mbs.GetLoad(changed[-1]), loadVector=push))
+        change_item(mbs, "Load", later[-1], False, loadVector=push)
+        change_item(mbs, "Load", changed[-1], True, loadVector=push)
     sensors = [s.sensor("SensorLoad", loadNumber=load) for load in loads]
     mbs.Assemble()
     for call, values in (
@@ -473,13 +473,13 @@ def _add_parameters(s: _Items) -> None:
         first, second = (s.marker("MarkerBodyRigid", bodyNumber=body) for _ in range(2))
         firsts.append(first)
         seconds.append(second)
-        mbs.SetMarkerParameter(first, "localPosition", one.arm)
-        mbs.ModifyMarker(second, changed_item(mbs.GetMarker(second), localPosition=one.arm))
+        change_item(mbs, "Marker", first, False, localPosition=one.arm)
+        change_item(mbs, "Marker", second, True, localPosition=one.arm)
         own = {"markerNumber": first, "outputVariableType": Output.Velocity}
         sensors.append([s.sensor("SensorMarker", **own) for _ in range(3)])
         _, third, fourth = sensors[-1]
-        mbs.SetSensorParameter(third, "outputVariableType", position)
-        mbs.ModifySensor(fourth, changed_item(mbs.GetSensor(fourth), outputVariableType=position))
+        change_item(mbs, "Sensor", third, False, outputVariableType=position)
+        change_item(mbs, "Sensor", fourth, True, outputVariableType=position)
     mbs.Assemble()
     arms = [mbs.GetMarkerParameter(marker, "localPosition") for marker in firsts]
     read = [mbs.GetSensorParameter(velocity, "markerNumber") for velocity, _, _ in sensors]

@@ -18,9 +18,11 @@ from exudyn import rigidBodyUtilities
 from adapters.exudyn_common import (
     IMPLICIT,
     Ways,
-    add_item,
+    add_plain,
     call_parts,
-    changed_item,
+    change_item,
+    first_known,
+    initialize,
     items,
     items_argument,
     known_arguments,
@@ -147,17 +149,8 @@ def _set_later(modifies: bool) -> Any:
         other, rest = replace(piece.part, mass=2 * piece.part.mass), np.zeros(3)
         node, body = USUAL_BODY(mbs, replace(piece, part=other, velocity=rest, spin=rest))
         rates = [*piece.velocity, *(euler_parameter_rates(piece.turn) @ piece.spin)]
-        given: Any
-        for name, item, given in (
-            ("Node", node, {"initialVelocities": rates}),
-            ("Object", body, sizes_of_body(mass=piece.part.mass)),
-        ):
-            if modifies:
-                whole = changed_item(getattr(mbs, f"Get{name}")(item), **given)
-                getattr(mbs, f"Modify{name}")(item, whole)
-                continue
-            for key, value in given.items():
-                getattr(mbs, f"Set{name}Parameter")(item, key, value)
+        change_item(mbs, "Node", node, modifies, initialVelocities=rates)
+        change_item(mbs, "Object", body, modifies, **sizes_of_body(mass=piece.part.mass))
         return node, body
 
     return add
@@ -245,7 +238,7 @@ class Change:
     assemble: Callable[[Any], None] = lambda mbs: mbs.Assemble()
     ways: Ways = field(default_factory=dict)  # of loads and spring-dampers
     solver: Callable[[], Any] = lambda: exudyn.MainSolverImplicitSecondOrder()  # looked up when it is called
-    initialize: Callable[[Any, Any, Any], bool] = lambda solver, *rest: bool(solver.InitializeSolver(*rest))
+    initialize: Callable[[Any, Any, Any], bool] = initialize
     mass_matrix: Callable[[Any, Array], Array] = lambda _, M: M  # of the chain, and the solver's
     jacobian: Callable[[Any, Array], Array] = lambda _, C: C
 
@@ -270,10 +263,6 @@ _spelling = variants_of("spelling", Change, is_open)
 
 def _joints(names: str, add: Callable[[Any, Joint], Any], are_meant: Callable[[JointKind], bool]) -> Variant:
     return _spelling(names, lambda model: any(map(are_meant, model.kinds)), joints=add, are_meant=are_meant)
-
-
-def _renamed(kind: str) -> Callable[..., Any]:
-    return lambda mbs, **given: add_item(mbs, {}, kind, **given)
 
 
 DRAG = "ObjectConnectorRigidBodySpringDamper"
@@ -340,7 +329,7 @@ def _created_load(function: str) -> Callable[..., Any]:
 def _load_by_function(kind: str) -> Callable[..., Any]:
     def add(mbs: Any, loadVector: Any, **given: Any) -> Any:
         given["loadVectorUserFunction"] = lambda mbs, t, load: loadVector
-        return add_item(mbs, {}, kind, loadVector=[0.0] * 3, **given)
+        return add_plain(kind, mbs, loadVector=[0.0] * 3, **given)
 
     return add
 
@@ -352,7 +341,7 @@ def _by_function(kind: str, argument: str, law: Callable[..., Any]) -> Callable[
         def user(mbs: Any, t: float, item: int, *motion: Any) -> Any:
             return law(given, *motion)
 
-        return add_item(mbs, {}, kind, **given, **{argument: user})
+        return add_plain(kind, mbs, **given, **{argument: user})
 
     return add
 
@@ -376,7 +365,7 @@ def _drag_by_two(way: Callable[..., Any]) -> Callable[..., Any]:
 
     def add(mbs: Any, damping: Array, markerNumbers: Any, **given: Any) -> Any:
         turning = np.diag(np.append(np.zeros(3), np.diag(damping)[3:]))
-        add_item(mbs, {}, DRAG, damping=turning, markerNumbers=markerNumbers, **given)
+        add_plain(DRAG, mbs, damping=turning, markerNumbers=markerNumbers, **given)
         moving = np.diag(damping)[:3].tolist()
         return way(mbs, markerNumbers=markerNumbers, stiffness=[0.0] * 3, damping=moving)
 
@@ -406,12 +395,12 @@ HAS: Mapping[str, Callable[[Model], bool]] = {
     "ObjectConnectorTorsionalSpringDamper": _has_elements_that("turn"),
 }
 # under the name of the version; else the drag would act between the points
-_FUNCTION: Any = exudyn.MainSystem.CreateRigidBodySpringDamper
-_NAMES_OF_INTRINSIC = {"useIntrinsicFormulation": False, "intrinsicFormulation": False}
-_NOT_INTRINSIC = dict(list(known_arguments(_FUNCTION, _NAMES_OF_INTRINSIC).items())[:1])
+_NOT_INTRINSIC = first_known(
+    exudyn.MainSystem.CreateRigidBodySpringDamper, "useIntrinsicFormulation intrinsicFormulation", False
+)
 # By kind of item and names what adds it.
 WAYS: tuple[tuple[str, str, Callable[..., Any]], ...] = (
-    *((kind, f"itemInterface.{short}", _renamed(short)) for kind, short in SHORT_NAMES.items()),
+    *((kind, f"itemInterface.{short}", partial(add_plain, short)) for kind, short in SHORT_NAMES.items()),
     *(
         way
         for name in ("Force", "Torque")
@@ -439,7 +428,7 @@ WAYS: tuple[tuple[str, str, Callable[..., Any]], ...] = (
     (DRAG, f"itemInterface.{DRAG}SpringForceTorqueUserFunction",
      _by_function(DRAG, "springForceTorqueUserFunction", _law_of_drag)),
     (DRAG, "itemInterface.ObjectConnectorCartesianSpringDamper itemInterface.CartesianSpringDamper",
-     _drag_by_two(_renamed("CartesianSpringDamper"))),
+     _drag_by_two(partial(add_plain, "CartesianSpringDamper"))),
     (DRAG, "itemInterface.ObjectConnectorCartesianSpringDamperSpringForceUserFunction",
      _drag_by_two(
          _by_function("ObjectConnectorCartesianSpringDamper", "springForceUserFunction", _law_of_axes)
