@@ -93,7 +93,7 @@ from plumbline.model.kinematics import (
     rotation_vector,
     turn_of_z,
 )
-from plumbline.model.loops import STABILISATION, cut_open
+from plumbline.model.loops import STABILISATION, CutMechanism, cut_open
 from plumbline.model.step_methods import SERIES_TURN, JointSpaceMethod, classical_runge_kutta
 from plumbline.model.welding import BodyParts, undivided_bodies
 
@@ -107,7 +107,9 @@ RIGID: Any = {
 # Of constraintDynamics: accuracy, damping (any from 1e-12 to 1e-3 does), largest number of steps.
 PROXIMAL_SETTINGS = 1e-15, 1e-8, 50
 MAX_DENSE_JOINTS = 10  # joints up to which their 3 × 3 blocks are solved faster as one matrix
+UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])
 Motion = tuple[Array, Array, Array]  # q, v and v̇
+Built = tuple[CutMechanism, "PinocchioChain"]
 EARLY_STATES = 2  # at which loops are closed in all ways, and composite joints asked
 FIXED_STEPS = {"semi-implicit-euler": semi_implicit_euler, "rkmk4": rkmk4}
 
@@ -286,10 +288,14 @@ class PinocchioChain:
         return q, T @ minimal_rates(self.source_model, state)
 
     def _frames(self, state: State) -> tuple[Array, Array]:
-        """Return the joints' frames, quaternions (nj, 4) scalar first, and S (nj, 3, nu) of their ω = S ν."""
+        """Return the joints' frames, quaternions (nj + 1, 4), and S (nj + 1, 3, nu) of their ω = S ν.
+
+        The world's, which stands still, are in a row behind them: the parent −1 of the first joints.
+        """
         model, of_rods = self.source_model, np.flatnonzero(self.source_model.rods).tolist()
         jacobian = remembered_velocity_jacobian(model, state).reshape(model.n, 6, -1)
-        frames, S = np.zeros((self.joint_count, 4)), np.zeros((self.joint_count, 3, jacobian.shape[-1]))
+        rows = self.joint_count + 1
+        frames, S = np.tile(UNTURNED, (rows, 1)), np.zeros((rows, 3, jacobian.shape[-1]))
         for k, (kind, row) in enumerate(zip(model.kinds, self.body_rows, strict=True)):
             if not kind.is_rigid:
                 p, turn = state.p[k], model.turn[k, 1]
@@ -308,14 +314,9 @@ class PinocchioChain:
         return self.last_motion
 
     def _motion_at(self, state: State) -> tuple[Array, Array]:
-        model, (frames, S) = self.source_model, self._frames(state)
-        up = np.array(self.parent_rows)
-        own = np.flatnonzero(up >= 0)
-        up = up[own]
-        relative = frames.copy()
-        relative[own] = quaternion_product(quaternion_conjugate(frames[up]), frames[own])
-        spin = S.copy()
-        spin[own] -= rotation_matrix(relative[own]).swapaxes(-1, -2) @ S[up]
+        model, (frames, S), up = self.source_model, self._frames(state), self.parent_rows
+        relative = quaternion_product(quaternion_conjugate(frames[up]), frames[:-1])
+        spin = S[:-1] - rotation_matrix(relative).swapaxes(-1, -2) @ S[up]
         q, T = pin.neutral(self.pin_model), np.zeros((self.pin_model.nv, S.shape[-1]))
         rates = own_rates(model)
         for j, joint in enumerate(self.joints):
@@ -335,9 +336,9 @@ class PinocchioChain:
         return self._motion(state)[1]
 
     def _absolute_attitudes(self, q: Array) -> Array:
-        """Return the attitudes (T, nj, 4) of the joints' frames, scalar first, at q (T, nq)."""
-        model, frames = self.source_model, np.empty((len(q), self.joint_count, 4))
-        bodies = self.body_of_row
+        """Return the attitudes (T, nj + 1, 4) of the joints' frames and of the world at q (T, nq)."""
+        model, bodies = self.source_model, self.body_of_row
+        frames = np.tile(UNTURNED, (len(q), self.joint_count + 1, 1))
         for j, joint in enumerate(self.joints):
             is_jointed = j in bodies and bool(model.kinds[bodies[j]].motions)
             turn = np.roll(q[:, joint.idx_q : joint.idx_q + joint.nq][:, -4:], 1, axis=1)
@@ -346,8 +347,7 @@ class PinocchioChain:
                 far = model.body[bodies[j], 0]
                 above = model.turn[bodies[j], 0]
                 turn = quaternion_product(self._frame_in_joint(far, above), turn)
-            up = self.parent_rows[j]
-            frames[:, j] = quaternion_product(frames[:, up], turn) if up >= 0 else turn
+            frames[:, j] = quaternion_product(frames[:, self.parent_rows[j]], turn)
         return frames
 
     def _frame_in_joint(self, k: int, turn: Array) -> Array:
@@ -623,13 +623,8 @@ class PinocchioChain:
                 r[i, k] = pose.act(centre.translation)
                 rdot[i, k] = pose.rotation @ (centre.rotation @ motion.linear)
                 omega[i, k] = motion.angular
-        frames, unit = self._absolute_attitudes(q), np.array([1.0, 0.0, 0.0, 0.0])
-        at_rest = np.tile(unit, (len(q), 1))
-        pairs = [
-            (frames[:, row] if row >= 0 else at_rest, self._frame_in_joint(k, unit))
-            for k, row in enumerate(self.body_rows)
-        ]
-        p = np.stack([quaternion_product(*pair) for pair in pairs], 1)
+        own = [self._frame_in_joint(k, UNTURNED) for k in range(self.source_model.n)]
+        p = quaternion_product(self._absolute_attitudes(q)[:, self.body_rows], np.array(own))
         pdot, coordinates = quaternion_rate(p, omega), self._joint_coordinates(q)
         return Trajectory(times, r, p, rdot, pdot, steps, coordinates=coordinates, velocities=v)
 
@@ -644,7 +639,7 @@ class PinocchioChain:
             for at in places:
                 found[:, at] = q[:, at][:, [6, 3, 4, 5, 0, 1, 2] if kind.holds_nothing else [3, 0, 1, 2]]
             if (far := int(model.body[k, 0])) >= 0:
-                far_joint = self._frame_in_joint(far, np.array([1.0, 0.0, 0.0, 0.0]))
+                far_joint = self._frame_in_joint(far, UNTURNED)
                 turned = quaternion_product(quaternion_conjugate(far_joint), found[:, first])
                 found[:, first] = turned
         return found
@@ -722,7 +717,7 @@ def _joint_call(joint: Any) -> str:
 
 def _joint_turns(model: Model, k: int, x: Array) -> Array:
     """Return the quaternions (T, 4) of joint k at coordinates x (T, ≥ motions), its own axes."""
-    turn = np.tile([1.0, 0.0, 0.0, 0.0], (len(x), 1))
+    turn = np.tile(UNTURNED, (len(x), 1))
     for i, (what, axis) in enumerate(model.kinds[k].motions):
         if what == "turn":
             half = np.zeros_like(turn)
@@ -789,28 +784,30 @@ class Pinocchio(PinocchioAdapter):
     column_names = COLUMN_NAMES
     usual_algorithm: ClassVar[str] = "crba"  # for the accelerations of state evaluation
 
-    def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
-        cut, change = cut_open(model), self.variant.change if self.variant else Change()
+    def _built(self, model: Model, algorithm: str, change: Change = Change()) -> Built:  # noqa: B008
+        """Build a mechanism, with its loops cut open."""
+        cut = cut_open(model)
         parts = None if cut.ends else self.body_pieces(model)
-        given = cut.model, self.option or self.usual_algorithm, parts
+        return cut, PinocchioChain(cut.model, algorithm, parts, cut.ends, change)
+
+    def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
+        change = self.variant.change if self.variant else Change()
+        cut, chain = self._built(model, self.option or self.usual_algorithm, change)
         if change.joints:
-            usual = PinocchioChain(*given)
-            return [_SpelledTree(usual, change, state).quantities(state) for state in states]
-        chain = PinocchioChain(*given, cut.ends, change)
+            return [_SpelledTree(chain, change, state).quantities(state) for state in states]
         return [cut.source_quantities(chain.quantities(cut.state(state))) for state in states]
 
     def written(self, model: Model, state: State, moves: bool = False) -> dict[str, Any]:
         """Return the numbers of the engine's model at a state, see `PinocchioChain.written`."""
-        cut = cut_open(model)
-        algorithm = "aba" if moves and not cut.ends else self.option or self.usual_algorithm
-        parts = None if cut.ends else self.body_pieces(model)
-        found = PinocchioChain(cut.model, algorithm, parts, cut.ends).written(cut.state(state))
+        algorithm = "aba" if moves and not model.has_loops else self.option or self.usual_algorithm
+        cut, chain = self._built(model, algorithm)
+        found = chain.written(cut.state(state))
         found["fields"] |= {"bodies": cut.place[: model.n], "joints": cut.place}
         return found
 
     def _surface(self, model: Model, states: Sequence[State]) -> Sequence[SurfaceAnswer]:
-        cut = cut_open(model)
-        chain, own = PinocchioChain(cut.model, self.usual_algorithm, ends=cut.ends), cut.place[: model.n]
+        cut, chain = self._built(model, self.usual_algorithm)
+        own = cut.place[: model.n]
         joints, placements = [chain.body_joints[k] for k in own], [chain.placements[k] for k in own]
         frames = add_probe_frames(chain.pin_model, joints, placements, model)
         chain.renew_data()
@@ -847,8 +844,7 @@ class Pinocchio(PinocchioAdapter):
     def _simulate(
         self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
     ) -> Trajectory:
-        cut = cut_open(model)
-        chain = PinocchioChain(cut.model, "crba" if integrator.kind == "tolerance" else "aba", ends=cut.ends)
+        cut, chain = self._built(model, "crba" if integrator.kind == "tolerance" else "aba")
         for weld in chain.welds:
             set_corrector(weld, STABILISATION)
         start = chain.coordinates(cut.state(state))
