@@ -130,9 +130,11 @@ class ExudynChain:
         self.x = joint_coordinates(model, state)[2]
         self.connectors: list[tuple[int, Any, bool, Array]] = []
         self.jacobian_rate = np.zeros((0, 0))  # d_t(C_q), where joints need it
-        motions, attitude = list[tuple[Array, Array]](), rotation_matrix(state.p)
+        # of the bodies, and behind them of the world, body −1
+        self.turns = np.concatenate([rotation_matrix(state.p), [np.eye(3)]])
+        motions = list[tuple[Array, Array]]()
         for k, (first, last) in enumerate(zip(self.first_piece, self.last_piece, strict=True)):
-            motions += [self._add_piece(k, part, attitude[k]) for part in parts[k]]
+            motions += [self._add_piece(k, part) for part in parts[k]]
             self._add_joint(k)
             if last > first:
                 middle = [self._add_marker(piece, np.zeros(3)) for piece in (first, last)]
@@ -150,9 +152,9 @@ class ExudynChain:
         self.width = self.qdot.shape[1]
         change.assemble(mbs)
 
-    def _add_piece(self, k: int, part: RigidPart, attitude: Array) -> tuple[Array, Array]:
+    def _add_piece(self, k: int, part: RigidPart) -> tuple[Array, Array]:
         """Add a piece of body k; return the rates q̇ of its node, and B of θ̇ = B ω′."""
-        mbs, state = self.mbs, self.state
+        mbs, state, attitude = self.mbs, self.state, self.turns[k]
         arm, arm_rate = attitude @ part.centre, attitude @ cross(state.omega[k], part.centre)
         velocity, gravity = state.v[k] + arm_rate, self.model.gravity
         piece = Piece(part, state.r[k] + arm, velocity, state.p[k], state.omega[k], gravity)
@@ -174,7 +176,7 @@ class ExudynChain:
             return
         held = enumerate(_constrained_axes(kind) or [1] * 3)
         rows = [int(is_held and (k, i) not in self.left_out) for i, is_held in held]
-        A, turns = rotation_matrix(self.state.p[near]), rotation_matrix(model.turn[k])
+        A, turns = self.turns[near], rotation_matrix(model.turn[k])
         place = self.state.r[near] + A @ model.proximal[k]
         points = model.point[k, 0], model.proximal[k]
         bodies = [self.piece_bodies[self.last_piece[far]] if far >= 0 else self.ground]
@@ -188,8 +190,7 @@ class ExudynChain:
         model, far = self.model, self.model.body[k, 0]
         if not any(np.any(one[k]) for one in (model.stiffness, model.damping, model.effort)):
             return
-        above = rotation_matrix(self.state.p[far]) if far >= 0 else np.eye(3)
-        axes = JointFrame(model, k, above).axes(self.x[k])
+        axes = JointFrame(model, k, self.turns[far]).axes(self.x[k])
         for i, ((what, number), (axis, *_)) in enumerate(zip(model.kinds[k].motions, axes, strict=True)):
             stiffness, damping, effort = (x[k, i] for x in (model.stiffness, model.damping, model.effort))
             if not (stiffness or damping or effort):
@@ -346,7 +347,7 @@ class Exudyn(ExudynAdapter):
             _, _, C = _system_matrices(chain)
         used = _used_rows(chain, C)
         rates = np.zeros((0, 0)) if model.has_loops else _coordinate_rate_map(chain)
-        fields = {"qdot": chain.qdot.ravel(), "A": rotation_matrix(state.p), "used": used}
+        fields = {"qdot": chain.qdot.ravel(), "A": chain.turns[:-1], "used": used}
         fields |= {"elastic": np.array(elastic_energy(model, state)), "joint_rates": rates}
         fields |= {"gravity": model.gravity, "proximal": model.proximal, "near": model.body[:, 1]}
         joints = [None if joint is None else int(joint) for joint in chain.joints]
@@ -452,8 +453,7 @@ def _chain_that_moves(model: Model, state: State) -> ExudynChain:
     _, _, C = _system_matrices(chain)
     for k in [k for k, kind in enumerate(model.kinds) if kind.holds_points and not kind.is_spherical]:
         # of some displacements the engine holds those along the joint's axes, of all those along the world's
-        rows, far = chain.joint_rows(k)[:3], model.body[k, 0]
-        above = rotation_matrix(state.p[far]) if far >= 0 else np.eye(3)
+        rows, above = chain.joint_rows(k)[:3], chain.turns[model.body[k, 0]]
         C[rows] = (above @ rotation_matrix(model.turn[k, 0])).T @ C[rows]
     used = np.flatnonzero(np.any(C != 0, axis=1))
     data = chain.mbs.systemData
@@ -510,7 +510,6 @@ def _evaluate_state(chain: ExudynChain) -> StateQuantities:
     reaction, turning = (np.array(half) for half in zip(*pushes, strict=True))
     elements = _element_wrenches(chain)
     momentum = (M @ chain.qdot.ravel()).reshape(n, w)  # of θ̇ = B ω′: Bᵀ (…) = J ω′
-    p = chain.state.p[chain.body_of_piece]
     spin = rotate_vectors(chain.rates.swapaxes(-1, -2), momentum[:, 3:])
     r = np.array([mbs.GetObjectOutputBody(body, Output.Position) for body in chain.piece_bodies])
     still = np.zeros(w - 3)
@@ -526,7 +525,7 @@ def _evaluate_state(chain: ExudynChain) -> StateQuantities:
         # its own PotentialEnergy is always 0, and springs have none
         potential_energy=elastic_energy(chain.model, chain.state) - float(np.sum(weight * r)),
         angular_momentum=np.sum(cross(r, momentum[:, :3]), 0)
-        + np.einsum("kij,kj->i", rotation_matrix(p), spin),
+        + np.einsum("kij,kj->i", chain.turns[chain.body_of_piece], spin),
         # Of welded pieces the engine has no mass matrix on ν.
         mass_matrix=None if rates is None else rates.T @ M @ rates,
     )
@@ -548,7 +547,7 @@ def _joint_moments(chain: ExudynChain, force: Array, of_p: Array) -> Array:
     With θ̇ = B ω′, A Bᵀ Q is the moment about the centre of the piece that the body hangs by.
     """
     near = chain.model.body[:, 1]
-    A, pieces = rotation_matrix(chain.state.p)[near], chain.first_piece[near]
+    A, pieces = chain.turns[near], chain.first_piece[near]
     about_centre = rotate_vectors(chain.rates[pieces].swapaxes(-1, -2), of_p)
     lever = rotate_vectors(A, chain.model.proximal - chain.piece_centre[pieces])
     return np.asarray(rotate_vectors(A, about_centre) - cross(lever, force))
