@@ -178,10 +178,11 @@ class ExudynChain:
         rows = [int(is_held and (k, i) not in self.left_out) for i, is_held in held]
         A, turns = self.turns[near], rotation_matrix(model.turn[k])
         place = self.state.r[near] + A @ model.proximal[k]
-        points = model.point[k, 0], model.proximal[k]
         bodies = [self.piece_bodies[self.last_piece[far]] if far >= 0 else self.ground]
         bodies.append(self.piece_bodies[self.first_piece[near]])
-        joint = Joint(kind, ends, bodies, points, turns, place, A @ turns[1], rows, float(model.length[k]))
+        joint = Joint(
+            kind, ends, bodies, model.point[k], turns, place, A @ turns[1], rows, float(model.length[k])
+        )
         self.joints.append(self.change.add_joint(self.mbs, joint))
         self._add_joint_elements(k, ends)
 

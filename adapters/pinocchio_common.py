@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -82,27 +83,53 @@ def parts_of(joint: Any) -> list[Any]:
     return list(getattr(own, "joints", (joint,)))
 
 
-def with_single_joints(pin_model: pin.Model) -> tuple[pin.Model, list[int]]:
-    """Rebuild a model with the parts of composite joints in turn, and nothing between them.
+def axis_of(joint: Any) -> Float[Array, "3"]:
+    """Return the axis of a joint that is named after it."""
+    return np.asarray(np.eye(3)["XYZ".index(joint.shortname()[-1])])
+
+
+def rebuilt(pin_model: pin.Model, parts: Callable[[Any], Sequence[Any]]) -> tuple[pin.Model, list[int]]:
+    """Rebuild a model with some joints in turn, and nothing between them, in place of each of its own.
 
     Returns:
-        The model, with the same q, v and numbers of frames, and by joint the number of its last part.
+        The model, without frames and rotors, and by joint the number of its last part.
 
     """
     other, last = pin.Model(), [0]
     other.gravity = pin_model.gravity
     for j in range(1, pin_model.njoints):
         number, place, name = last[pin_model.parents[j]], pin_model.jointPlacements[j], pin_model.names[j]
-        for i, part in enumerate(parts_of(pin_model.joints[j])):
+        for i, part in enumerate(parts(pin_model.joints[j])):
             number = other.addJoint(number, part, place, f"{name}, part {i}")
             place = pin.SE3.Identity()
         other.appendBodyToJoint(number, pin_model.inertias[j], pin.SE3.Identity())
         last.append(number)
+    return other, last
+
+
+def with_single_joints(pin_model: pin.Model) -> tuple[pin.Model, list[int]]:
+    """Rebuild a model with the parts of composite joints; q, v and the numbers of frames are the same."""
+    other, last = rebuilt(pin_model, parts_of)
     for frame in list(pin_model.frames)[1:]:
         other.addFrame(pin.Frame(frame.name, last[joint_of(frame)], 0, frame.placement, frame.type))
     if hasattr(other, "armature"):
         other.armature = pin_model.armature
     return other, last
+
+
+Place = tuple[int, pin.SE3]  # a joint, and a place in its frame
+
+
+def rigid_constraints(
+    kind: Any, pin_model: pin.Model, pairs: Iterable[tuple[Place, Place]]
+) -> tuple[Any, Any]:
+    """Return constraints of a kind that hold pairs of places together, and their data."""
+    constraints, data = pin.StdVec_RigidConstraintModel(), pin.StdVec_RigidConstraintData()
+    for near, far in pairs:
+        ends = *near, *far, pin.ReferenceFrame.LOCAL
+        constraints.append(pin.RigidConstraintModel(kind, pin_model, *ends))
+        data.append(constraints[-1].createData())
+    return constraints, data
 
 
 def add_frame(pin_model: pin.Model, name: str, joint: int, point: Float[Array, "3"]) -> int:

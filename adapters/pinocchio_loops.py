@@ -9,14 +9,15 @@ the right side −γ + μ λ in turn leads to the solution for μ = 0, also wher
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from itertools import starmap
 from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
-from adapters.pinocchio_common import init_constraint_dynamics, translation
+from adapters.pinocchio_common import Place, init_constraint_dynamics, rigid_constraints, translation
 from plumbline.model.datatypes import Array, Float
 
 # μ over the largest entry of J M⁻¹ Jᵀ, and how often the step is taken.  Measured on squeezer: with 1e-5 the
@@ -28,14 +29,7 @@ DEPENDENT = 1e-10
 CORNERS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # m, points that hold a frame
 
 
-def welded(m: pin.Model, pairs: Iterable[tuple[tuple[int, pin.SE3], tuple[int, pin.SE3]]]) -> tuple[Any, Any]:
-    """Return constraints that hold pairs of places together, each given by joint and place in its frame."""
-    welds, data = pin.StdVec_RigidConstraintModel(), pin.StdVec_RigidConstraintData()
-    kind, frame = pin.ContactType.CONTACT_6D, pin.ReferenceFrame.LOCAL
-    for near, far in pairs:
-        welds.append(pin.RigidConstraintModel(kind, m, *near, *far, frame))
-        data.append(welds[-1].createData())
-    return welds, data
+welded = partial(rigid_constraints, pin.ContactType.CONTACT_6D)
 
 
 class Loops(NamedTuple):
@@ -48,8 +42,8 @@ class Loops(NamedTuple):
 
     def on(self, m: pin.Model, numbers: Sequence[int]) -> Loops:
         """Return the same on another model with the same velocities, in which joints have these numbers."""
-        ends = ([(numbers[j], place) for j, place in _ends(weld)] for weld in self.welds)
-        return Loops(m, *welded(m, ((near, far) for near, far in ends)), self.push)
+        ends = (((numbers[j], here), (numbers[k], there)) for (j, here), (k, there) in map(_ends, self.welds))
+        return Loops(m, *welded(m, ends), self.push)
 
 
 class _Rows:
@@ -154,7 +148,7 @@ def _still(m: pin.Model, q: Array, v: Array) -> pin.Data:
     return data
 
 
-def _ends(weld: Any) -> tuple[tuple[int, pin.SE3], tuple[int, pin.SE3]]:
+def _ends(weld: Any) -> tuple[Place, Place]:
     """Joint and place in its frame of both ends."""
     return (weld.joint1_id, weld.joint1_placement), (weld.joint2_id, weld.joint2_placement)
 

@@ -36,6 +36,7 @@ from adapters.pinocchio_common import (
     energies_and_momentum,
     init_constraint_dynamics,
     point_acceleration,
+    rigid_constraints,
     translation,
 )
 from plumbline.model.datatypes import Array, Indices, Model, State, StateQuantities, Unsupported
@@ -71,12 +72,9 @@ class _FreeFlyerSystem:
             [add_frame(self.pin_model, f"{side} {k}", *point) for k, point in enumerate(points)]
             for side, points in (("near", near), ("far", far))
         )
-        self.contacts, self.contact_data = pin.StdVec_RigidConstraintModel(), pin.StdVec_RigidConstraintData()
-        kind, frame = pin.ContactType.CONTACT_3D, pin.ReferenceFrame.LOCAL
-        for (here, at), (there, hang) in zip(near, far, strict=True):
-            ends = here, translation(at), there, translation(hang)
-            self.contacts.append(pin.RigidConstraintModel(kind, self.pin_model, *ends, frame))
-            self.contact_data.append(self.contacts[-1].createData())
+        pairs = zip(*([(j, translation(at)) for j, at in points] for points in (near, far)), strict=True)
+        kind = pin.ContactType.CONTACT_3D
+        self.contacts, self.contact_data = rigid_constraints(kind, self.pin_model, pairs)
         self.data = self.pin_model.createData()
         self.allowed = np.zeros((len(model.kind), 6))  # accelerations that the joints' rates cause
         init_constraint_dynamics(self.pin_model, self.data, self.contacts, self.contact_data)
@@ -123,7 +121,6 @@ class _FreeFlyerSystem:
             for k, own in enumerate(self.parts)
             for part in own
         ]
-        self.quantities(state)
         q, v, tau, rates = self._coordinates(state)
         kept = self._solve_constraint_rows(state, q, v, tau)[2]
         fields = {"q": q, "v": v, "torque": tau, "joint_rates": rates, "kept": kept}

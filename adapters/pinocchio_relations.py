@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from adapters.pinocchio_common import armature
+from adapters.pinocchio_common import armature, axis_of, rebuilt
 from adapters.pinocchio_probes import Probed
 from plumbline.engines.missing_names import add_parts
 from plumbline.model.datatypes import Array
@@ -201,25 +201,19 @@ def mimics(s: Probed) -> Sequence[Callable[[Probed], None]]:
 
 def _with_mimics(s: Probed, along_axis: bool) -> tuple[str, pin.Model]:
     """The model, and the names that it uses; slides may be those along a given axis."""
-    m, other, last, slides = s.m, pin.Model(), [0], list[tuple[int, int, float]]()
-    other.gravity = m.gravity
-    for j in range(1, m.njoints):
-        joint, place, name = m.joints[j], m.jointPlacements[j], m.names[j]
-        parent, kind = last[m.parents[j]], joint.shortname()
-        is_screw = kind.startswith("JointModelH")
-        made = getattr(pin, kind.replace("ModelH", "ModelR"))() if is_screw else joint
-        number = other.addJoint(parent, made, place, name)
-        if is_screw:
-            axis = np.eye(3)["XYZ".index(kind[-1])]
-            slide = getattr(pin, kind.replace("ModelH", "ModelP"))()
-            slide = pin.JointModelPrismaticUnaligned(axis) if along_axis else slide
-            beyond = other.addJoint(number, slide, pin.SE3.Identity(), f"slide of {name}")
-            slides.append((number, beyond, joint.extract().pitch))
-            number = beyond
-        other.appendBodyToJoint(number, m.inertias[j], pin.SE3.Identity())
-        last.append(number)
-    for turn, beyond, pitch in slides:
-        other = pin.transformJointIntoMimic(other, turn, beyond, pitch, 0.0)
+
+    def parts(joint: Any) -> list[Any]:
+        kind = joint.shortname()
+        if not kind.startswith("JointModelH"):
+            return [joint]
+        turn, slide = (getattr(pin, kind.replace("ModelH", f"Model{letter}"))() for letter in "RP")
+        return [turn, pin.JointModelPrismaticUnaligned(axis_of(joint)) if along_axis else slide]
+
+    other, last = rebuilt(s.m, parts)
+    for joint, number in zip(s.m.joints, last, strict=True):
+        if joint.shortname().startswith("JointModelH"):
+            pitch = joint.extract().pitch
+            other = pin.transformJointIntoMimic(other, number - 1, number, pitch, 0.0)
     kinds = "JointModelPrismaticUnaligned" if along_axis else ""
     return f"transformJointIntoMimic JointModelMimic JointDataMimic {kinds}", other
 

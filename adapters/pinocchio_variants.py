@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from adapters.pinocchio_common import composite, joint_of, parts_of
+from adapters.pinocchio_common import axis_of, composite, joint_of, parts_of
 from plumbline.engines.variants import Variant, has, variants_of
 from plumbline.model.datatypes import Array, Float, Model
 
@@ -57,11 +57,6 @@ _option = variants_of("option", Change, _is_tree)
 _spelling = variants_of("spelling", Change, _is_tree)
 
 
-def _axis(joint: Any) -> Float[Array, "3"]:
-    """The axis of a joint that is named after it."""
-    return np.asarray(np.eye(3)["XYZ".index(joint.shortname()[-1])])
-
-
 def _of_axes(kinds: str, spelling: Spelling) -> dict[str, Spelling]:
     """By the short names of joints about or along each axis."""
     return {f"JointModel{kind}{axis}": spelling for kind in kinds for axis in "XYZ"}
@@ -71,7 +66,7 @@ def _universal(joint: Any) -> Any:
     """The engine's own joint in place of a composite one of two turns."""
     parts = parts_of(joint)
     is_meant = all(part.shortname().startswith("JointModelR") for part in parts)
-    return pin.JointModelUniversal(*map(_axis, parts)) if is_meant else joint
+    return pin.JointModelUniversal(*map(axis_of, parts)) if is_meant else joint
 
 
 def _made(*kinds: str) -> Callable[[Any], Any]:
@@ -263,18 +258,18 @@ VARIANTS = (
     ),
     _spelled(
         "RevoluteUnaligned",
-        _of_axes("R", Spelling(lambda joint: pin.JointModelRevoluteUnaligned(_axis(joint)))),
+        _of_axes("R", Spelling(lambda joint: pin.JointModelRevoluteUnaligned(axis_of(joint)))),
         _moves("turn"),
     ),
     _spelled("RUBZ", {"JointModelRZ": Spelling(_made("RUBZ"), _unbounded)}, _moves("turn")),
     _spelled(
         "PrismaticUnaligned",
-        _of_axes("P", Spelling(lambda joint: pin.JointModelPrismaticUnaligned(_axis(joint)))),
+        _of_axes("P", Spelling(lambda joint: pin.JointModelPrismaticUnaligned(axis_of(joint)))),
         _moves("slide"),
     ),
     _spelled(
         "HelicalUnaligned",
-        _of_axes("H", Spelling(lambda joint: pin.JointModelHelicalUnaligned(_axis(joint), joint.pitch))),
+        _of_axes("H", Spelling(lambda joint: pin.JointModelHelicalUnaligned(axis_of(joint), joint.pitch))),
         lambda model: any(kind.has_pitch for kind in model.kinds),
     ),
     _spelled("Universal", {"JointModelComposite": Spelling(_universal)}, _moves("turn", "turn")),
