@@ -320,10 +320,8 @@ def _add_coordinate_constraints(s: _Items) -> None:
         halves = zip((one.place / 2).tolist(), (one.velocity / 2).tolist(), strict=True)
         for i, (place, velocity) in enumerate(halves):
             marker = s.marker("MarkerNodeCoordinate", nodeNumber=node, coordinate=i)
-            by_place = {"offsetUserFunction": lambda mbs, t, item, offset, x=place: x}
-            by_velocity = {
-                "velocityLevel": True, "offsetUserFunction_t": lambda mbs, t, item, offset, x=velocity: x
-            }  # fmt: skip
+            by_place = {"offsetUserFunction": lambda *_, x=place: x}
+            by_velocity = {"velocityLevel": True, "offsetUserFunction_t": lambda *_, x=velocity: x}
             for call, kind, given in (
                 (f"{ITEM}.{long} {what}", long, {"factorValue1": 2.0}),
                 (f"{ITEM}.{short} {what}", short, {}),
@@ -352,8 +350,8 @@ def _add_vector_constraints(s: _Items) -> None:
     own = {"scalingMarker1": 2 * AXES}
     law = {
         "scalingMarker0": np.zeros((3, 1)),
-        "constraintUserFunction": lambda mbs, t, item, q, rates, is_velocity: 2 * np.array(q)[-3:],
-        "jacobianUserFunction": lambda mbs, t, item, q, rates, is_velocity: 2 * AXES,
+        "constraintUserFunction": lambda mbs, t, item, q, *_: 2 * np.array(q)[-3:],
+        "jacobianUserFunction": lambda *_: 2 * AXES,
     }
     long, short = "ObjectConnectorCoordinateVector", "CoordinateVectorConstraint"
     joints = {
@@ -412,7 +410,7 @@ def _add_connectors(s: _Items) -> None:
             s.object("ObjectConnectorDistance", *ends, distance=1.0),
             s.object("ObjectConnectorRigidBodySpringDamper", *ends, rotationMarker0=turn, damping=damping),
             s.object("ObjectJointGeneric", *ends, rotationMarker0=turn,
-                     offsetUserFunction=lambda mbs, t, item, given: [*shift, 0.0, 0.0, 0.0]),
+                     offsetUserFunction=lambda *_: [*shift, 0.0, 0.0, 0.0]),
         ))  # fmt: skip
     spring, rod, six, joint = zip(*made, strict=True)
     forces, distances = (
@@ -439,20 +437,16 @@ def _add_connectors(s: _Items) -> None:
 
 def _add_loads(s: _Items) -> None:
     """Loads of mass times place, by sensors and functions, and with parameters that are set later."""
-    mbs, loads, later, changed = s.mbs, [], [], []
+    mbs, made = s.mbs, []
     for node, one in zip(s.point_nodes(), s.bodies, strict=True):
         s.body("ObjectMassPoint", node, mass=one.mass)
         marker = s.marker("MarkerNodePosition", nodeNumber=node)
         push = (one.mass * one.place).tolist()
-
-        def law(mbs: Any, t: float, load: Any, push: Any = push) -> Any:
-            return push
-
-        loads.append(mbs.AddLoad(items.Force(markerNumber=marker, loadVectorUserFunction=law)))
-        later.append(mbs.AddLoad(items.Force(markerNumber=marker)))
-        changed.append(mbs.AddLoad(items.Force(markerNumber=marker)))
-        change_item(mbs, "Load", later[-1], False, loadVector=push)
-        change_item(mbs, "Load", changed[-1], True, loadVector=push)
+        law = {"loadVectorUserFunction": lambda *_, push=push: push}
+        made.append([mbs.AddLoad(items.Force(markerNumber=marker, **given)) for given in (law, {}, {})])
+        for load, modifies in zip(made[-1][1:], (False, True), strict=True):
+            change_item(mbs, "Load", load, modifies, loadVector=push)
+    loads, later, changed = zip(*made, strict=True)
     sensors = [s.sensor("SensorLoad", loadNumber=load) for load in loads]
     mbs.Assemble()
     for call, values in (
@@ -468,26 +462,24 @@ def _add_loads(s: _Items) -> None:
 def _add_parameters(s: _Items) -> None:
     """Markers at probe points that they are set to later, and sensors that read others later."""
     mbs, bodies, position = s.mbs, s.rigid_bodies(), Output.Position
-    firsts, seconds, sensors = list[Any](), list[Any](), list[list[Any]]()
+    made = []
     for body, one in zip(bodies, s.bodies, strict=True):
-        first, second = (s.marker("MarkerBodyRigid", bodyNumber=body) for _ in range(2))
-        firsts.append(first)
-        seconds.append(second)
-        change_item(mbs, "Marker", first, False, localPosition=one.arm)
-        change_item(mbs, "Marker", second, True, localPosition=one.arm)
-        own = {"markerNumber": first, "outputVariableType": Output.Velocity}
-        sensors.append([s.sensor("SensorMarker", **own) for _ in range(3)])
-        _, third, fourth = sensors[-1]
-        change_item(mbs, "Sensor", third, False, outputVariableType=position)
-        change_item(mbs, "Sensor", fourth, True, outputVariableType=position)
+        markers = [s.marker("MarkerBodyRigid", bodyNumber=body) for _ in range(2)]
+        own = {"markerNumber": markers[0], "outputVariableType": Output.Velocity}
+        velocity, *sensors = (s.sensor("SensorMarker", **own) for _ in range(3))
+        for marker, sensor, modifies in zip(markers, sensors, (False, True), strict=True):
+            change_item(mbs, "Marker", marker, modifies, localPosition=one.arm)
+            change_item(mbs, "Sensor", sensor, modifies, outputVariableType=position)
+        made.append((*markers, velocity, *sensors))
     mbs.Assemble()
+    firsts, seconds, velocities, thirds, fourths = zip(*made, strict=True)
     arms = [mbs.GetMarkerParameter(marker, "localPosition") for marker in firsts]
-    read = [mbs.GetSensorParameter(velocity, "markerNumber") for velocity, _, _ in sensors]
+    read = [mbs.GetSensorParameter(velocity, "markerNumber") for velocity in velocities]
     for name, values in (
         ("SetMarkerParameter", [mbs.GetMarkerOutput(one, position) for one in firsts]),
         ("ModifyMarker", [mbs.GetMarkerOutput(one, position) for one in seconds]),
-        ("SetSensorParameter", s.sensed([third for _, third, _ in sensors])),
-        ("ModifySensor", s.sensed([fourth for _, _, fourth in sensors])),
+        ("SetSensorParameter", s.sensed(thirds)),
+        ("ModifySensor", s.sensed(fourths)),
         ("GetMarkerParameter",
          [s.of_body(body, "Position", arm) for body, arm in zip(bodies, arms, strict=True)]),
         ("GetSensorParameter", [mbs.GetMarkerOutput(one, position) for one in read]),
@@ -516,7 +508,7 @@ def _add_linear_systems(s: _Items) -> None:
     K = np.diag(sizes)
     s.object(
         "ObjectGenericODE2", nodeNumbers=[node], massMatrix=2 * np.eye(len(sizes)), stiffnessMatrix=K,
-        forceUserFunction=lambda mbs, t, item, q, rates: (-sizes * q).tolist(),
+        forceUserFunction=lambda mbs, t, item, q, *_: (-sizes * q).tolist(),
         jacobianUserFunction=lambda mbs, t, item, q, rates, of_q, of_rates: of_q * K,
     )  # fmt: skip
     s.mbs.Assemble()

@@ -91,7 +91,7 @@ def _weight(marker: Any, gravity: Array, kind: str = "LoadMassProportional") -> 
 
 
 def _weight_by_function(marker: Any, gravity: Array) -> Any:
-    given = {"loadVector": [0.0] * 3, "loadVectorUserFunction": lambda mbs, t, load: gravity.tolist()}
+    given = {"loadVector": [0.0] * 3, "loadVectorUserFunction": lambda *_: gravity.tolist()}
     return items.LoadMassProportional(markerNumber=marker, **given)
 
 
@@ -328,7 +328,7 @@ def _created_load(function: str) -> Callable[..., Any]:
 
 def _load_by_function(kind: str) -> Callable[..., Any]:
     def add(mbs: Any, loadVector: Any, **given: Any) -> Any:
-        given["loadVectorUserFunction"] = lambda mbs, t, load: loadVector
+        given["loadVectorUserFunction"] = lambda *_: loadVector
         return add_plain(kind, mbs, loadVector=[0.0] * 3, **given)
 
     return add

@@ -97,7 +97,7 @@ class _FreeFlyerSystem:
         engine, data, model = self.pin_model, self.data, self.source_model
         turn, (q, v, tau, rates) = rotation_matrix(state.p), self._coordinates(state)
         if self.use_kkt_inverse or model.has_loops or not all(kind.is_spherical for kind in model.kinds):
-            reaction, moment, _ = self._solve_constraint_rows(state, q, v, tau)
+            reaction, moment, _ = self._solve_constraint_rows(q, v, tau)
         else:
             pin.constraintDynamics(engine, data, q, v, tau, self.contacts, self.contact_data)
             reaction = rotate_vectors(turn, np.array([one.contact_force.linear for one in self.contact_data]))
@@ -122,20 +122,18 @@ class _FreeFlyerSystem:
             for part in own
         ]
         q, v, tau, rates = self._coordinates(state)
-        kept = self._solve_constraint_rows(state, q, v, tau)[2]
+        kept = self._solve_constraint_rows(q, v, tau)[2]
         fields = {"q": q, "v": v, "torque": tau, "joint_rates": rates, "kept": kept}
         fields |= {"gravity": model.gravity, "omega": state.omega, "A": rotation_matrix(state.p)}
         joints = []
         for k, (kind, bodies) in enumerate(zip(model.kinds, model.body + 1, strict=True)):
             bend = model.length[k] * self.udot[k] @ self.udot[k] if kind.holds_distance else 0.0
             ends = list(zip(bodies.tolist(), model.point[k], strict=True))
-            joints.append((ends, self._held_directions(k, state), self.allowed[k], bend, kind.has_attitude))
+            joints.append((ends, self._held_directions(k), self.allowed[k], bend, kind.has_attitude))
         uses_contacts = all(kind.is_spherical for kind in model.kinds) and not model.has_loops
         return {"joints": joints, "masses": masses, "contacts": uses_contacts, "fields": fields}
 
-    def _solve_constraint_rows(
-        self, state: State, q: Array, v: Array, tau: Array
-    ) -> tuple[Array, Array, Indices]:
+    def _solve_constraint_rows(self, q: Array, v: Array, tau: Array) -> tuple[Array, Array, Indices]:
         """Solve with rows built here into ``data.ddq``; return forces, moments (N, 3) and rows used."""
         engine, data, model = self.pin_model, self.data, self.source_model
         pin.forwardKinematics(engine, data, q, v, np.zeros(engine.nv))
@@ -143,8 +141,8 @@ class _FreeFlyerSystem:
         pin.updateFramePlacements(engine, data)
         rows, drifts, directions = [np.zeros((0, engine.nv))], [np.zeros(0)], []
         for k in range(len(model.kind)):
-            jacobian, drift = self._relative_motion(k, state)
-            held = self._held_directions(k, state)
+            jacobian, drift = self._relative_motion(k)
+            held = self._held_directions(k)
             rows.append(held @ jacobian)
             bend = held @ drift
             if model.rods[k]:
@@ -167,7 +165,7 @@ class _FreeFlyerSystem:
         wrench = np.array([held.T @ part for held, part in zip(directions, parts, strict=True)])
         return wrench[:, :3], wrench[:, 3:], kept
 
-    def _relative_motion(self, k: int, state: State) -> tuple[Array, Array]:
+    def _relative_motion(self, k: int) -> tuple[Array, Array]:
         """Jacobian (6, nv) of joint k, and its acceleration at v̇ = 0 less what allowed rates cause.
 
         Of the near point against the point of the far body where it is, and of the angular velocity.  The
@@ -203,7 +201,7 @@ class _FreeFlyerSystem:
                 carried = carried + about * rate
         return jacobian, drift - self.allowed[k]
 
-    def _held_directions(self, k: int, state: State) -> Array:
+    def _held_directions(self, k: int) -> Array:
         """Rows (c, 6) of the near point's velocity and of the angular velocity that joint k holds."""
         model, kind = self.source_model, self.source_model.kinds[k]
         if kind.has_attitude:
