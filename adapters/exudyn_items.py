@@ -27,7 +27,7 @@ from adapters.exudyn_common import (
     sizes_of_body,
     texts,
 )
-from adapters.pose_functions import Pose, about, turned
+from adapters.pose_functions import Pose, about, homogeneous, turned
 from adapters.surface_record import SurfaceRecord
 from plumbline.engines.missing_names import add_parts
 from plumbline.model.datatypes import Array, Float, Model, State
@@ -602,21 +602,17 @@ def _add_inertias(s: _Items) -> None:
         add(f"rigidBodyUtilities.{name}", own)
 
 
-def _pose(turn: Array, place: Array) -> Array:
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = turn, place
-    return pose
-
-
 def _add_robots(s: _Items) -> None:
     """Robots of one link on a base half way to the body, with the probe frame as their tool."""
     angle, poses = 0.4, []
-    back = _pose(about(2, -angle), np.zeros(3))
+    back = homogeneous(about(2, -angle), np.zeros(3))
     for one in s.bodies:
-        base = _pose(PROBE_TURN, one.place / 2)  # no farther than the body, by whose size places are rounded
-        tool = robots.RobotTool(HT=_pose(PROBE_TURN, one.arm))
+        base = homogeneous(
+            PROBE_TURN, one.place / 2
+        )  # no farther than the body, by whose size places are rounded
+        tool = robots.RobotTool(HT=homogeneous(PROBE_TURN, one.arm))
         robot = robots.Robot(base=robots.RobotBase(HT=base), tool=tool)
-        before = np.linalg.inv(base) @ _pose(one.turn, one.place) @ back
+        before = np.linalg.inv(base) @ homogeneous(one.turn, one.place) @ back
         robot.AddLink(robots.RobotLink(one.mass, [0.0] * 3, AXES, jointType="Rz", preHT=before))
         poses.append(np.array(robot.JointHT([angle])[0]) @ np.array(robot.GetToolHT()))
     call, found = "robotics.RobotBase robotics.RobotTool", np.array(poses)

@@ -26,6 +26,7 @@ from adapters.exudyn_common import (
     texts,
 )
 from adapters.exudyn_variants import is_open, of_ways
+from adapters.pose_functions import homogeneous
 from plumbline.engines.variants import both, has, variants_of
 from plumbline.model.datatypes import Array, EngineFailure, Float, Model
 
@@ -40,9 +41,7 @@ LONG_STEP = 2.0**20  # s: of one step of Euler's method, in which v₁ = v₀ + 
 
 def pose_of(link: Any) -> Float[Array, "4 4"]:
     """The joint of a link in the link before, at its start."""
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = link.axes_in_parent, link.offset
-    return pose
+    return homogeneous(link.axes_in_parent, link.offset)
 
 
 def short_type(link: Any) -> str:

@@ -158,37 +158,29 @@ def pose_of_coordinates(x: Float[Array, "7"]) -> Float[Array, "4 4"]:
 
 
 def free_joint_name(body: str, file: ModelFile) -> str:
-    """Return the name of a body's free joint, which most engines do not keep.
+    """Return the name of a body's free joint, which most engines do not keep: the file's, if it has one."""
+    return _own_names(file, body, [f"{body}/free"])[0]
 
-    Args:
-        file: the file that says it, if it is an MJCF.
 
-    Returns:
-        The name that the file's description uses.
+def names_of_parts(file: ModelFile, body: str, joint: str, count: int) -> list[str]:
+    """Return names of the joints that an engine has made one of: the file's, or the one's with numbers."""
+    return _own_names(file, body, [f"{joint}/{k}" for k in range(count)])
 
-    """
-    own = joint_names(file).get(body, []) if file.format == "mjcf" else []
-    return own[0] if len(own) == 1 else f"{body}/free"
+
+def _own_names(file: ModelFile, body: str, made_up: list[str]) -> list[str]:
+    names = joint_names(file).get(body, [])
+    return names if len(names) == len(made_up) else made_up
 
 
 def joint_names(file: ModelFile) -> dict[str, list[str]]:
-    """Read the names of the joints of each body of an MJCF file.
-
-    Returns:
-        Names of the joints, in their order, by the body's name.
-
-    """
+    """Read the names of the joints of each body of an MJCF file, in their order, by the body's name."""
+    if file.format != "mjcf":
+        return {}
     root = ElementTree.parse(file.path).getroot()
     return {
         body.get("name", ""): [joint.get("name", "") for joint in body if joint.tag in ("joint", "freejoint")]
         for body in root.iter("body")
     }
-
-
-def names_of_parts(file: ModelFile, body: str, joint: str, count: int) -> list[str]:
-    """Return names of the joints that an engine has made one of: the file's, or the one's with numbers."""
-    names = joint_names(file).get(body, []) if file.format == "mjcf" else []
-    return names if len(names) == count else [f"{joint}/{k}" for k in range(count)]
 
 
 def merge_made_up_bodies(bodies: Sequence[NeutralBody], file: ModelFile) -> list[NeutralBody]:

@@ -25,7 +25,7 @@ import mujoco
 import numpy as np
 
 from adapters.importer_common import Layout, LoadingImporter, Refused, free_joint_name, make_joint, pose
-from adapters.mujoco_common import full_mass_matrix, warnings_to
+from adapters.mujoco_common import compiler_of, full_mass_matrix, set_attributes, warnings_to
 from plumbline.importers.importer import ModelFile
 from plumbline.importers.neutral_model import (
     CanonicalState,
@@ -123,11 +123,11 @@ def _compiled(file: ModelFile) -> Any:
     if file.format == "mjcf" or file.base == "fixed":
         return mujoco.MjModel.from_xml_path(file.path)
     spec = mujoco.MjSpec.from_file(file.path)
-    getattr(spec, "compiler", spec).fusestatic = False  # an attribute of the spec before 3.2.5
+    compiler_of(spec).fusestatic = False
     root = spec.worldbody.first_body()
     if root is not None:
-        joint = root.add_joint()
-        joint.type, joint.name = mujoco.mjtJoint.mjJNT_FREE, free_joint_name(root.name, file)
+        name = free_joint_name(root.name, file)
+        set_attributes(root.add_joint(), type=mujoco.mjtJoint.mjJNT_FREE, name=name)
     return spec.compile()
 
 

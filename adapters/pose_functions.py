@@ -77,6 +77,13 @@ def about(axis: int, angle: float) -> Float[Array, "3 3"]:
     return rotation_matrix(np.append(np.cos(angle / 2), np.sin(angle / 2) * np.eye(3)[axis]))
 
 
+def homogeneous(turn: Float[Array, "3 3"], place: Float[Array, "3"]) -> Float[Array, "4 4"]:
+    """Return the matrix of a pose."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = turn, place
+    return pose
+
+
 def turned(angles: Float[Array, "3"]) -> Float[Array, "3 3"]:
     """Return the turn by angles about x, y, z in turn, intrinsic."""
     return about(0, angles[0]) @ about(1, angles[1]) @ about(2, angles[2])
@@ -114,9 +121,8 @@ class Pose:
     def forms(self) -> Mapping[str, Any]:
         """By name; x, y and z are numbers."""
         phi, xyz = rotation_vector(self.p), xyz_angles(self.R)
-        H, G = np.eye(4), np.eye(7)
-        H[:3, :3] = G[:3, :3] = self.R
-        H[:3, 3] = G[3:6, 6] = self.r
+        H, G = homogeneous(self.R, self.r), np.eye(7)
+        G[:3, :3], G[3:6, 6] = self.R, self.r
         X = np.kron(np.eye(2), self.R)
         X[3:, :3] = cross_matrix(self.r) @ self.R
         XI = np.kron(np.eye(2), self.R.T)
