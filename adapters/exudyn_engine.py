@@ -350,12 +350,12 @@ class Exudyn(ExudynAdapter):
         rates = np.zeros((0, 0)) if model.has_loops else _coordinate_rate_map(chain)
         fields = {"qdot": chain.qdot.ravel(), "A": chain.turns[:-1], "used": used}
         fields |= {"elastic": np.array(elastic_energy(model, state)), "joint_rates": rates}
-        fields |= {"gravity": model.gravity, "proximal": model.proximal, "near": model.body[:, 1]}
+        fields |= {"proximal": model.proximal, "near": model.body[:, 1]}
         joints = [None if joint is None else int(joint) for joint in chain.joints]
         pushes = [(k, int(item), is_push, axis.tolist()) for k, item, is_push, axis in chain.connectors]
         parts = {"items": system, "joints": joints, "pushes": pushes}
         held = [chain.joint_rows(k) for k in range(len(joints))]
-        bodies = {"nodes": [*map(int, chain.nodes)], "bodies": [*map(int, chain.piece_bodies)], "held": held}
+        bodies = {"bodies": [*map(int, chain.piece_bodies)], "held": held}
         return parts | bodies | {"fields": fields}
 
     def _surface(self, model: Model, states: Sequence[State]) -> Sequence[SurfaceAnswer]:

@@ -118,11 +118,10 @@ def _set_efforts(m: Any, d: Any, ways: Ways, effort: Array) -> None:
                 q = d.qpos[at + turned : at + turned + 4]
                 wanted = (rotation_matrix(q / np.linalg.norm(q)) @ share[first : first + 3])[i - turned]
             if way == "affine":
-                length = GEAR * d.qpos[at] if _dofs(m, j) == 1 else 0.0
-                speed = GEAR * d.qvel[rate]
-                gain = 2.0, 0.5 / (1 + abs(length)), 0.5 / (1 + abs(speed))
-                m.actuator_gainprm[a, :3] = gain if length else (2.0, 0.0, 0.5 / (1 + abs(speed)))
-                wanted /= m.actuator_gainprm[a, :3] @ [1.0, length, speed]
+                length, speed = GEAR * d.qpos[at] * (_dofs(m, j) == 1), GEAR * d.qvel[rate]
+                gain = 2.0, 0.5 * bool(length) / (1 + abs(length)), 0.5 / (1 + abs(speed))
+                m.actuator_gainprm[a, :3] = gain
+                wanted /= np.dot(gain, [1.0, length, speed])
             if way == "pid":
                 _set_pid(m, d, a, wanted / GEAR, (j, rate))
             elif "dyntype" in members:

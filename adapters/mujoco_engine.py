@@ -225,7 +225,7 @@ class Mujoco(MetamorphicHooks):
         rates, loads = tree.set_state(there), ("proximal", "force", "moment", "drag_force", "drag_moment")
         fields = {name: getattr(tree.d, name).copy() for name in ("qpos", "qvel", "qfrc_applied")}
         fields |= {f"link_{name}": getattr(tree.model, name) for name in loads}
-        fields |= {"gravity": model.gravity, "link": np.array(tree.link_ids), "joint_rates": rates}
+        fields |= {"link": np.array(tree.link_ids), "joint_rates": rates}
         if soft and moves:
             fields["scales"] = LARGEST_RUN_REGULARISATION / RATIO ** np.arange(RUN_REGULARISATIONS)
         elif soft:

@@ -552,7 +552,7 @@ class PinocchioChain:
             masses.append((self.body_joints[k] - 1, at_joint, 0.0, _axial_inertia(model, k)))
         welds = [[bodies[k] for k in pair] for pair in self.ends]
         loads = ("force", "moment", "drag_force", "drag_moment")
-        fields = {"gravity": model.gravity, "q": q, "v": v, "armature": armature(engine)}
+        fields = {"q": q, "v": v, "armature": armature(engine)}
         fields |= {f"link_{name}": getattr(model, name) for name in loads}
         fields |= {name: getattr(self, name) for name in ("effort", "damping", "stiffness", "rest")}
         fields |= {"of_q": self.scalars[0], "of_v": self.scalars[1], "joint_rates": self.rate_map(state)}

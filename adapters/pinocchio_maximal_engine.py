@@ -124,7 +124,7 @@ class _FreeFlyerSystem:
         q, v, tau, rates = self._coordinates(state)
         kept = self._solve_constraint_rows(q, v, tau)[2]
         fields = {"q": q, "v": v, "torque": tau, "joint_rates": rates, "kept": kept}
-        fields |= {"gravity": model.gravity, "omega": state.omega, "A": rotation_matrix(state.p)}
+        fields |= {"omega": state.omega, "A": rotation_matrix(state.p)}
         joints = []
         for k, (kind, bodies) in enumerate(zip(model.kinds, model.body + 1, strict=True)):
             bend = model.length[k] * self.udot[k] @ self.udot[k] if kind.holds_distance else 0.0
