@@ -207,36 +207,30 @@ class Mujoco(MetamorphicHooks):
         return str(mujoco.mj_versionString())
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
-        if self.is_soft(model):
-            soft = self._soft(model)
-            with _raise_on_warnings(soft.tree.d):
-                return [_rigid_limit(soft, state) for state in states]
-        chain = self._chain(model)
-        with _raise_on_warnings(chain.d):
-            return [chain.quantities(state) for state in states]
+        mechanism = self._mechanism(model)
+        with _raise_on_warnings(mechanism.tree.d):
+            if self.is_soft(model):
+                return [_rigid_limit(mechanism, state) for state in states]
+            return [mechanism.tree.quantities(state) for state in states]
 
     def written(self, model: Model, state: State, moves: bool = False) -> dict[str, Any]:
         """Return the MJCF, the numbers that it lacks, and what the read-out needs, of one state."""
-        parts, soft = self.body_pieces(model), None
-        if self.is_soft(model):
-            soft = _SoftMechanism(model, self.option, parts, has_text=True)
-        tree = soft.tree if soft else _MujocoChain(model, parts, has_text=True)
-        there = soft.state(state) if soft else state
+        mechanism = _Mechanism(model, self.option, self.body_pieces(model), has_text=True)
+        tree, there = mechanism.tree, mechanism.state(state)
         rates, loads = tree.set_state(there), ("proximal", "force", "moment", "drag_force", "drag_moment")
         fields = {name: getattr(tree.d, name).copy() for name in ("qpos", "qvel", "qfrc_applied")}
         fields |= {f"link_{name}": getattr(tree.model, name) for name in loads}
         fields |= {"link": np.array(tree.link_ids), "joint_rates": rates}
-        if soft and moves:
-            fields["scales"] = LARGEST_RUN_REGULARISATION / RATIO ** np.arange(RUN_REGULARISATIONS)
-        elif soft:
-            largest = _usable_regularisation(soft, state, there)
-            fields["scales"] = largest / RATIO ** np.arange(REGULARISATIONS)
-        bodies, joints = soft.places() if soft else (np.arange(model.n), np.arange(len(model.kind)))
-        fields |= {"bodies": bodies, "joints": joints}
+        if self.is_soft(model):
+            largest, count = LARGEST_RUN_REGULARISATION, RUN_REGULARISATIONS
+            if not moves:
+                largest, count = _usable_regularisation(mechanism, state, there), REGULARISATIONS
+            fields["scales"] = largest / RATIO ** np.arange(count)
+        fields["bodies"], fields["joints"] = mechanism.places()
         constants = dict[str, Array]()
-        if soft and soft.rods:
-            along = kinematics.joint_coordinates(model, state)[0][soft.rods]
-            fields |= {"tied": np.array(soft.rods), "along": along}
+        if rods := mechanism.rods:
+            along = kinematics.joint_coordinates(model, state)[0][rods]
+            fields |= {"tied": np.array(rods), "along": along}
             constants = {name: getattr(tree.m, name) for name in ("tendon_length0", "tendon_invweight0")}
         settings = {"softness": SOFTNESS, "ratio": RATIO, "iterations": RUN_ITERATIONS, "solref": RUN_SOLREF}
         numbers = {"text": tree.text, "numbers": tree.numbers, "constants": constants}
@@ -246,26 +240,12 @@ class Mujoco(MetamorphicHooks):
         """Whether constraints hold it: loops, options of joints, pitches."""
         return is_constrained(model) or self.option in self.joint_options
 
-    @property
-    def _change(self) -> Change:
-        return self.variant.change if self.variant else Change()
-
-    @property
-    def _is_compiled_as_usual(self) -> bool:
-        """Whether it is set to a variant of a model that other variants have as well."""
-        return self.variant is not None and self._change.is_after_compiling
-
-    def _chain(self, model: Model) -> _MujocoChain:
-        """The mechanism as the adapter is set."""
-        if self._is_compiled_as_usual:
-            return _compiled_chain(model).copied(self._change)
-        return _MujocoChain(model, self.body_pieces(model), self.option == DENSE, change=self._change)
-
-    def _soft(self, model: Model) -> _SoftMechanism:
-        """The same where constraints hold it."""
-        if self._is_compiled_as_usual:
-            return _compiled_mechanism(model, self.option).copied(self._change)
-        return _SoftMechanism(model, self.option, self.body_pieces(model), self._change)
+    def _mechanism(self, model: Model) -> _Mechanism:
+        """The mechanism as the adapter is set; variants after compiling share what is compiled."""
+        change = self.variant.change if self.variant else Change()
+        if self.variant and change.is_after_compiling:
+            return _compiled_mechanism(model, self.option).copied(change)
+        return _Mechanism(model, self.option, self.body_pieces(model), change)
 
     def _surface(self, model: Model, states: Sequence[State]) -> Sequence[SurfaceAnswer]:
         if self.is_soft(model):
@@ -287,7 +267,7 @@ class Mujoco(MetamorphicHooks):
             raise Unsupported(TENDON_MOTIONS)
         if self.is_soft(model):
             return self._rigid_run(model, state, times, integrator, resolution)
-        chain = _compiled_chain(model).copied(Change())
+        chain = _compiled_mechanism(model, self.option).tree.copied(Change())
         return self._sampled_run(chain, state, (times, integrator, resolution))
 
     def _step(self, model: Model, state: State, times: Array, integrator: Integrator, step: float) -> StepRun:
@@ -295,7 +275,7 @@ class Mujoco(MetamorphicHooks):
             return self._limit_of_steps(model, state, times, integrator, step)
         return super()._step(model, state, times, integrator, step)
 
-    def _softened(self, model: Model, largest: float) -> list[_SoftMechanism]:
+    def _softened(self, model: Model, largest: float) -> list[_Mechanism]:
         """The mechanism at regularisations that fall from the largest."""
         compiled = _compiled_mechanism(model, self.option)
         found = [compiled.copied(Change()) for _ in range(RUN_REGULARISATIONS)]
@@ -705,8 +685,11 @@ class _MujocoChain:
         return out
 
 
-class _SoftMechanism:
-    """A mechanism that MuJoCo holds by soft constraints: loops closed, rods as ties, motions held."""
+class _Mechanism:
+    """A mechanism and the tree that MuJoCo makes of it, with soft constraints where the mechanism needs them.
+
+    They close loops, tie bodies together in place of rods, or hold motions that joints have in addition.
+    """
 
     def __init__(
         self,
@@ -727,7 +710,8 @@ class _SoftMechanism:
         for k in self.rods:
             softness = sum(1 / model.mass[b] for b in model.body[k] if b >= 0)
             ties.append(_Tie(place[model.body[k]], model.point[k], model.length[k], softness))
-        held = joints_as_cylinders(self.opened, PITCHED_KINDS + (HELD_KINDS if option == HELD else ()))
+        some = PITCHED_KINDS + (HELD_KINDS if option == HELD else ())
+        held = self.opened if set(some).isdisjoint(rest.kind) else joints_as_cylinders(self.opened, some)
         pairs = zip(self.opened.kinds, self.opened.length, strict=True)
         pitches = tuple(float(length) if kind.has_pitch else 0.0 for kind, length in pairs)
         added = tuple(added_motions(self.opened, held))
@@ -735,7 +719,7 @@ class _SoftMechanism:
         parts = None if self.cut.ends or self.rodless else parts  # whose bodies are in another order
         self.tree = _MujocoChain(held, parts, option == DENSE, constraints, change=change, has_text=has_text)
 
-    def copied(self, change: Change) -> _SoftMechanism:
+    def copied(self, change: Change) -> _Mechanism:
         """The same with a copy of its tree."""
         other = copy(self)
         other.tree = self.tree.copied(change)
@@ -778,11 +762,10 @@ class _SoftMechanism:
 
 
 # Variants, steps and runs are of the same mechanisms in turn; these are not run themselves.
-_compiled_chain = lru_cache(maxsize=8)(_MujocoChain)
-_compiled_mechanism = lru_cache(maxsize=8)(_SoftMechanism)
+_compiled_mechanism = lru_cache(maxsize=16)(_Mechanism)
 
 
-def _rigid_limit(soft: _SoftMechanism, state: State) -> StateQuantities:
+def _rigid_limit(soft: _Mechanism, state: State) -> StateQuantities:
     """Evaluate at falling regularisations R, check order 1, and extrapolate to none.
 
     Rounding of the forces grows with 1/R.  The limit's uncertainty, by rounding and by what is left of R, is
@@ -804,7 +787,7 @@ def _rigid_limit(soft: _SoftMechanism, state: State) -> StateQuantities:
     return StateQuantities(**values, limit_error=errors)
 
 
-def _usable_regularisation(soft: _SoftMechanism, state: State, there: State) -> float:
+def _usable_regularisation(soft: _Mechanism, state: State, there: State) -> float:
     """Find the largest from which the answers can be extrapolated."""
     for largest in LARGEST_REGULARISATIONS:
         with suppress(Unsupported, EngineFailure):
@@ -813,7 +796,7 @@ def _usable_regularisation(soft: _SoftMechanism, state: State, there: State) -> 
     raise Unsupported("no regularisation of MuJoCo's constraints can be extrapolated from")
 
 
-def _limits(soft: _SoftMechanism, state: State, there: State, largest: float) -> list[dict[str, Array]]:
+def _limits(soft: _Mechanism, state: State, there: State, largest: float) -> list[dict[str, Array]]:
     """Extrapolate three sequences or more: rounding can spoil one, and is another in the next."""
     found, refusals = list[dict[str, Array]](), list[Unsupported | EngineFailure]()
     # An option's solver may lose digits in one sequence; of MuJoCo's own way a wrong order is a failure.
@@ -835,7 +818,7 @@ def _largest_norm(difference: Array) -> float:
     return float(np.max(np.linalg.norm(np.atleast_2d(difference), axis=-1)))
 
 
-def _extrapolated(soft: _SoftMechanism, state: State, there: State, largest: float) -> dict[str, Array]:
+def _extrapolated(soft: _Mechanism, state: State, there: State, largest: float) -> dict[str, Array]:
     """Extrapolate all quantities from one sequence of regularisations."""
     found = list[dict[str, Array]]()
     for k in range(REGULARISATIONS):
