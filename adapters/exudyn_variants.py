@@ -31,7 +31,7 @@ from adapters.exudyn_common import (
     texts,
 )
 from adapters.pose_functions import Pose, rate_maps
-from plumbline.engines.variants import Variant, both, has, variants_of
+from plumbline.engines.variants import Suits, Variant, both, has, variants_of
 from plumbline.model.datatypes import Array, Float, JointKind, Model, Unsupported
 from plumbline.model.kinematics import quaternion_rate, rotation_matrix, rotation_vector
 from plumbline.model.welding import RigidPart
@@ -372,7 +372,7 @@ def _drag_by_two(way: Callable[..., Any]) -> Callable[..., Any]:
     return add
 
 
-def _has_elements_that(what: str) -> Callable[[Model], bool]:
+def _has_elements_that(what: str) -> Suits:
     """Whether a joint with one motion of this kind has a spring, damper or effort."""
 
     def has(model: Model) -> bool:
@@ -386,7 +386,7 @@ def _has_elements_that(what: str) -> Callable[[Model], bool]:
     return has
 
 
-HAS: Mapping[str, Callable[[Model], bool]] = {
+HAS: Mapping[str, Suits] = {
     "LoadForceVector": has("force"),
     "LoadTorqueVector": has("moment"),
     DRAG: both(has("drag_force"), has("drag_moment")),

@@ -337,22 +337,16 @@ class Mujoco(MetamorphicHooks):
         times, integrator, resolution = run
         chain.prepare(state, integrator, resolution)
         counts = np.round(times / resolution).astype(int)
-        t, rows = [0.0], [chain.sample()]
-        joint_q, joint_v = [chain.d.qpos.copy()], [chain.d.qvel.copy()]
+        rows = [chain.full_sample()]
         advance = advance or (lambda count: mujoco.mj_step(chain.m, chain.d, nstep=count))
         with _raise_on_warnings(chain.d):
             for done in np.diff(counts):
                 advance(int(done))
-                t.append(chain.d.time)  # the engine's own clock: the contract's checks notice a reset
-                rows.append(chain.sample())
-                joint_q.append(chain.d.qpos.copy())
-                joint_v.append(chain.d.qvel.copy())
-        r, p, v, omega = (np.array(column) for column in zip(*rows, strict=True))
+                rows.append(chain.full_sample())
+        t, r, p, v, omega, *joints = (np.array(column) for column in zip(*rows, strict=True))
         pdot = kinematics.quaternion_rate(p, omega)
-        coordinates, velocities = chain.joint_samples(joint_q, joint_v)
-        return Trajectory(
-            np.array(t), r, p, v, pdot, int(counts[-1]), coordinates=coordinates, velocities=velocities
-        )
+        coordinates, velocities = chain.joint_samples(*joints)
+        return Trajectory(t, r, p, v, pdot, int(counts[-1]), coordinates=coordinates, velocities=velocities)
 
 
 HALF_TURN = np.array([0.0, 1.0, 0.0, 0.0])  # about x
@@ -664,9 +658,13 @@ class _MujocoChain:
         omega = _to_body_frame(probe.xmat[self.link_ids], velocity[:, :3])
         return probe.xpos[self.link_ids], p, velocity[:, 3:], omega
 
-    def joint_samples(self, qpos: Sequence[Array], qvel: Sequence[Array]) -> tuple[Array, Array]:
-        """Return samples as `Trajectory` orders them: rods point along z there, along −z here."""
-        q, v, m = np.array(qpos), np.array(qvel), self.m
+    def full_sample(self) -> tuple[Any, ...]:
+        """Return the time by the engine's clock, by which a reset is noticed, the sample, qpos and qvel."""
+        return self.d.time, *self.sample(), self.d.qpos.copy(), self.d.qvel.copy()
+
+    def joint_samples(self, q: Array, v: Array) -> tuple[Array, Array]:
+        """Reorder samples as `Trajectory` has them: rods point along z there, along −z here."""
+        m = self.m
         for kind, b in zip(self.model.kinds, self.link_ids, strict=True):
             at, dof = m.jnt_qposadr[m.body_jntadr[b]], m.body_dofadr[b]
             if kind.holds_nothing:

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
 from functools import reduce
-from operator import or_
+from operator import attrgetter, or_
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from adapters import mujoco_actuation as actuation
 from adapters import mujoco_shapes as shapes
 from adapters.mujoco_common import bodies_of, compiler_of, dense_rows, member, through_inverse
 from adapters.pose_functions import FIXED_PLACE, Pose, rate_maps
-from plumbline.engines.variants import Variant, both, every, has, names_of_column, variants_of
+from plumbline.engines.variants import Suits, Variant, both, every, has, names_of_column, variants_of
 from plumbline.model.datatypes import Array, Model, Unsupported
 from plumbline.model.kinematics import quaternion_conjugate, quaternion_product, rotation_matrix
 from plumbline.model.probe_frames import PROBE_ATTITUDE
@@ -116,16 +116,12 @@ def _set_options(**values: Any) -> Callable[[Any, Any], tuple[Any, Any]]:
 
 def is_constrained(model: Model) -> bool:
     """Whether soft constraints hold a mechanism: loops, and pitches of joints."""
-    return model.has_loops or any(kind.has_pitch for kind in model.kinds)
+    return _has_loops(model) or _has_pitches(model)
 
 
 def _has_few_constraints(model: Model) -> bool:
     """Whether an iteration over all rows is cheap."""
     return is_constrained(model) and len(model.kind) <= FEW_JOINTS
-
-
-def _is_free(model: Model) -> bool:
-    return not is_constrained(model)
 
 
 def _binary(m: Any, d: Any) -> tuple[Any, Any]:
@@ -401,10 +397,12 @@ def _has_inertia(model: Model) -> bool:
     return bool(np.all(moments[:, 2] < (1 - ROUNDING) * (moments[:, 0] + moments[:, 1])))
 
 
-def _has_loops(model: Model) -> bool:
-    return model.has_loops
+def _is_free(model: Model) -> bool:
+    return not is_constrained(model)
 
 
+_has_loops: Suits = attrgetter("has_loops")
+_has_pitches: Suits = lambda model: any(kind.has_pitch for kind in model.kinds)  # noqa: E731
 _option = variants_of("option", Change, _is_free)
 _spelling = variants_of("spelling", Change, _is_free)
 
@@ -427,7 +425,7 @@ def _forward_to_convergence(m: Any, d: Any) -> None:
 
 
 def _options(
-    suits: Callable[[Model], bool] = every,
+    suits: Suits = every,
     forward: Callable[[Any, Any], None] = mujoco.mj_forward,
     **values: Any,
 ) -> Variant:
@@ -437,7 +435,7 @@ def _options(
     return _of_constraints(names, suits, remake=set_options, forward=forward)
 
 
-def _of_shapes(by: str, describe: Callable[[Any], Any], suits: Callable[[Model], bool]) -> Variant:
+def _of_shapes(by: str, describe: Callable[[Any], Any], suits: Suits) -> Variant:
     """Describe bodies of geoms."""
     names = f"mjtInertiaFromGeom.mjINERTIAFROMGEOM_{by} {SHAPES}"
     return _spelling(names, both(_has_inertia, suits), has_own_inertia=True, describe=describe)
@@ -447,7 +445,7 @@ def _actuated(
     ways: actuation.Ways,
     read: str = "",
     names: str = "",
-    suits: Callable[[Model], bool] = has("effort"),  # noqa: B008
+    suits: Suits = has("effort"),  # noqa: B008
 ) -> Variant:
     """Let actuators exert what the joints have."""
     own = " ".join(actuation.names_of(ways))
@@ -595,18 +593,14 @@ VARIANTS = (
 )  # fmt: skip
 
 
-def _has_kind(*kinds: str) -> Callable[[Model], bool]:
-    return lambda model: not set(kinds).isdisjoint(model.kind)
-
-
 COLUMN_NAMES = names_of_column(
     "mujoco",
     {
         "without constraints": _is_free,
-        "balls and rods": _has_kind("ball", "rod"),
-        "free bodies": _has_kind("free"),
+        "balls and rods": lambda model: any(kind.holds_no_turn for kind in model.kinds),
+        "free bodies": has("free"),
         "loops": _has_loops,
-        "pitches": lambda model: any(kind.has_pitch for kind in model.kinds),
+        "pitches": _has_pitches,
         "springs between points": lambda model: len(model.spring_body) > 0,
         "moments and drag": has("moment", "drag_force", "drag_moment"),
     },

@@ -39,7 +39,7 @@ off on the catalogue's ten balls, 2e-8 on thirty, 8e-3 on fifty, where `crba` is
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, ClassVar, Literal
 
@@ -69,7 +69,7 @@ from adapters.pose_functions import add_pose_answers
 from adapters.surface_record import Answer
 from plumbline.engines.integrators import dop853, rkmk4, sample_steps, semi_implicit_euler
 from plumbline.engines.missing_names import add_parts
-from plumbline.engines.variants import names_of_column
+from plumbline.engines.variants import Suits, names_of_column
 from plumbline.model.datatypes import (
     Array,
     Float,
@@ -732,7 +732,7 @@ def _add_closed(s: Probed, loops: Loops) -> None:
         s.add_accelerations(call, a, "by_derivative" if by_derivative else "by_constraint_solver")
 
 
-def _has_joint(kind: str) -> Callable[[Model], bool]:
+def _has_joint(kind: str) -> Suits:
     """Whether a mechanism is built with such a joint."""
 
     def has(model: Model) -> bool:

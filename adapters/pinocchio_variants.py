@@ -19,7 +19,7 @@ import numpy as np
 import pinocchio as pin
 
 from adapters.pinocchio_common import axis_of, composite, joint_of, parts_of
-from plumbline.engines.variants import Variant, has, variants_of
+from plumbline.engines.variants import Suits, Variant, has, variants_of
 from plumbline.model.datatypes import Array, Float, Model
 
 LIMITS = (
@@ -94,9 +94,7 @@ def _unbounded(q: Array) -> Array:
     return np.array([*q[:-1], np.cos(q[-1]), np.sin(q[-1])])
 
 
-def _spelled(
-    kinds: str, joints: Mapping[str, Spelling], is_meant: Callable[[Model], bool], names: str = ""
-) -> Variant:
+def _spelled(kinds: str, joints: Mapping[str, Spelling], is_meant: Suits, names: str = "") -> Variant:
     """Describe joints by models of these kinds, whose names and those of their data are the engine's."""
 
     def suits(model: Model) -> bool:
@@ -107,7 +105,7 @@ def _spelled(
     return _spelling(names or " ".join(every), suits, joints=joints)
 
 
-def _moves(*motions: str) -> Callable[[Model], bool]:
+def _moves(*motions: str) -> Suits:
     """Whether a joint of the mechanism has these motions in turn, and no pitch."""
     return lambda model: any(
         tuple(what for what, _ in kind.motions) == motions and not kind.has_pitch for kind in model.kinds
