@@ -94,6 +94,13 @@ def make_settings() -> Any:
     return settings
 
 
+def make_evaluation_settings() -> Any:
+    """Make settings for single evaluations, without initial accelerations."""
+    settings = make_settings()
+    settings.timeIntegration.generalizedAlpha.computeInitialAccelerations = False
+    return settings
+
+
 def add_loads(
     mbs: Any, model: Model, k: int, marker: Any, ground: Any, moment: Float[Array, "3"], ways: Ways
 ) -> None:
@@ -118,13 +125,25 @@ def add_loads(
         add_item(mbs, ways, "ObjectConnectorRigidBodySpringDamper", **given)
 
 
-def add_point_spring(mbs: Any, model: Model, i: int, markers: list[Any], ways: Ways) -> None:
-    """Add a spring and damper between two points."""
-    add_item(
-        mbs, ways, "ObjectConnectorSpringDamper", markerNumbers=markers,
-        referenceLength=float(model.spring_length[i]), stiffness=float(model.spring_stiffness[i]),
-        damping=float(model.spring_damping[i]),
-    )  # fmt: skip
+def add_point_springs(mbs: Any, model: Model, marker: Callable[[int, Array], Any], ways: Ways) -> None:
+    """Add the springs and dampers between points, for which a function adds markers on bodies."""
+    for i, (bodies, points) in enumerate(zip(model.spring_body, model.spring_point, strict=True)):
+        add_item(
+            mbs, ways, "ObjectConnectorSpringDamper",
+            markerNumbers=[marker(int(body), point) for body, point in zip(bodies, points, strict=True)],
+            referenceLength=float(model.spring_length[i]), stiffness=float(model.spring_stiffness[i]),
+            damping=float(model.spring_damping[i]),
+        )  # fmt: skip
+
+
+def coordinate_marker(mbs: Any, node: Any, coordinate: int) -> Any:
+    """Add a marker at a coordinate of a node."""
+    return mbs.AddMarker(items.MarkerNodeCoordinate(nodeNumber=node, coordinate=coordinate))
+
+
+def grounded_marker(mbs: Any) -> Any:
+    """Add a marker of a coordinate that does not move."""
+    return coordinate_marker(mbs, mbs.AddNode(items.NodePointGround()), 0)
 
 
 def written_items(mbs: Any) -> list[tuple[str, dict[str, str]]]:

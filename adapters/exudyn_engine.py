@@ -35,10 +35,11 @@ from adapters.exudyn_common import (
     Output,
     add_item,
     add_loads,
-    add_point_spring,
+    add_point_springs,
     initialized_solver,
     items,
     kinetic_energy,
+    make_evaluation_settings,
     make_settings,
     make_system,
     mass_matrix_and_force,
@@ -141,9 +142,7 @@ class ExudynChain:
                 self.welds.append(mbs.AddObject(items.ObjectJointGeneric(markerNumbers=middle)))
             centre = self._add_marker(first, np.zeros(3))
             add_loads(mbs, model, k, centre, pivot, model.moment[k], change.ways)
-        for i, (bodies, points) in enumerate(zip(model.spring_body, model.spring_point, strict=True)):
-            ends = [self._end_marker(*end) for end in zip(bodies, points, strict=True)]
-            add_point_spring(mbs, model, i, ends, change.ways)
+        add_point_springs(mbs, model, self._end_marker, change.ways)
         for k in range(model.n, len(model.kind)):
             self._add_joint(k)
         self.probes = Probes(mbs, model, self.piece_bodies, self.nodes) if has_probes else None
@@ -556,10 +555,8 @@ def _joint_moments(chain: ExudynChain, force: Array, of_p: Array) -> Array:
 
 def _system_matrices(chain: ExudynChain) -> tuple[Array, Array, Array]:
     """Return M (7N, 7N), f (7N,) and C (nc, 7N)."""
-    settings = make_settings()
-    settings.timeIntegration.generalizedAlpha.computeInitialAccelerations = False
     solver: Any = chain.change.solver()
-    with initialized_solver(solver, chain.mbs, settings, chain.change.initialize):
+    with initialized_solver(solver, chain.mbs, make_evaluation_settings(), chain.change.initialize):
         M, f = mass_matrix_and_force(solver, chain.mbs)
         M = chain.change.mass_matrix(chain, M)
 

@@ -26,7 +26,7 @@ import exudyn.robotics as robotics_module
 import exudyn.robotics.utilities as loader_module
 import numpy as np
 
-from adapters.exudyn_common import initialized_solver, mass_matrix_and_force
+from adapters.exudyn_common import initialized_solver, make_evaluation_settings, mass_matrix_and_force
 from adapters.importer_common import Layout, LoadingImporter, Refused, joint_from_screw, make_body, pose
 from plumbline.importers.importer import ModelFile
 from plumbline.importers.neutral_model import CanonicalState, ModelQuantities, NeutralBody
@@ -78,11 +78,8 @@ class _Layout(Layout):
         initial = exudyn.ConfigurationType.Initial
         self.system.systemData.SetODE2Coordinates(q.tolist(), initial)
         self.system.systemData.SetODE2Coordinates_t(v.tolist(), initial)
-        settings, solver = exudyn.SimulationSettings(), exudyn.MainSolverImplicitSecondOrder()
-        settings.timeIntegration.verboseMode = 0
-        settings.solutionSettings.writeSolutionToFile = False
-        settings.timeIntegration.generalizedAlpha.computeInitialAccelerations = False
-        with initialized_solver(solver, self.system, settings):
+        solver = exudyn.MainSolverImplicitSecondOrder()
+        with initialized_solver(solver, self.system, make_evaluation_settings()):
             M, force = mass_matrix_and_force(solver, self.system)
         return M, -force
 

@@ -18,9 +18,12 @@ from adapters.exudyn_common import (
     IMPLICIT,
     Output,
     change_item,
+    coordinate_marker,
+    grounded_marker,
     initialized_solver,
     items,
     items_argument,
+    make_evaluation_settings,
     make_rigid_body,
     make_settings,
     make_system,
@@ -99,11 +102,6 @@ class _Items(SurfaceRecord):
         """A rigid marker of the world."""
         body = self.mbs.AddObject(items.ObjectGround())
         return self.marker("MarkerBodyRigid", bodyNumber=body, localPosition=list(place))
-
-    def grounded_coordinate(self) -> Any:
-        """A marker of a coordinate that does not move."""
-        ground = self.node("NodePointGround")
-        return self.marker("MarkerNodeCoordinate", nodeNumber=ground, coordinate=0)
 
     def point_nodes(self) -> list[Any]:
         """Nodes that have the bodies' places as coordinates."""
@@ -311,7 +309,7 @@ def _add_coordinate_constraints(s: _Items) -> None:
 
     Half of each coordinate and of each velocity is the constraint's offset.
     """
-    fixed, nodes = s.grounded_coordinate(), s.point_nodes()
+    fixed, nodes = grounded_marker(s.mbs), s.point_nodes()
     points = [s.body("ObjectMassPoint", node, mass=1.0) for node in nodes]
     long, short = "ObjectConnectorCoordinate", "CoordinateConstraint"
     what, by_user = "OutputVariableType.ConstraintEquation", f"{long}OffsetUserFunction"
@@ -319,7 +317,7 @@ def _add_coordinate_constraints(s: _Items) -> None:
     for node, point, one in zip(nodes, points, s.bodies, strict=True):
         halves = zip((one.place / 2).tolist(), (one.velocity / 2).tolist(), strict=True)
         for i, (place, velocity) in enumerate(halves):
-            marker = s.marker("MarkerNodeCoordinate", nodeNumber=node, coordinate=i)
+            marker = coordinate_marker(s.mbs, node, i)
             by_place = {"offsetUserFunction": lambda *_, x=place: x}
             by_velocity = {"velocityLevel": True, "offsetUserFunction_t": lambda *_, x=velocity: x}
             for call, kind, given in (
@@ -370,7 +368,7 @@ def _add_vector_constraints(s: _Items) -> None:
 
 def _add_relative_markers(s: _Items) -> None:
     """Markers of one coordinate of a body or between two, read by connectors."""
-    ground, fixed = s.mbs.CreateGround(referencePosition=s.anchor), s.grounded_coordinate()
+    ground, fixed = s.mbs.CreateGround(referencePosition=s.anchor), grounded_marker(s.mbs)
     between, made = "MarkerBodiesRelative", dict[str, list[Any]]()
     for body, one in zip(s.rigid_bodies(), s.bodies, strict=True):
         ends = {"bodyNumbers": [ground, body], "localPosition1": one.arm}
@@ -536,9 +534,8 @@ def _add_equations(s: _Items) -> None:
         joints.append(s.object("ObjectJointSpherical", fixed, marker, constrainedAxes=[1, 1, 1]))
     s.mbs.Assemble()
     solver: Any = exudyn.MainSolverImplicitSecondOrder()
-    settings, data = make_settings(), s.mbs.systemData
-    settings.timeIntegration.generalizedAlpha.computeInitialAccelerations = False
-    with initialized_solver(solver, s.mbs, settings):
+    data = s.mbs.systemData
+    with initialized_solver(solver, s.mbs, make_evaluation_settings()):
         for quantity, is_velocity in (("body_position", False), ("body_velocity", True)):
             solver.ComputeAlgebraicEquations(s.mbs, is_velocity)
             own = np.array(solver.GetSystemResidual())[solver.GetODE2size() :]

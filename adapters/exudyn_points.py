@@ -23,6 +23,8 @@ from adapters.exudyn_common import (
     IMPLICIT,
     Output,
     call_parts,
+    coordinate_marker,
+    grounded_marker,
     initialized_solver,
     items,
     make_rigid_body,
@@ -119,6 +121,13 @@ ROOTS: Sequence[tuple[str, Mapping[str, Any]]] = (
 )  # fmt: skip
 
 
+def _add_point(mbs: Any, mass: float) -> tuple[Any, Any]:
+    """Add a mass point in the origin; return its node and a marker."""
+    node = mbs.AddNode(items.NodePoint())
+    mbs.AddObject(items.ObjectMassPoint(nodeNumber=node, **sizes_of_body(mass=float(mass))))
+    return node, mbs.AddMarker(items.MarkerNodePosition(nodeNumber=node))
+
+
 class _Points:
     """What is pushed, and what a step made of it; ``places``: directions, of ``lengths`` [m]."""
 
@@ -151,9 +160,7 @@ class _Points:
             return [float(x) for x in self.mass[k] * push]
 
         for k, mass in enumerate(self.mass):
-            node = mbs.AddNode(items.NodePoint())
-            mbs.AddObject(items.ObjectMassPoint(nodeNumber=node, **sizes_of_body(mass=float(mass))))
-            marker = mbs.AddMarker(items.MarkerNodePosition(nodeNumber=node))
+            _, marker = _add_point(mbs, mass)
             push = (self.mass[k] * self.places[k]).tolist()
             if spring is not None:
                 spring(mbs, [ground, marker], k)
@@ -523,17 +530,13 @@ def _add_stored(points: _Points) -> None:
 def _add_held(points: _Points) -> None:
     """Hold a point beside each, which is pushed as much, by the constraint of its coordinates."""
     mbs, _container = make_system()
-    ground = mbs.AddNode(items.NodePointGround())
-    fixed = mbs.AddMarker(items.MarkerNodeCoordinate(nodeNumber=ground, coordinate=0))
+    fixed = grounded_marker(mbs)
     for is_held in (False, True):
         for place, mass in zip(points.places, points.mass, strict=True):
-            node = mbs.AddNode(items.NodePoint())
-            mbs.AddObject(items.ObjectMassPoint(nodeNumber=node, **sizes_of_body(mass=float(mass))))
-            push = {"loadVector": (mass * place).tolist()}
-            marker = mbs.AddMarker(items.MarkerNodePosition(nodeNumber=node))
-            mbs.AddLoad(items.LoadForceVector(markerNumber=marker, **push))
+            node, marker = _add_point(mbs, mass)
+            mbs.AddLoad(items.LoadForceVector(markerNumber=marker, loadVector=(mass * place).tolist()))
             for i in range(3 * is_held):
-                own = mbs.AddMarker(items.MarkerNodeCoordinate(nodeNumber=node, coordinate=i))
+                own = coordinate_marker(mbs, node, i)
                 mbs.AddObject(items.CoordinateConstraint(markerNumbers=[fixed, own]))
     mbs.Assemble()
     settings, solver = _settings({}), exudyn.MainSolverImplicitSecondOrder()

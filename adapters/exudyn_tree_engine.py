@@ -28,6 +28,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from math import cos, remainder, tau
 from typing import Any, ClassVar
 
@@ -38,7 +39,7 @@ from adapters.exudyn_common import (
     ExudynAdapter,
     Output,
     add_loads,
-    add_point_spring,
+    add_point_springs,
     initialized_solver,
     items,
     make_settings,
@@ -268,9 +269,7 @@ class _KinematicTree:
         pivot = self.mbs.AddMarker(items.MarkerBodyRigid(bodyNumber=ground))
         for k in range(model.n):
             self._add_loads_and_sensors(k, pivot)
-        for i, (bodies, points) in enumerate(zip(model.spring_body, model.spring_point, strict=True)):
-            ends = [self._point_marker(ground, int(b), at) for b, at in zip(bodies, points, strict=True)]
-            add_point_spring(self.mbs, model, i, ends, change.ways)
+        add_point_springs(self.mbs, model, partial(self._point_marker, ground), change.ways)
         self.mbs.Assemble()
 
     def _place(self, body: int, point: Array) -> dict[str, Any]:

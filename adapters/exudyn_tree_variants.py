@@ -18,6 +18,8 @@ from adapters.exudyn_common import (
     EXPLICIT,
     Ways,
     call_parts,
+    coordinate_marker,
+    grounded_marker,
     initialized_solver,
     items,
     make_settings,
@@ -167,10 +169,6 @@ STEPS: Mapping[str, Callable[[Any, Any], bool]] = {
 }
 
 
-def _coordinate_marker(mbs: Any, node: Any, link: int) -> Any:
-    return mbs.AddMarker(items.MarkerNodeCoordinate(nodeNumber=node, coordinate=link))
-
-
 def _spring_law(stiffness: float, damping: float) -> Callable[..., float]:
     def law(mbs: Any, t: float, item: int, x: float, rate: float, *_: Any) -> float:
         return stiffness * x + damping * rate
@@ -182,13 +180,12 @@ def _grounded(kind: str, by_function: bool = False) -> Callable[..., None]:
     """Springs, dampers and efforts of coordinates, one by one, against a grounded node."""
 
     def add(mbs: Any, node: Any, a: Array, c: Array, k: Array, force: Array) -> None:
-        ground = mbs.AddNode(items.NodePointGround())
-        fixed = mbs.AddMarker(items.MarkerNodeCoordinate(nodeNumber=ground, coordinate=0))
+        fixed = grounded_marker(mbs)
         for link in np.flatnonzero((c != 0) | (k != 0)):
             own: Any = {"stiffness": float(k[link]), "damping": float(c[link])}
             if by_function:
                 own = {"springForceUserFunction": _spring_law(**own)}
-            markers = [fixed, _coordinate_marker(mbs, node, int(link))]
+            markers = [fixed, coordinate_marker(mbs, node, int(link))]
             mbs.AddObject(getattr(items, kind)(markerNumbers=markers, **own))
         _add_rest(mbs, node, a, force)
 
@@ -197,7 +194,7 @@ def _grounded(kind: str, by_function: bool = False) -> Callable[..., None]:
 
 def _add_rest(mbs: Any, node: Any, a: Array, force: Array) -> None:
     for link in np.flatnonzero(force):
-        marker = _coordinate_marker(mbs, node, int(link))
+        marker = coordinate_marker(mbs, node, int(link))
         mbs.AddLoad(items.LoadCoordinate(markerNumber=marker, load=float(force[link])))
     if np.any(a):
         mbs.AddObject(items.ObjectGenericODE2(nodeNumbers=[node], massMatrix=np.diag(a)))
@@ -223,7 +220,7 @@ def _generic_by_functions(mbs: Any, node: Any, a: Array, c: Array, k: Array, for
 def _load_by_function(mbs: Any, node: Any, a: Array, c: Array, k: Array, force: Array) -> None:
     law_of_all = _law_of(c, k, force)
     for link in range(len(a)):
-        marker = _coordinate_marker(mbs, node, link)
+        marker = coordinate_marker(mbs, node, link)
 
         def law(mbs: Any, t: float, load: float, link: int = link) -> float:
             data = mbs.systemData

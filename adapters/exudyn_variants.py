@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from operator import attrgetter
 from typing import Any
 
 import exudyn
@@ -484,8 +485,7 @@ def _is_ball(kind: JointKind) -> bool:
     return kind.is_spherical and not kind.holds_distance
 
 
-def _is_rod(kind: JointKind) -> bool:
-    return kind.holds_distance
+_is_rod: Callable[[JointKind], bool] = attrgetter("holds_distance")
 
 
 VARIANTS = (

@@ -77,7 +77,7 @@ class _Layout(LayoutWithOwnVelocities):
             joints = self._joints(body, link, infos[link], zero)
         self.links.append((body, link, name))
         for joint in joints:
-            row = sum(6 if own[1] == BASE else 1 for own, _ in self.places)
+            row = self.places[-1][1].stop if self.places else 0
             rows = slice(row, row + (6 if joint.kind == "free" else 1))
             self.places.append(((body, link), rows))
         return make_body(name, parent, zero, joints, mass, center, R @ np.diag(diagonal) @ R.T)
