@@ -53,16 +53,9 @@ TIGHT = 4e-15  # of Newton's residual, relative: a root has rounding then, and t
 Factors = tuple[float, float]  # of r in places and velocities after the step
 
 
-def _factors(gamma: float, beta: float, first: float = 1.0, forces: Factors = (1.0, 2.0)) -> Factors:
-    """Return Newmark's: of accelerations of which the first is given and the second is the force's."""
-    last = forces[1]
+def _factors(gamma: float, beta: float, first: float = 1.0, last: float = 2.0) -> Factors:
+    """Return Newmark's: of the accelerations at the start and at the end."""
     return (0.5 - beta) * first + beta * last, (1 - gamma) * first + gamma * last
-
-
-def _pulled(gamma: float, beta: float) -> Factors:
-    """The same where a force −m x pulls besides."""
-    last = (2.0 - PULL * (0.5 - beta)) / (1 + PULL * beta)
-    return (0.5 - beta) + beta * last, (1 - gamma) + gamma * last
 
 
 NEWMARK = {"generalizedAlpha.useNewmark": True}
@@ -82,11 +75,11 @@ STEPS: Sequence[Step] = (
      NEWMARK | {"generalizedAlpha.computeInitialAccelerations": False,
                 "generalizedAlpha.resetAccelerations": True}, _factors(0.5, 0.25, first=0.0)),
     ("TimeIntegrationSettings.startTime", NEWMARK | {"startTime": 0.5, "endTime": 1.5},
-     _factors(0.5, 0.25, 1.5, (1.5, 2.5))),
+     _factors(0.5, 0.25, 1.5, 2.5)),
     ("TimeIntegrationSettings.reuseConstantMassMatrix",
      NEWMARK | {"reuseConstantMassMatrix": False}, BY_NEWMARK),
     ("TimeIntegrationSettings.computeLoadsJacobian", NEWMARK | {"computeLoadsJacobian": 1},
-     _pulled(0.5, 0.25)),
+     _factors(0.5, 0.25, last=(2.0 - PULL / 4) / (1 + PULL / 4))),
     ("NewtonSettings.active", NEWMARK | {"newton.active": False, "newton.maxIterations": 1},
      BY_NEWMARK),
     ("NewtonSettings.useNewtonSolver",
@@ -182,8 +175,9 @@ class _Points:
         """Add positions of bodies, by their directions in a row."""
         self.record.add("body_position", names, np.reshape(directions, (-1, 3)) * self.lengths)
 
-    def add_results(self, names: str, results: tuple[Array, Array], factors: Factors) -> None:
-        """Add the mean of what places and velocities give."""
+    def add_results(self, names: str, results: Any, factors: Factors) -> None:
+        """Add the mean of what places and velocities give: of results, or of a system."""
+        results = results if isinstance(results, tuple) else self.read(results)
         x, v = (value / factor for value, factor in zip(results, factors, strict=True))
         self.add(names, (x + v) / 2)
 
@@ -256,7 +250,7 @@ def add_point_answers(record: SurfaceRecord, state: State) -> None:
 def _add_step(points: _Points, names: str, options: Any, factors: Factors) -> None:
     mbs = points.system(pull=PULL * ("computeLoadsJacobian" in options))
     _solve(mbs, options)
-    points.add_results(names, points.read(mbs), factors)
+    points.add_results(names, mbs, factors)
 
 
 def _add_root(points: _Points, names: str, options: Mapping[str, Any]) -> None:
@@ -371,7 +365,7 @@ def _add_parts_of_a_step(points: _Points) -> None:
         change = np.linalg.solve(solver.GetSystemJacobian(), solver.GetSystemResidual()).reshape(x.shape)
         beta, gamma, radius = solver.newmarkBeta, solver.newmarkGamma, solver.spectralRadius
         forward = (solver.alphaF - solver.alphaM) / (1 - radius / (radius + 1) + (1 - radius) / (radius + 1))
-        factors = _factors(gamma, beta, forces=(1.0, 2 * solver.factJacAlgorithmic + forward))
+        factors = _factors(gamma, beta, last=2 * solver.factJacAlgorithmic + forward)
         by = (
             "UpdateCurrentTime InitializeStep ComputeNewtonUpdate ComputeNewtonResidual ComputeNewtonJacobian"
         )
@@ -396,8 +390,8 @@ def _add_whole_steps(points: _Points) -> None:
         mbs.SetPostStepUserFunction(after)
         solver.SolveSteps(mbs, settings)
         mbs.SetPostStepUserFunction(0)
-        factors = _factors(gamma, beta, forces=(1.0, last))
-        points.add_results(f"{IMPLICIT}.SolveSteps", points.read(mbs), factors)
+        factors = _factors(gamma, beta, last=last)
+        points.add_results(f"{IMPLICIT}.SolveSteps", mbs, factors)
         for name, value in (
             ("GetStartOfStepStateAAlgorithmic", kept[-1]),
             ("GetAAlgorithmic", np.array(solver.GetAAlgorithmic()) / last),
@@ -414,8 +408,8 @@ def _add_changed_newton(points: _Points) -> None:
         _set(newton, "active", False)
         solver.newton = newton
         solver.SolveSteps(mbs, settings)
-        factors = _factors(0.5, 0.25, forces=(1.0, last))
-        points.add_results(f"{IMPLICIT}.newton", points.read(mbs), factors)
+        factors = _factors(0.5, 0.25, last=last)
+        points.add_results(f"{IMPLICIT}.newton", mbs, factors)
 
 
 def _add_changed_steps(points: _Points) -> None:
@@ -430,7 +424,7 @@ def _add_changed_steps(points: _Points) -> None:
                 solver.it.currentStepSize = start
                 getattr(solver, name)(mbs, settings, *arguments)
                 call_parts(solver, "UpdateCurrentTime InitializeStep Newton FinishStep", mbs, settings)
-                points.add_results(texts(kind, f"{name} {by}"), points.read(mbs), _exact(end))
+                points.add_results(texts(kind, f"{name} {by}"), mbs, _exact(end))
         with _initialized(points, options, kind) as (solver, *_):
             solver.SetSystemMassMatrix(np.diag(points.places.ravel()))
             points.add(f"{kind}.SetSystemMassMatrix", np.diag(solver.GetSystemMassMatrix()))
@@ -455,7 +449,7 @@ def _add_own_functions(points: _Points) -> None:
             for name, function in functions.items():
                 getattr(solver, f"SetUserFunction{name}")(mbs, function)
             solver.SolveSteps(mbs, settings)
-        found = ends[-1] if "FinishStep" in functions else points.read(mbs)
+        found = ends[-1] if "FinishStep" in functions else mbs
         names = " ".join(f"SetUserFunction{name}" for name in functions if name != "PostNewton")
         points.add_results(texts(IMPLICIT, names), found, EXACT)
 
@@ -512,7 +506,7 @@ def _add_initialisation(points: _Points) -> None:
         call_parts(solver, f"InitializeSolverPreChecks {parts}", mbs, settings)
         solver.SolveSteps(mbs, settings)
     names = texts(EXPLICIT, f"InitializeSolverPreChecks {parts}")
-    points.add_results(names, points.read(mbs), EXACT)
+    points.add_results(names, mbs, EXACT)
 
 
 def _add_stored(points: _Points) -> None:

@@ -272,6 +272,11 @@ class _KinematicTree:
         add_point_springs(self.mbs, model, partial(self._point_marker, ground), change.ways)
         self.mbs.Assemble()
 
+    @property
+    def gravity(self) -> Array:
+        """The engine's own [m/s²]."""
+        return np.array(self.mbs.GetObjectParameter(self.tree, "gravity"))
+
     def _place(self, body: int, point: Array) -> dict[str, Any]:
         """Where a point of a body is, as markers and sensors have it."""
         local = self.body_axes_of_links[body].T @ (point - self.linkage.origins[body])
@@ -433,9 +438,9 @@ class ExudynTree(ExudynAdapter):
         """Return the items of the assembled system, and what the read-out needs, of one state."""
         with silence_engine():
             tree = _KinematicTree(model, state)
-            gravity = np.array(tree.mbs.GetObjectParameter(tree.tree, "gravity"))
+            fields = {"gravity": tree.gravity}
             found = written_items(tree.mbs)
-        fields = {"rates": tree.initial_angle_rates, "joint_rates": tree.linkage.W, "gravity": gravity}
+        fields |= {"rates": tree.initial_angle_rates, "joint_rates": tree.linkage.W}
         fields |= {"frames": tree.body_axes_of_links, "A": tree.linkage.attitude}
         fields |= {"elastic": np.array(elastic_energy(model, state))}
         links = [(x.parent, None if x.joint in SLIDES else x.axis.tolist()) for x in tree.linkage.links]
@@ -481,7 +486,6 @@ def _evaluate_state(tree: _KinematicTree) -> StateQuantities:
         M, f = mass_matrix_and_force(solver, tree.mbs)
     M, a = tree.change.matrices(tree, (M, np.asarray(np.linalg.solve(M, f))))
     tree.mbs.systemData.SetODE2Coordinates_tt(a)
-    gravity = np.array(tree.mbs.GetObjectParameter(tree.tree, "gravity"))
     W, mass = tree.linkage.W, tree.model.mass  # links have the masses of several bodies where one is welded
     r, v, omega = (tree.read_sensors(output) for output in SENSOR_OUTPUTS[:3])
     spin = rotate_vectors(tree.linkage.attitude, rotate_vectors(tree.model.inertia, omega))
@@ -490,7 +494,7 @@ def _evaluate_state(tree: _KinematicTree) -> StateQuantities:
         angular_acceleration=tree.read_sensors(Output.AngularAccelerationLocal),
         kinetic_energy=float(0.5 * tree.initial_angle_rates @ M @ tree.initial_angle_rates),
         potential_energy=elastic_energy(tree.model, tree.state)  # springs have no output of it
-        - float(mass @ (r @ gravity)),
+        - float(mass @ (r @ tree.gravity)),
         angular_momentum=np.sum(cross(r, mass[:, None] * v) + spin, axis=0),
         mass_matrix=W.T @ M @ W,
     )
