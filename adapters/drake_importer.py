@@ -155,7 +155,7 @@ class _Layout(LayoutWithOwnVelocities):
         forces = MultibodyForces(plant)
         plant.CalcForceElementsContribution(context, forces)
         needed = plant.CalcInverseDynamics(context, np.zeros(plant.num_velocities()), forces)
-        elements = np.asarray(coriolis - needed - gravity)
+        elements = coriolis - needed - gravity
         if plant.num_force_elements() == 1:  # the difference is rounding
             elements = np.zeros(plant.num_velocities())
         damping = MultibodyForces(plant)

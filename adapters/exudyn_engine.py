@@ -550,7 +550,7 @@ def _joint_moments(chain: ExudynChain, force: Array, of_p: Array) -> Array:
     A, pieces = chain.turns[near], chain.first_piece[near]
     about_centre = rotate_vectors(chain.rates[pieces].swapaxes(-1, -2), of_p)
     lever = rotate_vectors(A, chain.model.proximal - chain.piece_centre[pieces])
-    return np.asarray(rotate_vectors(A, about_centre) - cross(lever, force))
+    return rotate_vectors(A, about_centre) - cross(lever, force)
 
 
 def _system_matrices(chain: ExudynChain) -> tuple[Array, Array, Array]:
@@ -588,7 +588,7 @@ def _rate_along_velocity(chain: ExudynChain, jacobian: Callable[[], Array]) -> A
         data.SetODE2Coordinates(count * step * qdot)
         values.append(jacobian())
     data.SetODE2Coordinates(0 * qdot)
-    return np.asarray((values[0] - 8 * values[1] + 8 * values[2] - values[3]) / (12 * step))
+    return (values[0] - 8 * values[1] + 8 * values[2] - values[3]) / (12 * step)
 
 
 def _constrained_axes(kind: JointKind) -> list[int]:

@@ -67,7 +67,7 @@ def bodies_at(model: Model, state: State) -> list[Body]:
     """List the bodies of a state."""
     turns = rotation_matrix(state.p)
     spins, arms = rotate_vectors(turns, state.omega), probe_points(model)
-    fields = state.r, state.v, turns, spins, arms, model.mass, state.p, np.asarray(model.inertia)
+    fields = state.r, state.v, turns, spins, arms, model.mass, state.p, model.inertia
     return [Body(*one) for one in zip(*fields, strict=True)]
 
 

@@ -72,7 +72,7 @@ def _screw(axis: int, angle: float, shift: float) -> Array:
 def _about_first(axes: Array, R: Array) -> Array:
     """Axes of which only the first is given, turned about it to R."""
     rest = axes.T @ R
-    return np.asarray(axes @ _screw(0, np.arctan2(rest[2, 1], rest[1, 1]), 0.0)[:3, :3])
+    return axes @ _screw(0, np.arctan2(rest[2, 1], rest[1, 1]), 0.0)[:3, :3]
 
 
 def _after_standard(function: Any, H: Array, theta: float, d: float, a: float, alpha: float) -> Array:

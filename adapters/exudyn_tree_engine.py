@@ -354,7 +354,7 @@ class _KinematicTree:
 def _unit_vector(wanted: Array, fallback: Array) -> Array:
     """Return the unit vector (3,) along ``wanted``, or the fallback where that is zero."""
     size = np.linalg.norm(wanted)
-    return np.asarray(wanted / size if size > 0 else fallback)
+    return wanted / size if size > 0 else fallback
 
 
 def _fallback_axis(arm: Array, gravity: Array) -> Array:
@@ -365,7 +365,7 @@ def _fallback_axis(arm: Array, gravity: Array) -> Array:
 def _perpendicular_unit(unit: Array) -> Array:
     """Return a unit vector (3,) perpendicular to a unit vector."""
     across = cross(unit, np.eye(3)[np.argmin(np.abs(unit))])
-    return np.asarray(across / np.linalg.norm(across))
+    return across / np.linalg.norm(across)
 
 
 def _alone(name: str, order: int, method: str | JointSpaceMethod, note: str) -> Any:

@@ -243,7 +243,7 @@ def elements_on_tendons(m: Any, d: Any) -> tuple[Any, Any]:
     """Move springs, dampers and rotors of hinges and slides to their tendons."""
     for j, t in _tendons(m):
         rate = m.jnt_dofadr[j]
-        m.tendon_stiffness[t] = np.asarray(m.jnt_stiffness)[j] / COEFFICIENT**2
+        m.tendon_stiffness[t] = m.jnt_stiffness[j] / COEFFICIENT**2
         m.tendon_damping[t], m.tendon_armature[t] = (
             x[rate] / COEFFICIENT**2 for x in (m.dof_damping, m.dof_armature)
         )

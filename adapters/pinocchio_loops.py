@@ -76,11 +76,11 @@ class _Rows:
         count = len(independent)
         system = np.block([[np.zeros((count, count)), independent], [independent.T, self.mass]])
         given = np.concatenate([-U.T[kept] @ bias, self.force])
-        return np.asarray(np.linalg.solve(system, given)[count:])
+        return np.linalg.solve(system, given)[count:]
 
     def by_force(self, multipliers: Array) -> Array:
         """Return v̇ by the forces of the rows."""
-        return np.asarray(np.linalg.solve(self.mass, self.force + self.J.T @ multipliers))
+        return np.linalg.solve(self.mass, self.force + self.J.T @ multipliers)
 
     def by(self, solve: Callable[[Array], Array], bias: Array, damping: float) -> Array:
         """Return v̇ by what solves the damped system."""

@@ -220,7 +220,7 @@ class _FreeFlyerSystem:
 
 def _complement(axes: list[Array]) -> Array:
     """Orthonormal vectors (3 − m, 3) perpendicular to m independent ones."""
-    return np.asarray(np.linalg.svd(np.reshape(axes, (-1, 3)))[2][len(axes) :])
+    return np.linalg.svd(np.reshape(axes, (-1, 3)))[2][len(axes) :]
 
 
 class PinocchioMaximal(PinocchioAdapter):

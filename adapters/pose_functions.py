@@ -100,7 +100,7 @@ def _mean_of_exponential(generator: Array) -> Array:
 
 
 def _place_on_se3(xi: Array) -> Array:
-    return np.asarray(_mean_of_exponential(cross_matrix(xi[3:])) @ xi[:3])
+    return _mean_of_exponential(cross_matrix(xi[3:])) @ xi[:3]
 
 
 class Pose:
@@ -225,7 +225,7 @@ class _Body:
         if name in ("Rx", "Ry", "Rz"):
             turns = [about(axis, angle) for axis, angle in enumerate(self.pose.forms["xyz"])]
             turns["xyz".index(name[1])] = value[:3, :3].T if name != form else value[:3, :3]
-            return np.asarray(turns[0] @ turns[1] @ turns[2])
+            return turns[0] @ turns[1] @ turns[2]
         if name in ("x", "y", "z"):
             return self._attitude(f"R{name}", about("xyz".index(name), float(value)))
         if name == "axis":

@@ -188,10 +188,10 @@ def _inertial_pose(body: int) -> Array:
 def _link_pose(body: int, link: int) -> Array:
     if link == BASE:
         X_I = _matrix(*bullet.getBasePositionAndOrientation(body))
-        return np.asarray(X_I @ np.linalg.inv(_inertial_pose(body)))
+        return X_I @ np.linalg.inv(_inertial_pose(body))
     center = bullet.getLinkState(body, link, computeForwardKinematics=True)  # 4 and 5 are single precision
     inertial = _matrix(*bullet.getDynamicsInfo(body, link)[3:5])
-    return np.asarray(_matrix(center[0], center[1]) @ np.linalg.inv(inertial))
+    return _matrix(center[0], center[1]) @ np.linalg.inv(inertial)
 
 
 def _matrix(position: Sequence[float], turn: Sequence[float]) -> Array:
