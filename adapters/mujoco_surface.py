@@ -37,17 +37,9 @@ from plumbline.model.datatypes import Array, Model
 from plumbline.model.kinematics import quaternion_product, rotation_matrix
 from plumbline.model.probe_frames import PROBE_ATTITUDE, anchor_point, probe_points
 
-SITE, BODY = "SITE", "BODY"
 SENSOR_CLASSES = "MjsSensor mjtSensor"
 TENDON_CLASSES = "MjsTendon MjsTendonPath MjsWrap mjtWrap"
 WRAPS = "mjtWrap.mjWRAP_SITE mjtWrap.mjWRAP_PULLEY"
-# By sensor that refers to the first probe frame its quantity.
-RELATIVE_SENSORS = {
-    "FRAMEPOS": "frame_position_in_first",
-    "FRAMEQUAT": "frame_axes_in_first",
-    "FRAMELINVEL": "frame_velocity_in_first",
-    "FRAMEANGVEL": "frame_angular_velocity_in_first",
-}
 # By sensor of distances from the anchor its quantity, and what one metre of a distance is there.
 DISTANCE_SENSORS = {
     "TENDONPOS": ("TENDON", "frame_distance", 1.5),
@@ -55,26 +47,29 @@ DISTANCE_SENSORS = {
     "ACTUATORPOS": ("ACTUATOR", "frame_distance", 3.0),
     "ACTUATORVEL": ("ACTUATOR", "frame_distance_rate", 3.0),
 }
-# By sensor the object that it is on, and its quantity.
-SENSORS = {
-    "FRAMEPOS": (SITE, "frame_position"),
-    "FRAMEXAXIS": (SITE, "frame_axes"),
-    "FRAMEYAXIS": (SITE, "frame_axes"),
-    "FRAMEZAXIS": (SITE, "frame_axes"),
-    "FRAMEQUAT": (SITE, "frame_axes"),
-    "FRAMELINVEL": (SITE, "frame_velocity"),
-    "VELOCIMETER": (SITE, "frame_velocity_local"),
-    "FRAMEANGVEL": (SITE, "frame_angular_velocity"),
-    "GYRO": (SITE, "frame_angular_velocity_local"),
-    "FRAMELINACC": (SITE, "frame_proper_acceleration"),
-    "ACCELEROMETER": (SITE, "frame_proper_acceleration_local"),
-    "FRAMEANGACC": (SITE, "frame_angular_acceleration"),
-    "FORCE": (SITE, "joint_force_local"),
-    "TORQUE": (SITE, "joint_moment_local"),
-    "SUBTREECOM": (BODY, "subtree_centre"),
-    "SUBTREELINVEL": (BODY, "subtree_velocity"),
-    "SUBTREEANGMOM": (BODY, "subtree_angular_momentum"),
+# By sensor its quantity: on the sites of the probe frames, and on the bodies.
+SITE_SENSORS = {
+    "FRAMEPOS": "frame_position",
+    "FRAMEXAXIS": "frame_axes",
+    "FRAMEYAXIS": "frame_axes",
+    "FRAMEZAXIS": "frame_axes",
+    "FRAMEQUAT": "frame_axes",
+    "FRAMELINVEL": "frame_velocity",
+    "VELOCIMETER": "frame_velocity_local",
+    "FRAMEANGVEL": "frame_angular_velocity",
+    "GYRO": "frame_angular_velocity_local",
+    "FRAMELINACC": "frame_proper_acceleration",
+    "ACCELEROMETER": "frame_proper_acceleration_local",
+    "FRAMEANGACC": "frame_angular_acceleration",
+    "FORCE": "joint_force_local",
+    "TORQUE": "joint_moment_local",
 }
+BODY_SENSORS = {
+    "SUBTREECOM": "subtree_centre",
+    "SUBTREELINVEL": "subtree_velocity",
+    "SUBTREEANGMOM": "subtree_angular_momentum",
+}
+RELATIVE_SENSORS = ("FRAMEPOS", "FRAMEQUAT", "FRAMELINVEL", "FRAMEANGVEL")  # in the first probe frame, too
 JOINT_SENSORS, BALL_SENSORS = ("JOINTPOS", "JOINTVEL"), ("BALLQUAT", "BALLANGVEL")
 ENERGIES = ("E_KINETIC", "E_POTENTIAL")
 AXES = ("FRAMEXAXIS", "FRAMEYAXIS", "FRAMEZAXIS")
@@ -83,18 +78,10 @@ OBJECT_MOTIONS = {
     "mj_objectVelocity": ("frame_angular_velocity", "frame_velocity"),
     "mj_objectAcceleration": ("frame_angular_acceleration", "frame_proper_acceleration"),
 }
-# By function of a Jacobian the quantities of its two parts, point and rotation.
-JACOBIANS = {
-    "mj_jac": ("frame_velocity", "frame_angular_velocity"),
-    "mj_jacSite": ("frame_velocity", "frame_angular_velocity"),
-    "mj_jacGeom": ("frame_velocity", "frame_angular_velocity"),
-    "mj_jacBody": ("body_velocity", "frame_angular_velocity"),
-    "mj_jacBodyCom": ("body_velocity", "frame_angular_velocity"),
-    "mj_jacPointAxis": ("frame_velocity",),
-    "mj_jacDot": ("frame_acceleration", "frame_angular_acceleration"),
-    "mj_jacSubtreeCom": ("subtree_velocity",),
-    "mj_angmomMat": ("subtree_angular_momentum",),
-}
+# Of a Jacobian the quantities of its two parts, point and rotation.
+AT_FRAME, AT_BODY = (
+    ("frame_velocity", "frame_angular_velocity"), ("body_velocity", "frame_angular_velocity")
+)  # fmt: skip
 MAX_AWAKE = 12  # steps after which what may sleep does
 INVERSE_STAGES = ("mj_invPosition", "mj_invVelocity", "mj_invConstraint")
 STILL_SENSORS = {"FRAMELINACC": False, "ACCELEROMETER": True}  # by name whether in own axes
@@ -103,20 +90,21 @@ STILL_SENSORS = {"FRAMELINACC": False, "ACCELEROMETER": True}  # by name whether
 class Clamp(NamedTuple):
     """What makes the forces of dampers zero in a step."""
 
-    limit: tuple[str, str]  # arrays of the model: the ranges and their flags; of early forces the flags alone
+    ranges: str  # array of the model, none of early forces
+    flags: str  # array of the model
     is_of_actuators: bool  # whether these are of the actuators, or of what they act on
     transmission: str  # of the dampers
     names: str  # that only a step with it uses
 
 
 CLAMPS = (
-    Clamp(("actuator_forcerange", "actuator_forcelimited"), True, "mjtTrn.mjTRN_TENDON",
+    Clamp("actuator_forcerange", "actuator_forcelimited", True, "mjtTrn.mjTRN_TENDON",
           "mjtBias.mjBIAS_AFFINE mjtTrn.mjTRN_TENDON"),
-    Clamp(("tendon_actfrcrange", "tendon_actfrclimited"), False, "mjtTrn.mjTRN_TENDON",
+    Clamp("tendon_actfrcrange", "tendon_actfrclimited", False, "mjtTrn.mjTRN_TENDON",
           "mjtBias.mjBIAS_AFFINE mjtObj.mjOBJ_TENDON"),
-    Clamp(("jnt_actfrcrange", "jnt_actfrclimited"), False, "mjtTrn.mjTRN_JOINT",
+    Clamp("jnt_actfrcrange", "jnt_actfrclimited", False, "mjtTrn.mjTRN_JOINT",
           "mjtBias.mjBIAS_AFFINE mjtTrn.mjTRN_JOINT"),
-    Clamp(("", "actuator_actearly"), True, "mjtTrn.mjTRN_TENDON",
+    Clamp("", "actuator_actearly", True, "mjtTrn.mjTRN_TENDON",
           "mjtGain.mjGAIN_AFFINE mjtDyn.mjDYN_INTEGRATOR"),
 )  # fmt: skip
 SENSOR_STAGES = ("mj_sensorPos", "mj_sensorVel", "mj_sensorAcc")
@@ -153,8 +141,9 @@ def add_probes(spec: Any, links: Sequence[Any], model: Model) -> None:
     for k, (link, point) in enumerate(zip(links, probe_points(model), strict=True)):
         site = set_attributes(link.add_site(), name=f"probe {k}", pos=point, quat=PROBE_ATTITUDE)
         link.name = f"link {k}"
-        for name, (kind, _) in SENSORS.items():
-            add_sensor(spec, name, kind, site.name if kind == SITE else link.name, f"{name} {k}")
+        for kind, one, sensors in (("SITE", site, SITE_SENSORS), ("BODY", link, BODY_SENSORS)):
+            for name in sensors:
+                add_sensor(spec, name, kind, one.name, f"{name} {k}")
     kinds = mujoco.mjtSensor.__members__
     for name in ENERGIES:  # of which `_add_energies` reports what the version lacks
         if (kind := kinds.get(f"mjSENS_{name}")) is not None:
@@ -213,7 +202,7 @@ def add_surface(s: Probed) -> None:
 def _add_sensors(s: Probed) -> None:
     for stage in SENSOR_STAGES:
         getattr(mujoco, stage)(s.m, s.d)
-    for name, (_, quantity) in SENSORS.items():
+    for name, quantity in (SITE_SENSORS | BODY_SENSORS).items():
         if quantity != "frame_axes":
             stage = SENSOR_STAGES[s.m.sensor_needstage[s.m.sensor(f"{name} 0").id] - 1]
             s.add(quantity, f"mjtSensor.mjSENS_{name} {stage}", s.sensors(name))
@@ -257,11 +246,11 @@ def _add_frames(s: Probed) -> None:
 def _add_relative(s: Probed) -> None:
     """Add what refers to the first probe frame and to the anchor."""
     m, d = s.m, s.d
-    for name, quantity in RELATIVE_SENSORS.items():
+    for name in RELATIVE_SENSORS:
         value = s.sensors(f"{name} in first")
         if name == "FRAMEQUAT":
             value = rotation_matrix(value).swapaxes(-1, -2).reshape(-1, 3)
-        s.add(quantity, f"mjtSensor.mjSENS_{name}", value)
+        s.add(f"{SITE_SENSORS[name]}_in_first", f"mjtSensor.mjSENS_{name}", value)
     for name, (_, quantity, size) in DISTANCE_SENSORS.items():
         s.add(quantity, f"mjtSensor.mjSENS_{name}", s.sensors(name) / size)
     tendons, on_tendons = s.ids("tendon"), s.ids("actuator")
@@ -358,22 +347,22 @@ def _add_jacobians(s: Probed) -> None:
         (p, r), (dp, dr) = np.zeros((2, 2, 3, m.nv))
         point, geom = d.site_xpos[site], m.geom(m.site(site).name).id
         axis = d.site_xmat[site].reshape(3, 3)[:, 0].copy()
-        for call, arguments in (
-            ("mj_jac", (p, r, point, b)),
-            ("mj_jacPointAxis", (p, r, point, axis, b)),
-            ("mj_jacBody", (p, r, b)),
-            ("mj_jacBodyCom", (p, r, b)),
-            ("mj_jacSite", (p, r, site)),
-            ("mj_jacGeom", (p, r, geom)),
-            ("mj_jacDot", (dp, dr, point, b)),
-            ("mj_jacSubtreeCom", (p, b)),
-            ("mj_angmomMat", (p, b)),
+        for call, arguments, quantities in (
+            ("mj_jac", (p, r, point, b), AT_FRAME),
+            ("mj_jacPointAxis", (p, r, point, axis, b), AT_FRAME[:1]),
+            ("mj_jacBody", (p, r, b), AT_BODY),
+            ("mj_jacBodyCom", (p, r, b), AT_BODY),
+            ("mj_jacSite", (p, r, site), AT_FRAME),
+            ("mj_jacGeom", (p, r, geom), AT_FRAME),
+            ("mj_jacDot", (dp, dr, point, b), ("frame_acceleration", "frame_angular_acceleration")),
+            ("mj_jacSubtreeCom", (p, b), ("subtree_velocity",)),
+            ("mj_angmomMat", (p, b), ("subtree_angular_momentum",)),
         ):
             getattr(mujoco, call)(m, d, *arguments)
             values = [p @ d.qvel, r @ d.qvel]
             if call == "mj_jacDot":
                 values = [dp @ d.qvel + p @ d.qacc, dr @ d.qvel + r @ d.qacc]
-            for quantity, value in zip(JACOBIANS[call], values, strict=False):
+            for quantity, value in zip(quantities, values, strict=False):
                 rows[quantity, call].append(value)
     for (quantity, call), vectors in rows.items():
         s.add(quantity, call, vectors)
@@ -535,16 +524,16 @@ def _add_clamped_step(s: Probed, usual: Any, clamp: Clamp, call: str, D: Array) 
 
     By a limit, or by activations that are zero at the end of the step, from where the force comes early.
     """
-    own, (ranges, flags) = copy(usual), clamp.limit
+    own = copy(usual)
     a = np.flatnonzero(own.actuator_trntype == member(clamp.transmission))
     if not len(a):
         return
     own.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
     own.actuator_gainprm[:] = own.actuator_biasprm[:] = 0.0  # of all others
     of = a if clamp.is_of_actuators else own.actuator_trnid[a, 0]
-    getattr(own, flags)[of] = True
-    if ranges:
-        getattr(own, ranges)[of] = 0.0
+    getattr(own, clamp.flags)[of] = True
+    if clamp.ranges:
+        getattr(own, clamp.ranges)[of] = 0.0
         own.actuator_biastype[a], own.actuator_biasprm[a, 2] = mujoco.mjtBias.mjBIAS_AFFINE, -7.0
     else:
         own.actuator_gaintype[a], own.actuator_gainprm[a, 2] = mujoco.mjtGain.mjGAIN_AFFINE, -7.0
