@@ -101,11 +101,12 @@ COMPLETED: Mapping[str, Callable[..., Any]] = {
 
 
 class _Output(NamedTuple):
-    """What an output of bodies, nodes and markers is."""
+    """An output of bodies, at a point, and whether nodes and markers have it."""
 
-    quantity: str  # at a point
-    of_node: str = ""  # the same at a centre of mass, where nodes are; empty: nodes have no such output
-    has_marker: bool = False  # whether markers have it
+    name: str
+    quantity: str
+    has_node: bool
+    has_marker: bool
     read: Callable[[Array], Array] = _as_given
 
 
@@ -120,32 +121,33 @@ def _weighted_sum(
 
 
 OUTPUTS = [
-    (name, output)
-    for name, output in (
-        ("Position", _Output("frame_position", "body_position", True)),
-        ("RotationMatrix", _Output("frame_axes", "frame_axes", True, _axes)),
-        ("Rotation", _Output("frame_axes_by_angles", "frame_axes_by_angles", True, _axes_of_angles)),
-        ("Velocity", _Output("frame_velocity", "body_velocity", True)),
-        ("VelocityLocal", _Output("frame_velocity_local", read=_in_probe_axes)),
-        ("AngularVelocity", _Output("frame_angular_velocity", "frame_angular_velocity", True)),
-        ("AngularVelocityLocal",
-         _Output("frame_angular_velocity_local", "frame_angular_velocity_local", True, _in_probe_axes)),
-        ("Acceleration", _Output("frame_acceleration", "body_acceleration")),
-        ("AccelerationLocal", _Output("frame_acceleration_local", read=_in_probe_axes)),
-        ("AngularAcceleration", _Output("frame_angular_acceleration", "frame_angular_acceleration")),
-        ("AngularAccelerationLocal", _Output("frame_angular_acceleration_local", read=_in_probe_axes)),
-        ("HomogeneousTransformation", _Output("frame_axes", "frame_axes", True, _axes_of_poses)),
-        ("HomogeneousTransformation", _Output("frame_position", "body_position", True, _place_of_poses)),
+    one
+    for one in (
+        _Output("Position", "frame_position", True, True),
+        _Output("RotationMatrix", "frame_axes", True, True, _axes),
+        _Output("Rotation", "frame_axes_by_angles", True, True, _axes_of_angles),
+        _Output("Velocity", "frame_velocity", True, True),
+        _Output("VelocityLocal", "frame_velocity_local", False, False, _in_probe_axes),
+        _Output("AngularVelocity", "frame_angular_velocity", True, True),
+        _Output("AngularVelocityLocal", "frame_angular_velocity_local", True, True, _in_probe_axes),
+        _Output("Acceleration", "frame_acceleration", True, False),
+        _Output("AccelerationLocal", "frame_acceleration_local", False, False, _in_probe_axes),
+        _Output("AngularAcceleration", "frame_angular_acceleration", True, False),
+        _Output("AngularAccelerationLocal", "frame_angular_acceleration_local", False, False, _in_probe_axes),
+        _Output("HomogeneousTransformation", "frame_axes", True, True, _axes_of_poses),
+        _Output("HomogeneousTransformation", "frame_position", True, True, _place_of_poses),
     )
-    if hasattr(Output, name)  # not in older versions
-]  # fmt: skip
+    if hasattr(Output, one.name)  # not in older versions
+]
+# Of nodes, which are at centres of mass.
+AT_CENTRE = {f"frame_{what}": f"body_{what}" for what in ("position", "velocity", "acceleration")}
+OF_NODES = [
+    one._replace(quantity=AT_CENTRE.get(one.quantity, one.quantity)) for one in OUTPUTS if one.has_node
+]
 OF_COORDINATES = {  # of nodes, whose first coordinates are those of the centre of mass
     "CoordinatesTotal": "body_position", "Coordinates_t": "body_velocity",
     "Coordinates_tt": "body_acceleration",
 }  # fmt: skip
-OF_BODIES = [(name, output.quantity, output.read) for name, output in OUTPUTS]
-OF_NODES = [(name, output.of_node, output.read) for name, output in OUTPUTS if output.of_node]
-OF_MARKERS = [(name, output.quantity, output.read) for name, output in OUTPUTS if output.has_marker]
 
 
 class Probes(SurfaceRecord):
@@ -163,36 +165,37 @@ class Probes(SurfaceRecord):
             "MarkerNodePosition": [mbs.AddMarker(items.MarkerNodePosition(nodeNumber=x)) for x in nodes],
             "MarkerNodeRigid": [mbs.AddMarker(items.MarkerNodeRigid(nodeNumber=x)) for x in nodes],
         }
-        # Functions that read items, kinds of sensors on them, their outputs, and the items with their points.
-        self.readers = (
-            ("GetObjectOutputBody", "SensorBody", OF_BODIES, places),
-            ("GetNodeOutput", "SensorNode", OF_NODES, [{"nodeNumber": node} for node in nodes]),
-            ("GetMarkerOutput", "SensorMarker", OF_MARKERS, [{"markerNumber": marker} for marker in markers]),
-        )
+        # By output of bodies, nodes and markers: function that reads it, kind of sensors, places and sensors.
+        self.readers = list[tuple[_Output, str, str, Sequence[dict[str, Any]], list[Any]]]()
         silent = {"writeToFile": False, "storeInternal": False}
-        self.sensors = dict[tuple[str, str, str], list[Any]]()  # by kind, output and quantity
-        for _, kind, outputs, given in self.readers:
-            for name, quantity, _ in outputs:
-                make = partial(getattr(items, kind), outputVariableType=getattr(Output, name), **silent)
-                self.sensors[kind, name, quantity] = [mbs.AddSensor(make(**one)) for one in given]
+        for function, kind, outputs, given in (
+            ("GetObjectOutputBody", "SensorBody", OUTPUTS, places),
+            ("GetNodeOutput", "SensorNode", OF_NODES, [{"nodeNumber": node} for node in nodes]),
+            ("GetMarkerOutput", "SensorMarker", [one for one in OUTPUTS if one.has_marker],
+             [{"markerNumber": marker} for marker in markers]),
+        ):  # fmt: skip
+            for one in outputs:
+                make = partial(getattr(items, kind), outputVariableType=getattr(Output, one.name), **silent)
+                self.readers.append((one, function, kind, given, [mbs.AddSensor(make(**x)) for x in given]))
         law = {"factors": [0.5, 1.5], "sensorUserFunction": _weighted_sum}
         self.sums = [
             mbs.AddSensor(items.SensorUserFunction(sensorNumbers=[sensor, sensor], **law, **silent))
-            for sensor in self.sensors.get(("SensorBody", "Velocity", "frame_velocity"), [])
+            for one, _, kind, _, sensors in self.readers
+            if (one.quantity, kind) == ("frame_velocity", "SensorBody")
+            for sensor in sensors
         ]
 
     def add_all(self) -> None:
         """Read all at the current state."""
         mbs, data = self.mbs, self.mbs.systemData
-        for function, kind, outputs, places in self.readers:
-            read = getattr(mbs, function)
-            for name, quantity, of in outputs:
-                output, member = getattr(Output, name), f"OutputVariableType.{name}"
-                direct = [read(item, output, *point) for item, *point in (x.values() for x in places)]
-                self.add(quantity, f"MainSystem.{function} {member}", of(np.array(direct)))
-                sensed = [mbs.GetSensorValues(sensor) for sensor in self.sensors[kind, name, quantity]]
-                call = f"MainSystem.GetSensorValues itemInterface.{kind} {member}"
-                self.add(quantity, call, of(np.array(sensed)))
+        for one, function, kind, places, sensors in self.readers:
+            read, output = getattr(mbs, function), getattr(Output, one.name)
+            member = f"OutputVariableType.{one.name}"
+            direct = [read(item, output, *point) for item, *point in (x.values() for x in places)]
+            self.add(one.quantity, f"MainSystem.{function} {member}", one.read(np.array(direct)))
+            sensed = np.array([mbs.GetSensorValues(sensor) for sensor in sensors])
+            call = f"MainSystem.GetSensorValues itemInterface.{kind} {member}"
+            self.add(one.quantity, call, one.read(sensed))
         add_parts(
             self.found,
             *(partial(self._add_coordinates, *one) for one in OF_COORDINATES.items()),

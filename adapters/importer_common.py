@@ -53,12 +53,16 @@ def to_canonical(
     M, h, a = quantities.mass_matrix, quantities.bias_force, quantities.acceleration
     if h is not None and M is None:
         raise ValueError("a bias force in canonical velocities needs the mass matrix")
+
+    def turned(force: Array | None) -> Array | None:
+        return None if force is None else T.T @ force
+
     return replace(
         quantities,
         mass_matrix=None if M is None else T.T @ M @ T,
-        bias_force=None if h is None or M is None else T.T @ (M @ Tdot_v + h),
-        gravity_force=None if quantities.gravity_force is None else T.T @ quantities.gravity_force,
-        passive_force=None if quantities.passive_force is None else T.T @ quantities.passive_force,
+        bias_force=turned(None if h is None or M is None else M @ Tdot_v + h),
+        gravity_force=turned(quantities.gravity_force),
+        passive_force=turned(quantities.passive_force),
         acceleration=None if a is None else np.asarray(np.linalg.solve(T, a - Tdot_v), float),
     )
 

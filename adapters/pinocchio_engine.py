@@ -168,9 +168,6 @@ class PinocchioChain:
         is_small = self.joint_count <= MAX_DENSE_JOINTS
         self.has_dense_dexp = is_small or any(joint.nv != 3 for joint in self.joints)
         self.zero_torque = np.zeros(self.pin_model.nv)
-        self.moving = [
-            (k, self.joints[row]) for k, row in enumerate(self.body_rows) if model.kinds[k].element_count
-        ]  # joints that can have elements
         self._init_elements()
         self.ends = ends
         # without ends a solver without constraints
@@ -226,7 +223,10 @@ class PinocchioChain:
         scalars: list[tuple[int, int]] = []  # places in q and in v
         balls: list[tuple[Array, Array]] = []  # quaternion, scalar first, and rates
         turns: list[Array] = []
-        for k, joint in self.moving:
+        for k, row in enumerate(self.body_rows):
+            if not model.kinds[k].element_count:
+                continue
+            joint = self.joints[row]
             is_ball = model.kinds[k].is_spherical
             at, own = slice(joint.idx_v, joint.idx_v + joint.nv), slice(1 if is_ball else joint.nv)
             if np.any(model.armature[k, own]):
