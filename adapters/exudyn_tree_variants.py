@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, cast
 
 import exudyn
@@ -17,6 +18,7 @@ from exudyn import graphics, kinematicTree, rigidBodyUtilities, robotics
 from adapters.exudyn_common import (
     EXPLICIT,
     Ways,
+    add_plain,
     call_parts,
     coordinate_marker,
     grounded_marker,
@@ -27,7 +29,7 @@ from adapters.exudyn_common import (
     set_linear_solver,
     texts,
 )
-from adapters.exudyn_variants import is_open, of_ways
+from adapters.exudyn_variants import by_function, is_open, of_ways, spring_law
 from adapters.pose_functions import homogeneous
 from plumbline.engines.variants import both, has, variants_of
 from plumbline.model.datatypes import Array, EngineFailure, Float, Model
@@ -169,27 +171,17 @@ STEPS: Mapping[str, Callable[[Any, Any], bool]] = {
 }
 
 
-def _spring_law(stiffness: float, damping: float) -> Callable[..., float]:
-    def law(mbs: Any, t: float, item: int, x: float, rate: float, *_: Any) -> float:
-        return stiffness * x + damping * rate
-
-    return law
-
-
-def _grounded(kind: str, by_function: bool = False) -> Callable[..., None]:
+def _grounded(add: Callable[..., Any]) -> Callable[..., None]:
     """Springs, dampers and efforts of coordinates, one by one, against a grounded node."""
 
-    def add(mbs: Any, node: Any, a: Array, c: Array, k: Array, force: Array) -> None:
+    def add_all(mbs: Any, node: Any, a: Array, c: Array, k: Array, force: Array) -> None:
         fixed = grounded_marker(mbs)
         for link in np.flatnonzero((c != 0) | (k != 0)):
-            own: Any = {"stiffness": float(k[link]), "damping": float(c[link])}
-            if by_function:
-                own = {"springForceUserFunction": _spring_law(**own)}
             markers = [fixed, coordinate_marker(mbs, node, int(link))]
-            mbs.AddObject(getattr(items, kind)(markerNumbers=markers, **own))
+            add(mbs, markerNumbers=markers, stiffness=float(k[link]), damping=float(c[link]))
         _add_rest(mbs, node, a, force)
 
-    return add
+    return add_all
 
 
 def _add_rest(mbs: Any, node: Any, a: Array, force: Array) -> None:
@@ -306,12 +298,12 @@ VARIANTS = (
     *(_option(names, matrices=_by_step(run)) for names, run in STEPS.items()),
     *(
         _spelling(f"itemInterface.{name} itemInterface.ObjectConnector{name}", HAS_ELEMENTS,
-                  add_elements=_grounded(name))
+                  add_elements=_grounded(partial(add_plain, name)))
         for name in CONNECTORS
     ),
     *(
         _spelling(f"itemInterface.ObjectConnector{name}SpringForceUserFunction", HAS_ELEMENTS,
-                  add_elements=_grounded(name, by_function=True))
+                  add_elements=_grounded(by_function(name, "springForceUserFunction", spring_law)))
         for name in CONNECTORS
     ),
     *(
@@ -323,7 +315,7 @@ VARIANTS = (
             ("itemInterface.LoadCoordinateLoadUserFunction itemInterface.MarkerNodeCoordinate",
              _load_by_function, HAS_ELEMENTS),
             ("itemInterface.LoadCoordinate itemInterface.NodePointGround",
-             _grounded("ObjectConnectorCoordinateSpringDamper"), has("effort")),
+             _grounded(partial(add_plain, "ObjectConnectorCoordinateSpringDamper")), has("effort")),
         )
     ),
     *of_ways(_spelling, "LoadVectorUserFunction"),

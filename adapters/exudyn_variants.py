@@ -335,7 +335,7 @@ def _load_by_function(kind: str) -> Callable[..., Any]:
     return add
 
 
-def _by_function(kind: str, argument: str, law: Callable[..., Any]) -> Callable[..., Any]:
+def by_function(kind: str, argument: str, law: Callable[..., Any]) -> Callable[..., Any]:
     """A connector whose law a function computes from its parameters and what the engine gives it."""
 
     def add(mbs: Any, **given: Any) -> Any:
@@ -347,7 +347,7 @@ def _by_function(kind: str, argument: str, law: Callable[..., Any]) -> Callable[
     return add
 
 
-def _law(own: Mapping[str, Any], x: float, rate: float, *_: Any) -> float:
+def spring_law(own: Mapping[str, Any], x: float, rate: float, *_: Any) -> float:
     """The law k (x − offset) + d v + constant."""
     constant = own.get("force", own.get("torque", 0.0))
     return float(own["stiffness"] * (x - own.get("offset", 0.0)) + own["damping"] * rate + constant)
@@ -414,7 +414,7 @@ WAYS: tuple[tuple[str, str, Callable[..., Any]], ...] = (
     *(
         (f"ObjectConnector{name}SpringDamper",
          f"itemInterface.ObjectConnector{name}SpringDamperSpring{what}UserFunction",
-         _by_function(f"ObjectConnector{name}SpringDamper", f"spring{what}UserFunction", _law))
+         by_function(f"ObjectConnector{name}SpringDamper", f"spring{what}UserFunction", spring_law))
         for name, what in (("", "Force"), ("Linear", "Force"), ("Torsional", "Torque"))
     ),
     *(
@@ -427,12 +427,12 @@ WAYS: tuple[tuple[str, str, Callable[..., Any]], ...] = (
         )
     ),
     (DRAG, f"itemInterface.{DRAG}SpringForceTorqueUserFunction",
-     _by_function(DRAG, "springForceTorqueUserFunction", _law_of_drag)),
+     by_function(DRAG, "springForceTorqueUserFunction", _law_of_drag)),
     (DRAG, "itemInterface.ObjectConnectorCartesianSpringDamper itemInterface.CartesianSpringDamper",
      _drag_by_two(partial(add_plain, "CartesianSpringDamper"))),
     (DRAG, "itemInterface.ObjectConnectorCartesianSpringDamperSpringForceUserFunction",
      _drag_by_two(
-         _by_function("ObjectConnectorCartesianSpringDamper", "springForceUserFunction", _law_of_axes)
+         by_function("ObjectConnectorCartesianSpringDamper", "springForceUserFunction", _law_of_axes)
      )),
     (DRAG, "MainSystem.CreateCartesianSpringDamper",
      _drag_by_two(_created_between("CreateCartesianSpringDamper"))),

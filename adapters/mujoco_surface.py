@@ -79,9 +79,8 @@ OBJECT_MOTIONS = {
     "mj_objectAcceleration": ("frame_angular_acceleration", "frame_proper_acceleration"),
 }
 # Of a Jacobian the quantities of its two parts, point and rotation.
-AT_FRAME, AT_BODY = (
-    ("frame_velocity", "frame_angular_velocity"), ("body_velocity", "frame_angular_velocity")
-)  # fmt: skip
+AT_FRAME = ("frame_velocity", "frame_angular_velocity")
+AT_BODY = ("body_velocity", "frame_angular_velocity")
 MAX_AWAKE = 12  # steps after which what may sleep does
 INVERSE_STAGES = ("mj_invPosition", "mj_invVelocity", "mj_invConstraint")
 STILL_SENSORS = {"FRAMELINACC": False, "ACCELEROMETER": True}  # by name whether in own axes
