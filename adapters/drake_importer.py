@@ -30,7 +30,6 @@ from pydrake.multibody.tree import BodyIndex, MultibodyForces
 from adapters.importer_common import (
     LayoutWithOwnVelocities,
     LoadingImporter,
-    Refused,
     depth_first,
     joint_from_screw,
     make_body,
@@ -175,17 +174,15 @@ class DrakeImporter(LoadingImporter):
     formats = ("urdf", "mjcf")
     environment = ".importers"
     layout = _Layout
+    refusals = (RuntimeError,)
 
     def _load(self, file: ModelFile) -> Any:
         plant = MultibodyPlant(0.0)
-        try:
-            Parser(plant).AddModels(file.path)
-            if file.format == "urdf" and file.base == "fixed":
-                children = {plant.get_joint(j).child_body().index() for j in plant.GetJointIndices()}
-                for index in range(1, plant.num_bodies()):
-                    if BodyIndex(index) not in children:
-                        plant.WeldFrames(plant.world_frame(), plant.get_body(BodyIndex(index)).body_frame())
-            plant.Finalize()
-        except RuntimeError as error:
-            raise Refused(str(error)) from None
+        Parser(plant).AddModels(file.path)
+        if file.format == "urdf" and file.base == "fixed":
+            children = {plant.get_joint(j).child_body().index() for j in plant.GetJointIndices()}
+            for index in range(1, plant.num_bodies()):
+                if BodyIndex(index) not in children:
+                    plant.WeldFrames(plant.world_frame(), plant.get_body(BodyIndex(index)).body_frame())
+        plant.Finalize()
         return plant

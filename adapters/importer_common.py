@@ -289,6 +289,7 @@ class LoadingImporter(Importer):
     """An importer whose engine loads a file into an object, which a layout describes and evaluates."""
 
     layout: ClassVar[type[Layout]]
+    refusals: ClassVar[tuple[type[Exception], ...]] = (Refused,)  # exceptions with the engine's words
 
     def version(self) -> str:
         """Return the version of the engine, as the metadata of its wheel have it."""
@@ -300,7 +301,7 @@ class LoadingImporter(Importer):
         with captured_output() as printed:
             try:
                 loaded = self._load(file)
-            except Refused as words:
+            except self.refusals as words:
                 refusal = str(words)
         if refusal is not None:
             return Reading(self.version(), refusal=self._refusal_words(refusal, printed))
@@ -318,7 +319,7 @@ class LoadingImporter(Importer):
 
     @abstractmethod
     def _load(self, file: ModelFile) -> Any:
-        """Load a file; raise `Refused` with the engine's words."""
+        """Load a file; raise one of `refusals` with the engine's words."""
 
     def _refusal_words(self, refusal: str, printed: Sequence[str]) -> str:
         return refusal or " ".join(printed)

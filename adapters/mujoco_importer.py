@@ -24,7 +24,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from adapters.importer_common import Layout, LoadingImporter, Refused, free_joint_name, make_joint, pose
+from adapters.importer_common import Layout, LoadingImporter, free_joint_name, make_joint, pose
 from adapters.mujoco_common import compiler_of, full_mass_matrix, set_attributes, warnings_to
 from plumbline.importers.importer import ModelFile
 from plumbline.importers.neutral_model import (
@@ -101,13 +101,11 @@ class MujocoImporter(LoadingImporter):
     formats = ("urdf", "mjcf")
     supported_versions = ">=3.2,<5"
     layout = _Layout
+    refusals = (ValueError,)
 
     def _load(self, file: ModelFile) -> Any:
         with warnings_to(_print):
-            try:
-                return _compiled(file)
-            except ValueError as error:
-                raise Refused(str(error)) from None
+            return _compiled(file)
 
     def evaluate(self, file: ModelFile, states: Sequence[CanonicalState]) -> list[ModelQuantities]:
         """Compute the quantities, with MuJoCo's warnings printed."""

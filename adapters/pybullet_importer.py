@@ -28,7 +28,6 @@ import pybullet as bullet
 from adapters.importer_common import (
     LayoutWithOwnVelocities,
     LoadingImporter,
-    Refused,
     depth_first,
     joint_from_screw,
     make_body,
@@ -152,18 +151,16 @@ class PybulletImporter(LoadingImporter):
         "gravity_force": "calculateInverseDynamics is used for fixed bases only",
     }
     layout = _Layout
+    refusals = (bullet.error,)
 
     def _load(self, file: ModelFile) -> Any:
         _server()
         bullet.resetSimulation()
         bullet.setGravity(*GRAVITY)
-        try:
-            if file.format == "mjcf":
-                return list(bullet.loadMJCF(file.path))
-            is_fixed, flags = file.base == "fixed", bullet.URDF_USE_INERTIA_FROM_FILE
-            return [bullet.loadURDF(file.path, useFixedBase=is_fixed, flags=flags)]
-        except bullet.error as error:
-            raise Refused(str(error)) from None
+        if file.format == "mjcf":
+            return list(bullet.loadMJCF(file.path))
+        is_fixed, flags = file.base == "fixed", bullet.URDF_USE_INERTIA_FROM_FILE
+        return [bullet.loadURDF(file.path, useFixedBase=is_fixed, flags=flags)]
 
     def _refusal_words(self, refusal: str, printed: Sequence[str]) -> str:
         return " ".join([refusal, *printed])
