@@ -489,17 +489,12 @@ _is_rod: Callable[[JointKind], bool] = attrgetter("holds_distance")
 
 
 VARIANTS = (
-    _spelling(
-        "itemInterface.NodeRigidBodyRxyz",
-        _has_no_axes,
-        add_body=_node("NodeRigidBodyRxyz", _angles, _angle_rates),
-        rates=_angle_rates,
-    ),
-    _spelling(
-        "itemInterface.NodeRigidBodyRotVecLG",
-        _has_no_axes,
-        add_body=_node("NodeRigidBodyRotVecLG", rotation_vector, lambda _: np.eye(3)),
-        rates=lambda _: np.eye(3),
+    *(
+        _spelling(f"itemInterface.{kind}", _has_no_axes, add_body=_node(kind, of, rates), rates=rates)
+        for kind, of, rates in (
+            ("NodeRigidBodyRxyz", _angles, _angle_rates),
+            ("NodeRigidBodyRotVecLG", rotation_vector, lambda _: np.eye(3)),
+        )
     ),
     _spelling(
         "MainSystem.CreateRigidBody rigidBodyUtilities.RigidBodyInertia",

@@ -384,7 +384,7 @@ class _MujocoChain:
         model: Model,
         parts: BodyParts | None = None,
         dense: bool = False,
-        constraints: _Constraints | None = None,
+        constraints: _Constraints = _Constraints(),
         has_probes: bool = False,
         change: Change = Change(),  # noqa: B008
         has_text: bool = False,
@@ -410,7 +410,6 @@ class _MujocoChain:
             _add_load_actuators(spec, links[k], k, model)
         for i, (bodies, points) in enumerate(zip(model.spring_body, model.spring_point, strict=True)):
             _add_tendon(spec, links, f"spring {i}", bodies, points)
-        constraints = constraints or _Constraints()
         _add_equalities(spec, links, constraints)
         if has_probes:
             add_probes(spec, links, model)

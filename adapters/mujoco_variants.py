@@ -70,14 +70,12 @@ SHAPES = (
     "mjtInertiaFromGeom MjsGeom MjsMesh mjtGeom mjtMeshInertia mjtGeomInertia "
     "mjtGeomInertia.mjINERTIA_VOLUME mjtGeomInertia.mjINERTIA_SHELL"
 )
-LAST_STAGES = ("mj_fwdActuation", "mj_fwdAcceleration", "mj_fwdConstraint")
-STAGES = ("mj_fwdPosition", "mj_energyPos", "mj_fwdVelocity", "mj_energyVel", *LAST_STAGES)
-PARTS = (  # the functions that the stages of positions and velocities call
-    "mj_kinematics", "mj_comPos", "mj_tendon", "mj_makeM", "mj_factorM", "mj_makeConstraint",
-    "mj_projectConstraint", "mj_transmission", "mj_energyPos", "mj_fwdVelocity", "mj_comVel", "mj_passive",
-    "mj_referenceConstraint", BIAS, "mj_energyVel", *LAST_STAGES,
-)  # fmt: skip
-OTHER_PARTS = ("mj_fwdKinematics", *PARTS[3:])
+LAST_STAGES = "mj_fwdActuation mj_fwdAcceleration mj_fwdConstraint"
+STAGES = f"mj_fwdPosition mj_energyPos mj_fwdVelocity mj_energyVel {LAST_STAGES}"
+PARTS = (  # the functions that the stages of positions and velocities call, after kinematics
+    "mj_makeM mj_factorM mj_makeConstraint mj_projectConstraint mj_transmission mj_energyPos mj_fwdVelocity "
+    f"mj_comVel mj_passive mj_referenceConstraint {BIAS} mj_energyVel {LAST_STAGES}"
+)
 
 
 @dataclass(frozen=True)
@@ -138,11 +136,11 @@ def _copied_data(m: Any, d: Any) -> tuple[Any, Any]:
     return m, other
 
 
-def _forward_by(*parts: str) -> Callable[[Any, Any], None]:
-    """Evaluate by these functions in turn."""
+def _forward_by(parts: str) -> Callable[[Any, Any], None]:
+    """Evaluate by functions with these names in turn."""
 
     def forward(m: Any, d: Any) -> None:
-        for part in parts:
+        for part in parts.split():
             more = (0, d.qfrc_bias) if part == BIAS else ()
             getattr(mujoco, part)(m, d, *more)
 
@@ -222,13 +220,13 @@ def _long_step(m: Any) -> Iterator[None]:
     m.opt.disableflags = flags
 
 
-def _forward_by_step(*functions: str) -> Callable[[Any, Any], None]:
+def _forward_by_step(functions: str) -> Callable[[Any, Any], None]:
     """Take the acceleration from the velocity after a step."""
 
     def forward(m: Any, d: Any) -> None:
         q, v, t = d.qpos.copy(), d.qvel.copy(), d.time
         with _long_step(m):
-            for function in functions:
+            for function in functions.split():
                 getattr(mujoco, function)(m, d)
         a = (d.qvel - v) / LONG_STEP
         d.qpos[:], d.qvel[:], d.time = q, v, t
@@ -407,7 +405,6 @@ _option = variants_of("option", Change, _is_free)
 _spelling = variants_of("spelling", Change, _is_free)
 
 
-_of_any = variants_of("option", Change, every)
 _of_constraints = variants_of("option", Change, is_constrained)
 _of_loops = variants_of("option", Change, _has_loops)
 
@@ -422,6 +419,12 @@ def _forward_to_convergence(m: Any, d: Any) -> None:
     left += d.efc_R * d.efc_force
     if np.max(np.abs(left), initial=0.0) > MAX_LEFT * np.max(np.abs(free), initial=0.0):
         raise Unsupported(f"the solver has not converged after {m.opt.iterations} iterations")
+
+
+def _by_parts(kinematics: str) -> Variant:
+    """Call the parts of the stages one by one."""
+    names = f"{kinematics} {PARTS}"
+    return variants_of("option", Change, every)(names, forward=_forward_by(names))
 
 
 def _options(
@@ -461,23 +464,23 @@ SPARSE: dict[str, Any] = {"jacobian": "mjtJacobian.mjJAC_SPARSE"}
 
 
 VARIANTS = (
-    _option(" ".join(STAGES), forward=_forward_by(*STAGES)),
-    _of_any(" ".join(PARTS), forward=_forward_by(*PARTS)),
+    _option(STAGES, forward=_forward_by(STAGES)),
+    _by_parts("mj_kinematics mj_comPos mj_tendon"),
     _option("mj_forwardSkip mjtStage", forward=_forward_with_skips),
-    _option("mj_step1", forward=_forward_by("mj_step1", *LAST_STAGES)),
+    _option("mj_step1", forward=_forward_by(f"mj_step1 {LAST_STAGES}")),
     _option("mj_getState mj_setState mj_stateSize mj_resetData mjtState", forward=_forward_after_set_state),
-    _of_any(" ".join(OTHER_PARTS), forward=_forward_by(*OTHER_PARTS)),
+    _by_parts("mj_fwdKinematics"),
     _option("mj_copyState mj_extractState", forward=_forward_after_copied_state),
     _option(
         "mj_setKeyframe mj_resetDataKeyframe MjsKey", describe=_with_key, forward=_forward_after_keyframe
     ),
     _option("mj_differentiatePos mj_integratePos", forward=_forward_from_reference),
-    _option("mj_Euler", forward=_forward_by_step("mj_forward", "mj_Euler")),
+    _option("mj_Euler", forward=_forward_by_step("mj_forward mj_Euler")),
     _option(
         "mj_step mjtIntegrator mjtIntegrator.mjINT_EULER MjOption.integrator MjOption.timestep",
         forward=_forward_by_step("mj_step"),
     ),
-    _option("mj_step2", forward=_forward_by_step("mj_step1", "mj_step2")),
+    _option("mj_step2", forward=_forward_by_step("mj_step1 mj_step2")),
     _option("set_mjcb_passive", forward=_forward_by_callback("passive")),
     _option("set_mjcb_control", forward=_forward_by_callback("control")),
     _option(NEEDLESS, lambda model: not model.has_elements, remake=_set_options(disableflags=NEEDLESS)),

@@ -249,8 +249,7 @@ class PinocchioChain:
         """Set `fext` to the constant loads; a moment is constant in the joint's frame, the others vary."""
         model = self.source_model
         self.fext = pin.StdVec_Force()
-        for _ in range(self.pin_model.njoints):
-            self.fext.append(pin.Force.Zero())
+        self.fext.extend([pin.Force.Zero()] * self.pin_model.njoints)
         # the numbers of `fext` by body, and whether it is the first on its joint: welded ones share it
         self.joint_loads = [self.fext[j].vector for j in self.body_joints]
         self.is_first = [j not in self.body_joints[:k] for k, j in enumerate(self.body_joints)]
