@@ -39,11 +39,7 @@ from adapters.exudyn_variants import INITIALISATION
 from adapters.surface_record import SurfaceRecord
 from plumbline.engines.missing_names import add_parts
 from plumbline.model.datatypes import Array, EngineFailure, Float, State
-from plumbline.model.kinematics import (
-    quaternion_exponential,
-    quaternion_product,
-    rotation_vector,
-)
+from plumbline.model.kinematics import quaternion_exponential, quaternion_product, rotation_vector
 from plumbline.model.probe_frames import PROBE_TURN
 
 AXES = np.eye(3)

@@ -76,11 +76,7 @@ from plumbline.model.kinematics import (
     rotate_vectors,
     rotation_matrix,
 )
-from plumbline.model.step_methods import (
-    JointSpaceMethod,
-    classical_runge_kutta,
-    runge_kutta,
-)
+from plumbline.model.step_methods import JointSpaceMethod, classical_runge_kutta, runge_kutta
 
 SENSOR_OUTPUTS = (
     Output.Position,
@@ -124,7 +120,7 @@ class _Linkage:
         self.angle_axes: list[Array] = []  # of revolutes that carry balls and rods, world
         self.link_of_body: list[int] = []
         self.origins: list[Array] = []
-        self.W = np.zeros((0, len(self.nu)))
+        self.W, self._rates = np.zeros((0, len(self.nu))), np.eye(len(self.nu))  # rows of single rates of ν
         self.motions: list[tuple[int, int, int]] = []  # link, joint and its coordinate
         self.link_axes: list[Array] = []  # as `_axes`, at each body
         self._body_spins = (
@@ -177,7 +173,7 @@ class _Linkage:
         """Add three massless slides along the world's axes, for the centre of mass of a free body."""
         self._hang = self.state.r[k]
         for i, x in enumerate(self.state.r[k]):
-            self._add_link(f"Prismatic{'XYZ'[i]}", np.eye(3), x, self._rate(own.start + i))
+            self._add_link(f"Prismatic{'XYZ'[i]}", np.eye(3), x, self._rates[own.start + i])
 
     def _add_turned_body(self, k: int) -> None:
         model, A = self.model, self.attitude[k]
@@ -205,13 +201,9 @@ class _Linkage:
             name = ("Revolute" if what == "turn" else "Prismatic") + "XYZ"[axis]
             is_carried = what == "slide" and not kind.is_about_z  # by the far body, as the turn comes later
             link_axes = above @ rotation_matrix(self.model.turn[k, 0]) if is_carried else axes
-            self._add_link(name, link_axes, self.state.x[k, i], self._rate(own.start + i))
+            self._add_link(name, link_axes, self.state.x[k, i], self._rates[own.start + i])
             self.motions.append((self._last, k, i))
         self._carry_body(k, self.model.proximal[k])
-
-    def _rate(self, i: int) -> Array:
-        """The row of W of a joint whose rate is that one of ν."""
-        return np.asarray(np.eye(len(self.nu))[i])
 
     def _add_link(
         self, joint: str, axes: Array, start: float, row: Array, twist: Array | None = None

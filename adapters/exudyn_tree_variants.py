@@ -202,10 +202,7 @@ def _law_of(c: Array, k: Array, force: Array) -> Callable[..., list[float]]:
 
 
 def _generic_by_functions(mbs: Any, node: Any, a: Array, c: Array, k: Array, force: Array) -> None:
-    given = {
-        "forceUserFunction": _law_of(c, k, force),
-        "massMatrixUserFunction": lambda *_: np.diag(a),
-    }
+    given = {"forceUserFunction": _law_of(c, k, force), "massMatrixUserFunction": lambda *_: np.diag(a)}
     mbs.AddObject(items.ObjectGenericODE2(nodeNumbers=[node], **given))
 
 

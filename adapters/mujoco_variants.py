@@ -428,9 +428,7 @@ def _by_parts(kinematics: str) -> Variant:
 
 
 def _options(
-    suits: Suits = every,
-    forward: Callable[[Any, Any], None] = mujoco.mj_forward,
-    **values: Any,
+    suits: Suits = every, forward: Callable[[Any, Any], None] = mujoco.mj_forward, **values: Any
 ) -> Variant:
     """Set options that concern constraints; the texts among them are its names."""
     names = " ".join(value for value in values.values() if isinstance(value, str))

@@ -459,10 +459,7 @@ class PinocchioChain:
         self._add_up_loads()
 
     def exponential_coordinate_rate(
-        self,
-        q: Float[Array, "nq"],
-        theta: Float[Array, "nv"],
-        v: Float[Array, "nv"],
+        self, q: Float[Array, "nq"], theta: Float[Array, "nv"], v: Float[Array, "nv"]
     ) -> Float[Array, "nv"]:
         """Apply dexp⁻¹ of θ to a velocity, joint by joint.
 

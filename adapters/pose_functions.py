@@ -298,10 +298,7 @@ PoseFunction = Callable[[str, Sequence[Any], Sequence[str]], Sequence[Any]]
 
 
 def add_pose_answers(
-    answers: Sequence[Answer],
-    states: Sequence[State],
-    engine: str,
-    call: PoseFunction,
+    answers: Sequence[Answer], states: Sequence[State], engine: str, call: PoseFunction
 ) -> None:
     """Call all functions of an engine on all bodies at the first states; add what they say to the answers.
 
@@ -325,10 +322,7 @@ def _bodies(state: State) -> list[_Body]:
 
 
 def _add_pose_answer(
-    answer: Answer,
-    function: tuple[str, str],
-    call: PoseFunction,
-    bodies: Callable[[], Sequence[_Body]],
+    answer: Answer, function: tuple[str, str], call: PoseFunction, bodies: Callable[[], Sequence[_Body]]
 ) -> None:
     """Call a function, whose name and forms are given, on all bodies."""
     rows: dict[str, list[Array]] = {}
