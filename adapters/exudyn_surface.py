@@ -7,7 +7,7 @@ here into those of the probe frame.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from functools import partial, reduce
 from importlib import import_module
 from typing import Any, NamedTuple, cast
 
@@ -75,18 +75,6 @@ def _about_first(axes: Array, R: Array) -> Array:
     return axes @ _screw(0, np.arctan2(rest[2, 1], rest[1, 1]), 0.0)[:3, :3]
 
 
-def _after_standard(function: Any, H: Array, theta: float, d: float, a: float, alpha: float) -> Array:
-    """H by the inverse of a pose by standard Denavit-Hartenberg parameters, and the function's."""
-    found = np.array(function([theta, d, a, alpha]))
-    return np.asarray(H @ _screw(0, -alpha, -a) @ _screw(2, -theta, -d) @ found)
-
-
-def _after_modified(function: Any, H: Array, alpha: float, d: float, theta: float, r: float) -> Array:
-    """The same of parameters by Khalil and Kleinfinger, of which the function returns two poses."""
-    before, after = map(np.array, function([alpha, d, theta, r]))
-    return np.asarray(H @ _screw(2, -theta, -r) @ _screw(0, -alpha, -d) @ before @ after)
-
-
 # By function whose result is no attitude or pose of a body what makes one of it.
 COMPLETED: Mapping[str, Callable[..., Any]] = {
     "HT0": lambda function, H: function() @ H,
@@ -95,8 +83,14 @@ COMPLETED: Mapping[str, Callable[..., Any]] = {
     "ComputeOrthonormalBasisVectors": lambda function, R: _about_first(np.stack(function(2 * R[:, 0]), 1), R),
     "GramSchmidt": lambda function, R: np.stack(function(2 * R[:, 0], R[:, 0] + 3 * R[:, 1]), 1),
     "projectAngleToPMPi": lambda function, angle: function(angle + 2 * np.pi),
-    "StdDH2HT": _after_standard,
-    "ModDHKK2HT": _after_modified,
+    # H by the inverse of a pose by Denavit-Hartenberg parameters, standard ones and those of Khalil and
+    # Kleinfinger, of which the function returns two poses, and by the function's
+    "StdDH2HT": lambda function, H, theta, d, a, alpha: (
+        H @ _screw(0, -alpha, -a) @ _screw(2, -theta, -d) @ function([theta, d, a, alpha])
+    ),
+    "ModDHKK2HT": lambda function, H, alpha, d, theta, r: reduce(
+        np.matmul, function([alpha, d, theta, r]), H @ _screw(2, -theta, -r) @ _screw(0, -alpha, -d)
+    ),
 }
 
 
