@@ -234,18 +234,13 @@ class Change:
 
     add_body: Callable[[Any, Piece], tuple[Any, Any]] = USUAL_BODY
     rates: Callable[[Array], Array] = euler_parameter_rates  # p → B
-    joints: Callable[[Any, Joint], Any] = _usual_joint
-    are_meant: Callable[[JointKind], bool] = lambda _: True  # the joints that ``joints`` adds
+    add_joint: Callable[[Any, Joint], Any] = _usual_joint
     assemble: Callable[[Any], None] = lambda mbs: mbs.Assemble()
     ways: Ways = field(default_factory=dict)  # of loads and spring-dampers
     solver: Callable[[], Any] = lambda: exudyn.MainSolverImplicitSecondOrder()  # looked up when it is called
     initialize: Callable[[Any, Any, Any], bool] = initialize
     mass_matrix: Callable[[Any, Array], Array] = lambda _, M: M  # of the chain, and the solver's
     jacobian: Callable[[Any, Array], Array] = lambda _, C: C
-
-    def add_joint(self, mbs: Any, joint: Joint) -> Any:
-        """Describe a joint to the engine in this way, or in the usual one."""
-        return (self.joints if self.are_meant(joint.kind) else _usual_joint)(mbs, joint)
 
 
 def is_open(model: Model) -> bool:
@@ -263,7 +258,12 @@ _spelling = variants_of("spelling", Change, is_open)
 
 
 def _joints(names: str, add: Callable[[Any, Joint], Any], are_meant: Callable[[JointKind], bool]) -> Variant:
-    return _spelling(names, lambda model: any(map(are_meant, model.kinds)), joints=add, are_meant=are_meant)
+    """Describe some joints to the engine in another way."""
+
+    def add_joint(mbs: Any, joint: Joint) -> Any:
+        return (add if are_meant(joint.kind) else _usual_joint)(mbs, joint)
+
+    return _spelling(names, lambda model: any(map(are_meant, model.kinds)), add_joint=add_joint)
 
 
 DRAG = "ObjectConnectorRigidBodySpringDamper"
