@@ -153,13 +153,11 @@ class ExudynChain:
 
     def _add_piece(self, k: int, part: RigidPart) -> tuple[Array, Array]:
         """Add a piece of body k; return the rates q̇ of its node, and B of θ̇ = B ω′."""
-        mbs, state, attitude = self.mbs, self.state, self.turns[k]
+        state, attitude = self.state, self.turns[k]
         arm, arm_rate = attitude @ part.centre, attitude @ cross(state.omega[k], part.centre)
         velocity, gravity = state.v[k] + arm_rate, self.model.gravity
         piece = Piece(part, state.r[k] + arm, velocity, state.p[k], state.omega[k], gravity)
-        node, body = self.change.add_body(mbs, piece)
-        own = np.array(mbs.GetNode(node)["referenceCoordinates"])[3:]
-        rates = self.change.rates(own if len(own) == len(piece.turn) else piece.turn)  # p or −p
+        node, body, rates = self.change.add_body(self.mbs, piece)
         self.nodes.append(node)
         self.piece_bodies.append(body)
         return np.append(velocity, rates @ state.omega[k]), rates

@@ -71,6 +71,9 @@ class Joint:
     length: float
 
 
+AddedBody = tuple[Any, Any, Array]  # node, body, and B of the rates B ω′ of the node's attitude
+
+
 def euler_parameter_rates(p: Float[Array, "4"]) -> Float[Array, "4 3"]:
     """Return B of Euler parameters."""
     return quaternion_rate(p, np.eye(3)).T
@@ -110,14 +113,14 @@ def _node(
 ) -> Any:
     """How a body on a node of this kind is added."""
 
-    def add(mbs: Any, piece: Piece) -> tuple[Any, Any]:
-        reference = [*piece.place, *parameters(piece.turn)]
-        velocities = [*piece.velocity, *(rates(piece.turn) @ piece.spin)]
+    def add(mbs: Any, piece: Piece) -> AddedBody:
+        reference, B = [*piece.place, *parameters(piece.turn)], rates(piece.turn)
+        velocities = [*piece.velocity, *(B @ piece.spin)]
         item = getattr(items, kind)(referenceCoordinates=reference, initialVelocities=velocities)
         node = mbs.AddNode(item)
         body = mbs.AddObject(make_body(node, piece.part.mass, piece.part.inertia))
         mbs.AddLoad(weight(mbs.AddMarker(items.MarkerBodyMass(bodyNumber=body)), piece.gravity))
-        return node, body
+        return node, body, B
 
     return add
 
@@ -125,17 +128,17 @@ def _node(
 def _by_helper(add: Callable[..., Any], place: str, velocity: str, turn: str, spin: str) -> Any:
     """Add a body by a function that makes its node too and is given these arguments."""
 
-    def add_body(mbs: Any, piece: Piece) -> tuple[Any, Any]:
+    def add_body(mbs: Any, piece: Piece) -> AddedBody:
         A = rotation_matrix(piece.turn)
         inertia = utilities.RigidBodyInertia(piece.part.mass, piece.part.inertia)
         given = {place: piece.place, velocity: piece.velocity, turn: A, spin: A @ piece.spin}
         made = add(mbs, inertia=inertia, gravity=piece.gravity.tolist(), **given)
         body = made[1] if isinstance(made, list | tuple) else made
         node = mbs.GetObject(body)["nodeNumber"]
-        own = rotation_matrix(np.array(mbs.GetNode(node)["referenceCoordinates"][3:]))
-        if np.max(np.abs(own - A)) > MAX_ATTITUDE_ERROR:
+        own = np.array(mbs.GetNode(node)["referenceCoordinates"][3:])  # p or −p
+        if np.max(np.abs(rotation_matrix(own) - A)) > MAX_ATTITUDE_ERROR:
             raise Unsupported("RotationMatrix2EulerParameters of Exudyn loses digits at an attitude")
-        return node, body
+        return node, body, euler_parameter_rates(own)
 
     return add_body
 
@@ -146,13 +149,13 @@ USUAL_BODY = _node("NodeRigidBodyEP")
 def _set_later(modifies: bool) -> Any:
     """Add a body of another mass and at rest, and set both later: parameters, or whole items."""
 
-    def add(mbs: Any, piece: Piece) -> tuple[Any, Any]:
+    def add(mbs: Any, piece: Piece) -> AddedBody:
         other, rest = replace(piece.part, mass=2 * piece.part.mass), np.zeros(3)
-        node, body = USUAL_BODY(mbs, replace(piece, part=other, velocity=rest, spin=rest))
-        rates = [*piece.velocity, *(euler_parameter_rates(piece.turn) @ piece.spin)]
+        node, body, B = USUAL_BODY(mbs, replace(piece, part=other, velocity=rest, spin=rest))
+        rates = [*piece.velocity, *(B @ piece.spin)]
         change_item(mbs, "Node", node, modifies, initialVelocities=rates)
         change_item(mbs, "Object", body, modifies, **sizes_of_body(mass=piece.part.mass))
-        return node, body
+        return node, body, B
 
     return add
 
@@ -232,8 +235,7 @@ ASSEMBLY = "AssembleCoordinates AssembleLTGLists AssembleInitializeSystemCoordin
 class Change:
     """What is done otherwise; as it stands nothing."""
 
-    add_body: Callable[[Any, Piece], tuple[Any, Any]] = USUAL_BODY
-    rates: Callable[[Array], Array] = euler_parameter_rates  # p → B
+    add_body: Callable[[Any, Piece], AddedBody] = USUAL_BODY
     add_joint: Callable[[Any, Joint], Any] = _usual_joint
     assemble: Callable[[Any], None] = lambda mbs: mbs.Assemble()
     ways: Ways = field(default_factory=dict)  # of loads and spring-dampers
@@ -490,7 +492,7 @@ _is_rod: Callable[[JointKind], bool] = attrgetter("holds_distance")
 
 VARIANTS = (
     *(
-        _spelling(f"itemInterface.{kind}", _has_no_axes, add_body=_node(kind, of, rates), rates=rates)
+        _spelling(f"itemInterface.{kind}", _has_no_axes, add_body=_node(kind, of, rates))
         for kind, of, rates in (
             ("NodeRigidBodyRxyz", _angles, _angle_rates),
             ("NodeRigidBodyRotVecLG", rotation_vector, lambda _: np.eye(3)),
