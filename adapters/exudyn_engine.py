@@ -130,7 +130,6 @@ class ExudynChain:
         # the body below gets the opposite of the connector's force
         self.x = joint_coordinates(model, state)[2]
         self.connectors: list[tuple[int, Any, bool, Array]] = []
-        self.jacobian_rate = np.zeros((0, 0))  # d_t(C_q), where joints need it
         # of the bodies, and behind them of the world, body −1
         self.turns = np.concatenate([rotation_matrix(state.p), [np.eye(3)]])
         motions = list[tuple[Array, Array]]()
@@ -342,7 +341,7 @@ class Exudyn(ExudynAdapter):
         with silence_engine():
             chain = _chain_that_moves(model, state) if moves else ExudynChain(model, state)
             system = written_items(chain.mbs)  # as it is before a solver has it
-            _, _, C = _system_matrices(chain)
+            C = _system_matrices(chain)[2]
         used = _used_rows(chain, C)
         rates = np.zeros((0, 0)) if model.has_loops else _coordinate_rate_map(chain)
         fields = {"qdot": chain.qdot.ravel(), "A": chain.turns[:-1], "used": used}
@@ -448,7 +447,7 @@ def _chain_that_moves(model: Model, state: State) -> ExudynChain:
     chain = ExudynChain(model, state)
     if not model.has_loops:
         return chain
-    _, _, C = _system_matrices(chain)
+    C = _system_matrices(chain)[2]
     for k in [k for k, kind in enumerate(model.kinds) if kind.holds_points and not kind.is_spherical]:
         # of some displacements the engine holds those along the joint's axes, of all those along the world's
         rows, above = chain.joint_rows(k)[:3], chain.turns[model.body[k, 0]]
@@ -490,8 +489,8 @@ def _evaluate_state(chain: ExudynChain) -> StateQuantities:
         ⎣ C  0  ⎦ ⎣ λ ⎦ = ⎣ γ ⎦,     γ from the accelerations Exudyn gives the attachments at q̈ = 0.
     """
     mbs, data, n, w = chain.mbs, chain.mbs.systemData, len(chain.piece_bodies), chain.width
-    M, f, C = _system_matrices(chain)
-    gamma = _constraint_accelerations(chain, C)
+    M, f, C, C_rate = _system_matrices(chain)
+    gamma = _constraint_accelerations(chain, C, C_rate)
     used = _used_rows(chain, C)
     C_used, multiplier = C[used], np.zeros(len(C))
     x = _solve(
@@ -551,8 +550,8 @@ def _joint_moments(chain: ExudynChain, force: Array, of_p: Array) -> Array:
     return rotate_vectors(A, about_centre) - cross(lever, force)
 
 
-def _system_matrices(chain: ExudynChain) -> tuple[Array, Array, Array]:
-    """Return M (7N, 7N), f (7N,) and C (nc, 7N)."""
+def _system_matrices(chain: ExudynChain) -> tuple[Array, Array, Array, Array]:
+    """Return M (7N, 7N), f (7N,), C (nc, 7N) and, where joints need it, d_t(C_q), else zeros."""
     solver: Any = chain.change.solver()
     with initialized_solver(solver, chain.mbs, make_evaluation_settings(), chain.change.initialize):
         M, f = mass_matrix_and_force(solver, chain.mbs)
@@ -565,10 +564,9 @@ def _system_matrices(chain: ExudynChain) -> tuple[Array, Array, Array]:
             return chain.change.jacobian(chain, np.array(solver.GetSystemJacobian())[len(M) :, : len(M)])
 
         C = constraint_jacobian()
-        chain.jacobian_rate = np.zeros_like(C)
-        if not all(kind.has_attitude for kind in chain.model.kinds):
-            chain.jacobian_rate = _rate_along_velocity(chain, constraint_jacobian)
-        return M, f, C
+        if all(kind.has_attitude for kind in chain.model.kinds):
+            return M, f, C, np.zeros_like(C)
+        return M, f, C, _rate_along_velocity(chain, constraint_jacobian)
 
 
 def _used_rows(chain: ExudynChain, C: Array) -> Indices:
@@ -596,7 +594,7 @@ def _constrained_axes(kind: JointKind) -> list[int]:
     return [int(axis not in axes) for axes in (kind.slide_axes, kind.turn_axes) for axis in range(3)]
 
 
-def _constraint_accelerations(chain: ExudynChain, C: Array) -> Array:
+def _constraint_accelerations(chain: ExudynChain, C: Array, C_rate: Array) -> Array:
     """Return γ (nc,) of C q̈ = γ.
 
     Pieces of one body turn alike, so that γ of a weld's rotations is 0.
@@ -610,7 +608,7 @@ def _constraint_accelerations(chain: ExudynChain, C: Array) -> Array:
     for k, joint in enumerate(chain.joints):
         if not model.kinds[k].holds_no_turn:
             rows = chain.joint_rows(k)
-            gamma[rows] = -chain.jacobian_rate[rows] @ chain.qdot.ravel()
+            gamma[rows] = -C_rate[rows] @ chain.qdot.ravel()
             continue
         bend = chain.joint_output(k, Output.Acceleration)
         if model.length[k] > 0:  # (‖d‖)¨ = (dᵀd̈ + ḋᵀḋ - (‖d‖˙)²) / ‖d‖, and ‖d‖˙ = 0 on the manifold
