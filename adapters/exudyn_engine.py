@@ -349,10 +349,9 @@ class Exudyn(ExudynAdapter):
         fields |= {"proximal": model.proximal, "near": model.body[:, 1]}
         joints = [None if joint is None else int(joint) for joint in chain.joints]
         pushes = [(k, int(item), is_push, axis.tolist()) for k, item, is_push, axis in chain.connectors]
-        parts = {"items": system, "joints": joints, "pushes": pushes}
-        held = [chain.joint_rows(k) for k in range(len(joints))]
-        bodies = {"bodies": [*map(int, chain.piece_bodies)], "held": held}
-        return parts | bodies | {"fields": fields}
+        held, bodies = [chain.joint_rows(k) for k in range(len(joints))], [*map(int, chain.piece_bodies)]
+        parts = {"items": system, "joints": joints, "pushes": pushes, "held": held, "bodies": bodies}
+        return parts | {"fields": fields}
 
     def _surface(self, model: Model, states: Sequence[State]) -> Sequence[SurfaceAnswer]:
         found = list[Answer]()

@@ -27,10 +27,6 @@ from plumbline.model.probe_frames import PROBE_TURN, probe_points
 FEW_BODIES = 3  # of mechanisms on which what does not depend on the mechanism is compared
 
 
-def _as_given(values: Array) -> Array:
-    return values
-
-
 def _in_probe_axes(values: Array) -> Array:
     return values @ PROBE_TURN
 
@@ -101,7 +97,7 @@ class _Output(NamedTuple):
     quantity: str
     has_node: bool
     has_marker: bool
-    read: Callable[[Array], Array] = _as_given
+    read: Callable[[Array], Array] = np.asarray
 
 
 def _weighted_sum(

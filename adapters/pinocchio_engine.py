@@ -339,13 +339,13 @@ class PinocchioChain:
         model, bodies = self.source_model, self.body_of_row
         frames = np.tile(UNTURNED, (len(q), self.joint_count + 1, 1))
         for j, joint in enumerate(self.joints):
-            is_jointed = j in bodies and bool(model.kinds[bodies[j]].motions)
-            turn = np.roll(q[:, joint.idx_q : joint.idx_q + joint.nq][:, -4:], 1, axis=1)
-            if is_jointed:
-                turn = _joint_turns(model, bodies[j], q[:, joint.idx_q :])
-                far = model.body[bodies[j], 0]
-                above = model.turn[bodies[j], 0]
-                turn = quaternion_product(self._frame_in_joint(far, above), turn)
+            k = bodies.get(j, -1)
+            if k >= 0 and model.kinds[k].motions:
+                turn = _joint_turns(model, k, q[:, joint.idx_q :])
+                above = self._frame_in_joint(model.body[k, 0], model.turn[k, 0])
+                turn = quaternion_product(above, turn)
+            else:
+                turn = np.roll(q[:, joint.idx_q : joint.idx_q + joint.nq][:, -4:], 1, axis=1)
             frames[:, j] = quaternion_product(frames[:, self.parent_rows[j]], turn)
         return frames
 
