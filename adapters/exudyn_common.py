@@ -45,6 +45,11 @@ def change_item(mbs: Any, kind: str, number: Any, modifies: bool, **given: Any) 
         getattr(mbs, f"Set{kind}Parameter")(number, name, value)
 
 
+def of_module_and_system(mbs: Any, name: str) -> Mapping[str, Callable[..., Any]]:
+    """A function that the module has and systems have as well, by its names."""
+    return {name: partial(getattr(exudyn, name), mbs), f"MainSystem.{name}": getattr(mbs, name)}
+
+
 def texts(owner: str, *names: str) -> str:
     """The names of a class or module in one text."""
     return " ".join(f"{owner}.{name}" for name in " ".join(names).split())

@@ -27,6 +27,7 @@ from adapters.exudyn_common import (
     make_rigid_body,
     make_settings,
     make_system,
+    of_module_and_system,
     sizes_of_body,
     texts,
 )
@@ -518,12 +519,9 @@ def _add_linear_systems(s: _Items) -> None:
     call = f"itemInterface.ObjectGenericODE2JacobianUserFunction {IMPLICIT}.ComputeJacobianODE2RHS"
     s.add("body_position", call, np.sign(s.places) * np.diag(jacobian).reshape(-1, 3) / 2)
     order, found = np.argsort(sizes, kind="stable"), np.zeros(len(sizes))
-    module: Any = exudyn
-    name = "ComputeODE2Eigenvalues"
-    for owner, function in (("", partial(module.ComputeODE2Eigenvalues, s.mbs)),
-                            ("MainSystem.", s.mbs.ComputeODE2Eigenvalues)):  # fmt: skip
+    for name, function in of_module_and_system(s.mbs, "ComputeODE2Eigenvalues").items():
         found[order] = np.sort(function()[0])
-        s.add("body_position", f"{owner}{name}", np.sign(s.places) * found.reshape(-1, 3))
+        s.add("body_position", name, np.sign(s.places) * found.reshape(-1, 3))
 
 
 def _add_equations(s: _Items) -> None:

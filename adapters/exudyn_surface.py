@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial, reduce
 from importlib import import_module
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import exudyn
 import numpy as np
 import scipy.linalg
 
-from adapters.exudyn_common import Output, items
+from adapters.exudyn_common import Output, items, of_module_and_system
 from adapters.exudyn_items import add_item_answers
 from adapters.exudyn_points import add_point_answers
 from adapters.pose_functions import turned
@@ -212,10 +212,8 @@ class Probes(SurfaceRecord):
             add_parts(self.found, self._add_degrees_of_freedom)
 
     def _add_degrees_of_freedom(self) -> None:
-        name, module = "ComputeSystemDegreeOfFreedom", cast("Any", exudyn)
-        for call, compute in ((name, partial(module.ComputeSystemDegreeOfFreedom, self.mbs)),
-                              (f"MainSystem.{name}", self.mbs.ComputeSystemDegreeOfFreedom)):  # fmt: skip
-            self.add("degrees_of_freedom", call, compute()["degreeOfFreedom"])
+        for name, compute in of_module_and_system(self.mbs, "ComputeSystemDegreeOfFreedom").items():
+            self.add("degrees_of_freedom", name, compute()["degreeOfFreedom"])
 
     def _own(self, values: Any, kind: str = "Node") -> list[Array]:
         """The first three of each body's or node's own coordinates, of those of the system."""
