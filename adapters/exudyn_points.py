@@ -75,7 +75,7 @@ STEPS: Sequence[Step] = (
     ("TimeIntegrationSettings.reuseConstantMassMatrix",
      NEWMARK | {"reuseConstantMassMatrix": False}, BY_NEWMARK),
     ("TimeIntegrationSettings.computeLoadsJacobian", NEWMARK | {"computeLoadsJacobian": 1},
-     _factors(0.5, 0.25, last=(2.0 - PULL / 4) / (1 + PULL / 4))),
+     _factors(0.5, 0.25, last=(2.0 - PULL / 4) / (1 + PULL / 4))),  # a force −m x pulls besides
     ("NewtonSettings.active", NEWMARK | {"newton.active": False, "newton.maxIterations": 1},
      BY_NEWMARK),
     ("NewtonSettings.useNewtonSolver",
