@@ -44,7 +44,7 @@ BY_CALLBACK: Ways = {
 }
 PID: Ways = {"pid": {"gaintype": "mjtGain.mjGAIN_PID"}}
 PID_GAINS = np.array([3.0, 2.0, 4.0])  # of position, velocity and integral
-CALLBACKS = ("set_mjcb_act_gain", "set_mjcb_act_bias", "set_mjcb_act_dyn")
+CALLBACKS = "set_mjcb_act_gain set_mjcb_act_bias set_mjcb_act_dyn"
 SERVO: Ways = {"servo": {"biastype": "mjtBias.mjBIAS_AFFINE"}, "motor": {}}
 GROUP_OFF = 3  # of actuators that are off
 FAR = 1e6  # of limits that are never reached [rad, m, N or N m]
@@ -332,6 +332,6 @@ def with_gravcomp_of_attached(spec: Any) -> Any:
     return spec
 
 
-def names_of(ways: Ways) -> tuple[str, ...]:
+def names_of(ways: Ways) -> str:
     """The members that ways have."""
-    return tuple(dict.fromkeys(member for members in ways.values() for member in members.values()))
+    return " ".join(dict.fromkeys(member for members in ways.values() for member in members.values()))

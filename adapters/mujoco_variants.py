@@ -449,7 +449,7 @@ def _actuated(
     suits: Suits = has("effort"),  # noqa: B008
 ) -> Variant:
     """Let actuators exert what the joints have."""
-    own = " ".join(actuation.names_of(ways))
+    own = actuation.names_of(ways)
     of_motors = f"mjtSensor.mjSENS_{read} {MOTORS} MjData.ctrl" if read else "mjtDyn MjData.act"
     describe, forward = actuation.with_actuators(ways, read), actuation.forward_by_actuators(ways, read)
     every = names or f"{own} {of_motors} mjtTrn.mjTRN_JOINT"
@@ -541,7 +541,7 @@ VARIANTS = (
     ),
     _actuated(actuation.PID, names="mjtGain.mjGAIN_PID mjtDyn.mjDYN_PID mjtCtrlInput"),
     _spelling(
-        " ".join((*actuation.CALLBACKS, *actuation.names_of(actuation.BY_CALLBACK))),
+        f"{actuation.CALLBACKS} {actuation.names_of(actuation.BY_CALLBACK)}",
         has("effort"),
         describe=actuation.with_actuators(actuation.BY_CALLBACK),
         forward=actuation.forward_by_callbacks,

@@ -132,17 +132,16 @@ def rigid_constraints(
     return constraints, data
 
 
-def add_frame(pin_model: pin.Model, name: str, joint: int, point: Float[Array, "3"]) -> int:
-    """Add an operational frame with the axes of a joint.
+def add_frame(pin_model: pin.Model, name: str, joint: int, placement: pin.SE3) -> int:
+    """Add an operational frame to a joint.
 
     Args:
         name: a name that no other frame has.
         joint: index of the joint that carries the frame.
-        point: its origin [m] in the joint's frame.
+        placement: of the frame in the joint's frame.
 
     """
-    frame = pin.Frame(name, joint, 0, translation(point), pin.FrameType.OP_FRAME)
-    return int(pin_model.addFrame(frame))
+    return int(pin_model.addFrame(pin.Frame(name, joint, 0, placement, pin.FrameType.OP_FRAME)))
 
 
 def point_acceleration(pin_model: pin.Model, data: pin.Data, frame: int) -> Float[Array, "3"]:

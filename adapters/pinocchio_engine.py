@@ -152,7 +152,7 @@ class PinocchioChain:
                 hang = translation(np.array([0.0, 0.0, model.length[k]]))
             joint = self._add_body(k, joint, hang)
             append_parts(self.pin_model, joint, parts[k], self.placements[k])
-            add_frame(self.pin_model, f"com {k}", joint, self.placements[k].translation)
+            add_frame(self.pin_model, f"com {k}", joint, translation(self.placements[k].translation))
             self.body_joints.append(joint)
         self.pin_model = change.remake(self.pin_model)
         self.com_frames = [self.pin_model.getFrameId(f"com {k}") for k in range(model.n)]

@@ -63,17 +63,16 @@ class _FreeFlyerSystem:
         for k in range(model.n):
             joint = self.pin_model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), f"body {k}")
             append_parts(self.pin_model, joint, parts[k], pin.SE3.Identity())
-        # Attachment points of joint k: (engine joint, point) on its bodies; joint 0 is the world.
+        # Attachment points of joint k: (engine joint, place) on its bodies; joint 0 is the world.
         far, near = (
-            [(int(body) + 1, at) for body, at in zip(model.body[:, i], model.point[:, i], strict=True)]
+            [(int(b) + 1, translation(at)) for b, at in zip(model.body[:, i], model.point[:, i], strict=True)]
             for i in (0, 1)
         )
         self.near_frames, self.far_frames = (
-            [add_frame(self.pin_model, f"{side} {k}", *point) for k, point in enumerate(points)]
-            for side, points in (("near", near), ("far", far))
+            [add_frame(self.pin_model, f"{side} {k}", *place) for k, place in enumerate(places)]
+            for side, places in (("near", near), ("far", far))
         )
-        pairs = zip(*([(j, translation(at)) for j, at in points] for points in (near, far)), strict=True)
-        kind = pin.ContactType.CONTACT_3D
+        kind, pairs = pin.ContactType.CONTACT_3D, zip(near, far, strict=True)
         self.contacts, self.contact_data = rigid_constraints(kind, self.pin_model, pairs)
         self.data = self.pin_model.createData()
         self.allowed = np.zeros((len(model.kind), 6))  # accelerations that the joints' rates cause

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from adapters.pinocchio_common import WORLD_ALIGNED, joint_of
+from adapters.pinocchio_common import WORLD_ALIGNED, add_frame, joint_of
 from adapters.surface_record import SurfaceRecord
 from plumbline.model.datatypes import Array, Float, Model
 from plumbline.model.probe_frames import PROBE_TURN, probe_points
@@ -25,9 +25,7 @@ def add_probe_frames(
 
     """
     own = enumerate(zip(joints, placements, probe_points(model), strict=True))
-    kind = pin.FrameType.OP_FRAME
-    frames = [pin.Frame(f"probe {k}", j, 0, at * pin.SE3(PROBE_TURN, x), kind) for k, (j, at, x) in own]
-    return [int(pin_model.addFrame(frame)) for frame in frames]
+    return [add_frame(pin_model, f"probe {k}", j, at * pin.SE3(PROBE_TURN, x)) for k, (j, at, x) in own]
 
 
 class Probed(SurfaceRecord):
