@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from plumbline.judging.refinement_analysis import RefinementAnalysis
-from plumbline.judging.rows import Row, Verdict, first_decided, with_unit
+from plumbline.judging.rows import Row, Verdict, with_unit
 from plumbline.measurements.order_and_limit import observed_order
 from plumbline.measurements.refinement_study import ROUNDING_PER_STEP, rounding_floor
 from plumbline.model.datatypes import Array
@@ -76,32 +75,28 @@ def _invariant_row(study: RefinementAnalysis, quantity: str, unit: str, samples:
     limit_drift = np.maximum.accumulate(np.max(np.linalg.norm(limit.y, axis=-1), axis=1))
     is_trusted = not study.has_steps or observed_order(samples, floor, study.integrator.order).is_asymptotic
 
-    def judge_window(number: int) -> Row:
-        at = number - 1
-        to_limit = float(np.max(np.linalg.norm((samples[-1] - limit.y)[:number], axis=-1)))
-        allowed = to_limit + float(tolerance[at])
+    def judge_window(at: int) -> tuple[Verdict, str]:
         at_zero = (
             f"{limit_drift[at]:.2g} ± {with_unit(tolerance[at], unit)} at step zero, t ≤ {times[at]:g} s"
         )
-        derivation = (
-            f"{to_limit:.2g} from the finest step to step zero, itself ± {limit.uncertainty[at]:.2g}; "
-            f"{rounding}; {UNCERTAIN} ± {uncertainty:.2g}"
-        )
-        ratio = float(limit_drift[at] / tolerance[at])
-        extra = {"limit": float(limit_drift[at]), "limit_tolerance": float(tolerance[at])}
         if limit_drift[at] <= tolerance[at] <= DETECTABLE_PARAMETER_ERROR * scale:
-            reason = f"{name} {with_unit(drift[at], unit)} at the finest step, {at_zero}"
-            return row(Verdict.AGREES, reason, at, allowed, derivation, ratio, **extra)
+            return Verdict.AGREES, f"{name} {with_unit(drift[at], unit)} at the finest step, {at_zero}"
         if limit_drift[at] > tolerance[at] and is_trusted:
-            reason = f"{name} does not vanish with the step: {at_zero}"
-            return row(Verdict.DISAGREES, reason, at, float(tolerance[at]), derivation, ratio, **extra)
-        reason = f"{name} {with_unit(drift[at], unit)}: {at_zero} does not decide"
-        return row(Verdict.UNRESOLVED, reason, at, allowed, derivation, ratio, **extra)
+            return Verdict.DISAGREES, f"{name} does not vanish with the step: {at_zero}"
+        return Verdict.UNRESOLVED, f"{name} {with_unit(drift[at], unit)}: {at_zero} does not decide"
 
-    found = first_decided(judge_window(number) for number in study.window_lengths(float(times[-1])))
-    duration, last_sample = float(times[-1]), int(np.searchsorted(times, found.compared_until or 0.0))
-    verdict, reason = found.verdict, found.reason
-    if verdict != Verdict.UNRESOLVED and study.is_too_short(last_sample, duration):
-        verdict, reason = Verdict.UNRESOLVED, f"too short a time to decide: {reason}"
-    reason += study.coverage_remark(last_sample, duration, duration)
-    return replace(found, verdict=verdict, reason=reason)
+    duration = float(times[-1])
+    verdict, reason, at, _ = study.decide(judge_window, duration, duration)
+    to_limit = float(np.max(np.linalg.norm((samples[-1] - limit.y)[: at + 1], axis=-1)))
+    is_off = limit_drift[at] > tolerance[at] and is_trusted
+    return row(
+        verdict,
+        reason,
+        at,
+        float(tolerance[at]) + (0.0 if is_off else to_limit),
+        f"{to_limit:.2g} from the finest step to step zero, itself ± {limit.uncertainty[at]:.2g}; "
+        f"{rounding}; {UNCERTAIN} ± {uncertainty:.2g}",
+        float(limit_drift[at] / tolerance[at]),
+        limit=float(limit_drift[at]),
+        limit_tolerance=float(tolerance[at]),
+    )

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from plumbline.engines.engine_calls import RefinementRun
-from plumbline.judging.rows import RowContext
+from plumbline.judging.rows import RowContext, Verdict, first_decided
 from plumbline.measurements.order_and_limit import (
     ORDER_MARGIN,
     ExtrapolatedLimit,
@@ -27,10 +27,20 @@ from plumbline.model.invariants import (
     compute_invariants,
     invariant_scales,
     motion_errors,
+    motion_samples,
     motion_scales,
 )
 from plumbline.model.kinematics import angular_velocity
 from plumbline.truth.ground_truth import RUN_ROUNDING, MotionTruth
+
+
+class WindowVerdict(NamedTuple):
+    """The verdict on a limit in one window of time."""
+
+    verdict: Verdict
+    reason: str
+    last_sample: int  # index of the window's last sample
+    remark: str = ""  # on the time that the window does not cover
 
 
 @dataclass
@@ -46,6 +56,7 @@ class RefinementAnalysis:
     finest: Trajectory = field(init=False)
     # by the names of `MOTION_UNITS`, per run (T, N, ·); NaN where the run failed
     samples: dict[str, list[Array]] = field(init=False)
+    true_samples: dict[str, Array] = field(init=False)  # of the truth, by the same names
     motion_scales: dict[str, float] = field(init=False)  # of rounding in them
     scaled_states: list[Float[Array, "samples bodies 6"]] = field(
         init=False
@@ -64,6 +75,7 @@ class RefinementAnalysis:
         r, p, v, pdot = (run_samples(self.runs, name) for name in ("r", "p", "v", "pdot"))
         omega = [angular_velocity(*pair) for pair in zip(p, pdot, strict=True)]
         self.samples = dict(zip(MOTION_UNITS, (r, p, v, omega), strict=True))
+        self.true_samples = motion_samples(self.truth.trajectory)
         self.motion_scales = motion_scales(self.model, self.truth.trajectory, self.truth.length)
         self.invariant_scales = invariant_scales(self.model, self.truth.trajectory, self.truth.length)
         # Positions alone may converge faster than the method: symplectic Euler from a state without
@@ -154,24 +166,26 @@ class RefinementAnalysis:
         numbers = [int(np.searchsorted(self.times, e, side="right")) for e in ends]
         return [number for number in dict.fromkeys(numbers) if number >= 3] or [min(3, len(self.times))]
 
-    def coverage_remark(self, at: int, duration: float, wanted: float) -> str:
-        """Describe a comparison that covers less time than the scenario asks for.
+    def decide(
+        self, judge: Callable[[int], tuple[Verdict, str]], until: float, wanted: float
+    ) -> WindowVerdict:
+        """Return the verdict in the longest window that decides; where none does, in the longest one.
 
         Args:
-            at: index of the last sample that was compared.
-            duration: of the scenario [s].
-            wanted: how much of it can be compared at best [s].
-
-        Returns:
-            Words that follow a reason; empty where everything was compared.
+            judge: from the index of a window's last sample to verdict and reason.
+            until: end of the longest window [s].
+            wanted: how much of the scenario can be compared at best [s]; a decision needs half of it.
 
         """
-        if self.times[at] >= duration * (1 - 1e-12):
-            return ""
-        until = f"; covers {self.times[at]:g} s of the scenario's {duration:g} s"
-        return (
-            until if wanted >= duration * (1 - 1e-12) else f"{until}, which can be predicted for {wanted:g} s"
-        )
+        windows = (WindowVerdict(*judge(number - 1), number - 1) for number in self.window_lengths(until))
+        verdict, reason, at, _ = first_decided(windows)
+        if verdict != Verdict.UNRESOLVED and self.is_too_short(at, wanted):
+            verdict, reason = Verdict.UNRESOLVED, f"too short a time to decide: {reason}"
+        remark, duration = "", self.times[-1] * (1 - 1e-12)
+        if self.times[at] < duration:
+            remark = f"; covers {self.times[at]:g} s of the scenario's {self.times[-1]:g} s"
+            remark += f", which can be predicted for {wanted:g} s" if wanted < duration else ""
+        return WindowVerdict(verdict, reason + remark, at, remark)
 
     def is_too_short(self, at: int, wanted: float) -> bool:
         """Whether a comparison up to a sample covers less than half of the wanted time.

@@ -8,8 +8,7 @@ window is never overruled by a shorter one.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -25,19 +24,17 @@ from plumbline.judging.rows import (
     Row,
     RowContext,
     Verdict,
-    first_decided,
     with_unit,
 )
 from plumbline.judging.state_level import SINGULAR_POSE
 from plumbline.measurements.order_and_limit import ORDER_CHANGE_FACTOR, ORDER_MARGIN
-from plumbline.model.datatypes import Array, Float, Integrator, Model, Trajectory
+from plumbline.model.datatypes import Integrator, Model, Trajectory
 from plumbline.model.invariants import (
     INVARIANT_UNITS,
     LIMITS,
     MOTION_UNITS,
     attitude_error,
     motion_error,
-    motion_samples,
     position_error,
 )
 from plumbline.truth.ground_truth import DETECTABLE_PARAMETER_ERROR, MotionTruth
@@ -102,7 +99,7 @@ def _limit_deviation(study: RefinementAnalysis, row: Row) -> Deviation:
     """By how much a limit that disagrees is off the truth, in the window of its row."""
     count = int(np.searchsorted(study.times, row.compared_until or 0.0, side="right"))
     quantity = LIMITS[row.quantity]
-    true = motion_samples(study.truth.trajectory)[quantity]
+    true = study.true_samples[quantity]
     limit = study.extrapolated_limit(study.samples[quantity]).y
     if quantity == "attitude":
         limit = limit / (np.linalg.norm(limit, axis=-1) * np.sign(np.sum(limit * true, axis=-1)))[..., None]
@@ -139,19 +136,11 @@ def trajectory_rows(study: RefinementAnalysis) -> list[Row]:
         the same run, and what their difference leaves out of the accepted errors is not known.
 
     """
-    truth, limit_error = study.truth, study.limit_error
     rows = [_order_row(study)] if study.has_steps else []
-    for name, true in motion_samples(truth.trajectory).items():
-        if not (study.has_steps or name in FINEST_RUN_SHOWN):
-            continue
-        found = _rows_against_truth(
-            study,
-            _ComparedQuantity(
-                name, MOTION_UNITS[name], study.samples[name], true, truth.uncertainty[name],
-                truth.detectable[name], limit_error[name], study.motion_scales[name],
-            ),
-        )  # fmt: skip
-        rows += found if name in FINEST_RUN_SHOWN else found[:1]
+    for name in MOTION_UNITS:
+        if study.has_steps or name in FINEST_RUN_SHOWN:
+            found = _rows_against_truth(study, name)
+            rows += found if name in FINEST_RUN_SHOWN else found[:1]
     return rows
 
 
@@ -193,45 +182,48 @@ def _order_row(study: RefinementAnalysis) -> Row:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _ComparedQuantity:
-    """A quantity of `MOTION_UNITS`: the samples of all runs and the truth."""
+def _rows_against_truth(study: RefinementAnalysis, name: str) -> list[Row]:
+    """Two rows: the limit against the truth; for information the finest run and the study's estimate.
 
-    name: str
-    unit: str
-    samples: Sequence[Array]  # per run (T, N, ·)
-    true: Array
-    truth_uncertainty: Float[Array, "samples"]  # in ``unit``
-    detectable: Float[Array, "samples"]  # in ``unit``: effect of the smallest mistake that must be detected
-    # in ``unit``: of runs that are themselves the limit of softer ones
-    limit_error: Float[Array, "samples"]
-    scale: float  # of rounding, in ``unit``
+    Args:
+        name: of `MOTION_UNITS`.
 
-
-@dataclass(frozen=True)
-class _WindowVerdict:
-    """The verdict on a limit in one window of time."""
-
-    verdict: Verdict
-    reason: str
-    last_sample: int  # index of the window's last sample
-    remark: str = ""  # on the time that the window does not cover
-
-
-def _rows_against_truth(study: RefinementAnalysis, quantity: _ComparedQuantity) -> list[Row]:
-    """Two rows: the limit against the truth; for information the finest run and the study's estimate."""
-    name, unit, samples = quantity.name, quantity.unit, quantity.samples
-    method, make_row = study.integrator.name, study.context.make_row
+    """
+    unit, samples, true = MOTION_UNITS[name], study.samples[name], study.true_samples[name]
+    make_row = partial(study.context.make_row, "trajectory", study.integrator.name, unit=unit)
     try:
         limit = study.extrapolated_limit(samples)
     except ValueError as error:
-        return [make_row("trajectory", method, f"{name}_limit", Verdict.UNRESOLVED, str(error), unit)]
-    off = np.maximum.accumulate(motion_error(name, limit.y, quantity.true))
-    limit_uncertainty = _per_component(name) * limit.uncertainty + quantity.limit_error
-    rounding = quantity.scale * study.rounding
-    tolerance = limit_uncertainty + quantity.truth_uncertainty + rounding
-    found = _judge_windows(study, quantity, off, tolerance)
-    at, end = found.last_sample, float(study.times[found.last_sample])
+        return [make_row(f"{name}_limit", Verdict.UNRESOLVED, str(error))]
+    off = np.maximum.accumulate(motion_error(name, limit.y, true))
+    # the finest run may itself be the limit of softer ones
+    limit_uncertainty = _per_component(name) * limit.uncertainty + study.limit_error[name]
+    truth_uncertainty, detectable = study.truth.uncertainty[name], study.truth.detectable[name]
+    rounding = study.motion_scales[name] * study.rounding
+    tolerance = limit_uncertainty + truth_uncertainty + rounding
+    is_trusted = not study.has_steps or study.observed.is_asymptotic or study.observed.is_at_rounding_floor
+    words = name.replace("_", " ")
+
+    def judge_window(at: int) -> tuple[Verdict, str]:
+        until = f"up to t = {study.times[at]:g} s"
+        if off[at] <= tolerance[at] <= detectable[at]:
+            return Verdict.AGREES, f"{words} limit within {with_unit(off[at], unit)} of the truth {until}"
+        if off[at] <= tolerance[at]:
+            return Verdict.UNRESOLVED, (
+                f"uncertainty {with_unit(tolerance[at], unit)} {until} is above the "
+                f"{with_unit(detectable[at], unit)} that a mistake of {DETECTABLE_PARAMETER_ERROR:g} "
+                "would make"
+            )
+        if is_trusted:
+            return Verdict.DISAGREES, (
+                f"the {words} at step zero is {with_unit(off[at], unit, 3)} from the truth {until}, "
+                f"{off[at] / tolerance[at]:.3g} times the uncertainties"
+            )
+        reason = f"{words} limit {with_unit(off[at], unit)} off {until}, but no order is observed"
+        return Verdict.UNRESOLVED, reason
+
+    verdict, reason, at, remark = study.decide(judge_window, study.horizon, study.truth.wanted_time)
+    end = float(study.times[at])
     if study.has_steps:
         resolution = "step"
         how = (
@@ -242,41 +234,32 @@ def _rows_against_truth(study: RefinementAnalysis, quantity: _ComparedQuantity) 
         resolution, how = "tolerance", f"tightest of {len(samples)} tolerances"
     common = {
         "compared_until": end,
-        "uncertainty": float(limit_uncertainty[at] + quantity.truth_uncertainty[at]),
+        "uncertainty": float(limit_uncertainty[at] + truth_uncertainty[at]),
         **study.common_fields,
     }
-    own = float(np.maximum.accumulate(motion_error(name, samples[-1], quantity.true))[at])
+    own = float(np.maximum.accumulate(motion_error(name, samples[-1], true))[at])
     estimate = float(np.max(motion_error(name, samples[-1], limit.y)[: at + 1]) + tolerance[at])
     finest = study.runs[-1].resolution
     limit_row = make_row(
-        "trajectory",
-        method,
         f"{name}_limit",
-        found.verdict,
-        found.reason,
-        unit,
+        verdict,
+        reason,
         value=float(off[at]),
         tolerance=float(tolerance[at]),
         ratio=float(off[at] / tolerance[at]),
         derivation=f"up to t = {end:g} s: limit ({how}) ± {limit_uncertainty[at]:.2g}, "
-        f"truth ({study.truth.method}) ± {quantity.truth_uncertainty[at]:.2g}, "
-        f"rounding {study.rounding_description} × {with_unit(quantity.scale, unit, 3)} = {rounding[at]:.2g}; "
-        f"a mistake of {DETECTABLE_PARAMETER_ERROR:g} in a parameter changes it by "
-        f"{quantity.detectable[at]:.2g}",
-        extra={
-            "visible": float(min(quantity.detectable[at], 1e308)),
-            "growth": float(study.truth.growth[at]),
-        },
+        f"truth ({study.truth.method}) ± {truth_uncertainty[at]:.2g}, "
+        f"rounding {study.rounding_description} × {with_unit(study.motion_scales[name], unit, 3)} = "
+        f"{rounding[at]:.2g}; a mistake of {DETECTABLE_PARAMETER_ERROR:g} in a parameter changes it by "
+        f"{detectable[at]:.2g}",
+        extra={"visible": float(min(detectable[at], 1e308)), "growth": float(study.truth.growth[at])},
         **common,
     )
     finest_row = make_row(
-        "trajectory",
-        method,
         name,
         Verdict.INFORMATION,  # own ≤ estimate where the limit agrees, by the triangle inequality
         f"{name} at {resolution} {finest:g} is {with_unit(own, unit)} from the truth, "
-        f"the refinement study estimates {estimate:.2g}{found.remark}",
-        unit,
+        f"the refinement study estimates {estimate:.2g}{remark}",
         value=own,
         tolerance=estimate,
         derivation=f"from the finest run to the limit, plus the limit's tolerance, t ≤ {end:g} s",
@@ -284,43 +267,6 @@ def _rows_against_truth(study: RefinementAnalysis, quantity: _ComparedQuantity) 
         **common,
     )
     return [limit_row, finest_row]
-
-
-def _judge_windows(
-    study: RefinementAnalysis, quantity: _ComparedQuantity, off: Array, tolerance: Array
-) -> _WindowVerdict:
-    """The longest window that decides; where none does, the longest one and the reason."""
-    name, unit, detectable = quantity.name.replace("_", " "), quantity.unit, quantity.detectable
-    is_trusted = not study.has_steps or study.observed.is_asymptotic or study.observed.is_at_rounding_floor
-
-    def judge_window(at: int) -> _WindowVerdict:
-        until = f"up to t = {study.times[at]:g} s"
-        if off[at] <= tolerance[at] <= detectable[at]:
-            reason = f"{name} limit within {with_unit(off[at], unit)} of the truth {until}"
-            return _WindowVerdict(Verdict.AGREES, reason, at)
-        if off[at] <= tolerance[at]:
-            reason = (
-                f"uncertainty {with_unit(tolerance[at], unit)} {until} is above the "
-                f"{with_unit(detectable[at], unit)} that a mistake of {DETECTABLE_PARAMETER_ERROR:g} "
-                "would make"
-            )
-        elif is_trusted:
-            reason = (
-                f"the {name} at step zero is {with_unit(off[at], unit, 3)} from the truth {until}, "
-                f"{off[at] / tolerance[at]:.3g} times the uncertainties"
-            )
-            return _WindowVerdict(Verdict.DISAGREES, reason, at)
-        else:
-            reason = f"{name} limit {with_unit(off[at], unit)} off {until}, but no order is observed"
-        return _WindowVerdict(Verdict.UNRESOLVED, reason, at)
-
-    found = first_decided(judge_window(number - 1) for number in study.window_lengths(study.horizon))
-    wanted = study.truth.wanted_time
-    remark = study.coverage_remark(found.last_sample, float(study.times[-1]), wanted)
-    verdict, reason = found.verdict, found.reason
-    if verdict != Verdict.UNRESOLVED and study.is_too_short(found.last_sample, wanted):
-        verdict, reason = Verdict.UNRESOLVED, f"too short a time to decide: {reason}"
-    return _WindowVerdict(verdict, reason + remark, found.last_sample, remark)
 
 
 def _convergence_columns(study: RefinementAnalysis) -> Columns:
