@@ -58,15 +58,15 @@ def judge_states(context: RowContext, truth: StateTruth, evaluation: Evaluation)
         One row per quantity, and per state the worst body (table "states").
 
     """
-    place = evaluation.place
-    if evaluation.unsupported is not None:
-        row = context.make_row(
-            "state", "-", "all", Verdict.UNSUPPORTED, evaluation.unsupported, gap=evaluation.gap, place=place
-        )
-        return JudgingResult([row])
-    if evaluation.failure is not None:
-        row = context.make_row("state", "-", "all", Verdict.FAILED, evaluation.failure, place=place)
-        return JudgingResult([row])
+    for verdict, reason in (
+        (Verdict.UNSUPPORTED, evaluation.unsupported),
+        (Verdict.FAILED, evaluation.failure),
+    ):
+        if reason is not None:
+            gap, place = evaluation.gap, evaluation.place
+            return JudgingResult(
+                [context.make_row("state", "-", "all", verdict, reason, gap=gap, place=place)]
+            )
     result = JudgingResult(fingerprints=state_fingerprints(evaluation.quantities))
     for quantity, unit in STATE_UNITS.items():
         if all(getattr(true, quantity) is None for true in truth.quantities):
@@ -138,15 +138,68 @@ def judge_variants(context: RowContext, truth: StateTruth, evaluation: Evaluatio
 def _judge_quantity(
     context: RowContext, quantity: str, truth: StateTruth, evaluation: Evaluation
 ) -> tuple[Row, Columns, Deviation]:
-    """The row of one quantity, per state the worst body, and the deviations."""
-    deviation = _deviation(quantity, truth, evaluation)
+    """The row of one quantity, per state the worst body, and the deviations.
+
+    A disagreement in any state decides. A state does not count as compared where the bound of its worst body
+    is too loose to detect an error, or any bound is not a number; of fewer than half of the states no
+    agreement follows. The reason counts the bodies with a loose bound in any case.
+    """
+    deviation, unit = _deviation(quantity, truth, evaluation), STATE_UNITS[quantity]
     worst, looseness = _worst_error_per_state(quantity, truth, deviation)
-    unit = STATE_UNITS[quantity]
-    row = _quantity_row(context, quantity, unit, worst, looseness, truth.method, evaluation.cpu_time)
-    if limit_error := float(np.max(_limit_errors(quantity, evaluation))):
-        share = f"; of it up to {with_unit(limit_error, unit)} is the uncertainty of the engine's limit"
-        extra = row.extra | {"limit_error": limit_error}
-        row = replace(row, derivation=row.derivation + share, extra=extra)
+    error, bound, scale = worst["error"], worst["bound"], worst["scale"]
+    known, has_scale = np.isfinite(bound), scale > 0
+    ratios = np.where(known, error / np.maximum(bound, TINY), 0.0)
+    at, ratio, count = int(np.argmax(ratios)), float(np.max(ratios)), len(ratios)
+    own = looseness[worst["state"], worst["body"]]
+    sharp = (own <= MAX_RELATIVE_BOUND) & np.all(np.isfinite(looseness), axis=1)
+    compared, loosest = int(np.sum(sharp)), float(np.max(looseness))
+    loose_count = int(np.sum(looseness > MAX_RELATIVE_BOUND))
+    relative = float(np.max(error[has_scale] / scale[has_scale], initial=0.0))
+    state, body = int(worst["state"][at]), int(worst["body"][at]) + 1
+    name, where = quantity.replace("_", " "), f"state {state}, body {body}"
+    loose = (
+        f"the rounding bound is up to {loosest:.1g} of the quantity's scale (limit {MAX_RELATIVE_BOUND:g}) "
+        f"at {count - compared} of {count} states and in {loose_count} of {looseness.size} comparisons, too "
+        "loose to detect an error"
+    )
+    limit_error = float(np.max(_limit_errors(quantity, evaluation)))
+    share = f"; of it up to {with_unit(limit_error, unit)} is the uncertainty of the engine's limit"
+    if ratio > 1:
+        verdict = Verdict.DISAGREES
+        reason = (
+            f"the {name} of {context.title} is off by {with_unit(error[at], unit, 3)} at {where}, "
+            f"{ratio:.3g} times the rounding bound; {int(np.sum(ratios > 1))} of {count} states disagree"
+        )
+    elif compared and 2 * compared >= count:
+        verdict = Verdict.AGREES
+        reason = f"{name} within {ratio:.2g} of the rounding bound at {compared} states"
+        reason += f"; {loose}" if loose_count else ""
+    else:
+        verdict, reason = Verdict.UNRESOLVED, f"inconclusive: {loose}"
+    row = context.make_row(
+        "state",
+        "-",
+        quantity,
+        verdict,
+        reason,
+        unit,
+        value=float(error[at]),
+        tolerance=float(bound[at]),
+        ratio=ratio,
+        derivation=f"first-order rounding bound per body and state, {with_unit(bound[at], unit)} at {where}, "
+        f"and at most {loosest:.1g} of the scale at {count} states, {MAX_RELATIVE_BOUND:g} at {compared} of "
+        f"them; truth: {truth.method}" + share * bool(limit_error),
+        cpu_time=evaluation.cpu_time,
+        extra={
+            "relative": relative,
+            "states": float(count),
+            "compared_states": float(compared),
+            "bound_relative": loosest,
+            "state": float(state),
+            "body": float(body),
+        }
+        | ({"limit_error": limit_error} if limit_error else {}),
+    )
     return row, worst, deviation
 
 
@@ -199,71 +252,3 @@ def _worst_error_per_state(quantity: str, truth: StateTruth, deviation: Deviatio
     looseness = np.where(known, relative, np.inf)
     worst = {"state": state, "body": body, "error": error[at], "bound": bound[at], "scale": scale[at]}
     return worst, looseness
-
-
-def _quantity_row(
-    context: RowContext,
-    quantity: str,
-    unit: str,
-    worst: Columns,
-    looseness: Array,
-    method: str,
-    cpu_time: float,
-) -> Row:
-    """The row of one quantity.
-
-    A disagreement in any state decides. A state does not count as compared where the bound of its worst body
-    is too loose to detect an error, or any bound is not a number; of fewer than half of the states no
-    agreement follows. The reason counts the bodies with a loose bound in any case.
-    """
-    error, bound, scale = worst["error"], worst["bound"], worst["scale"]
-    known, has_scale = np.isfinite(bound), scale > 0
-    ratios = np.where(known, error / np.maximum(bound, TINY), 0.0)
-    at, ratio, count = int(np.argmax(ratios)), float(np.max(ratios)), len(ratios)
-    own = looseness[worst["state"], worst["body"]]
-    sharp = (own <= MAX_RELATIVE_BOUND) & np.all(np.isfinite(looseness), axis=1)
-    compared, loosest = int(np.sum(sharp)), float(np.max(looseness))
-    loose_count = int(np.sum(looseness > MAX_RELATIVE_BOUND))
-    relative = float(np.max(error[has_scale] / scale[has_scale], initial=0.0))
-    state, body = int(worst["state"][at]), int(worst["body"][at]) + 1
-    name, where = quantity.replace("_", " "), f"state {state}, body {body}"
-    loose = (
-        f"the rounding bound is up to {loosest:.1g} of the quantity's scale (limit {MAX_RELATIVE_BOUND:g}) "
-        f"at {count - compared} of {count} states and in {loose_count} of {looseness.size} comparisons, too "
-        "loose to detect an error"
-    )
-    if ratio > 1:
-        verdict = Verdict.DISAGREES
-        reason = (
-            f"the {name} of {context.title} is off by {with_unit(error[at], unit, 3)} at {where}, "
-            f"{ratio:.3g} times the rounding bound; {int(np.sum(ratios > 1))} of {count} states disagree"
-        )
-    elif compared and 2 * compared >= count:
-        verdict = Verdict.AGREES
-        reason = f"{name} within {ratio:.2g} of the rounding bound at {compared} states"
-        reason += f"; {loose}" if loose_count else ""
-    else:
-        verdict, reason = Verdict.UNRESOLVED, f"inconclusive: {loose}"
-    return context.make_row(
-        "state",
-        "-",
-        quantity,
-        verdict,
-        reason,
-        unit,
-        value=float(error[at]),
-        tolerance=float(bound[at]),
-        ratio=ratio,
-        derivation=f"first-order rounding bound per body and state, {with_unit(bound[at], unit)} at {where}, "
-        f"and at most {loosest:.1g} of the scale at {count} states, {MAX_RELATIVE_BOUND:g} at {compared} of "
-        f"them; truth: {method}",
-        cpu_time=cpu_time,
-        extra={
-            "relative": relative,
-            "states": float(count),
-            "compared_states": float(compared),
-            "bound_relative": loosest,
-            "state": float(state),
-            "body": float(body),
-        },
-    )
