@@ -9,6 +9,7 @@ import time
 from bisect import bisect_left
 from collections import Counter
 from functools import cache
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
@@ -17,6 +18,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from plumbline.judging.rows import SHOWN_STYLES
+from plumbline.model.grouping import grouped
 from plumbline.storage.results_store import write_atomically
 from reports import coverage_table, reference_tables, report_data
 from reports.chunks import encode_texts
@@ -154,9 +156,7 @@ def _row_link(row: Record) -> str:
 
 def _matrix_by_family(results: Results) -> dict[str, Any]:
     """Arrange the matrix by family: for each scenario and engine the row that stands for the cell."""
-    cells: dict[tuple[str, str], list[Record]] = {}
-    for row in results.rows:
-        cells.setdefault((row["scenario"], row["engine"]), []).append(row)
+    cells = grouped(results.rows, itemgetter("scenario", "engine"))
     families: dict[str, Any] = {}
     for place, (name, scenario) in enumerate(results.scenarios.items()):
         line = {}

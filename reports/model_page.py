@@ -8,8 +8,10 @@ from __future__ import annotations
 import json
 import xml.etree.ElementTree as ET
 from collections import Counter
+from operator import itemgetter
 from pathlib import Path
 
+from plumbline.model.grouping import grouped
 from plumbline.storage.results_store import write_atomically
 from reports import html_report, junit, robot_drawing
 from reports.sarif import sarif
@@ -48,9 +50,7 @@ def render(document: Record) -> str:
     """
     files = []
     for file in document["files"]:
-        engines: dict[str, list[Record]] = {}
-        for row in file["rows"]:
-            engines.setdefault(row["engine"], []).append(row)
+        engines = grouped(file["rows"], itemgetter("engine"))
         files.append(
             {
                 **file,

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import re
-from collections import Counter
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 from plumbline.judging.rows import SHOWN_STYLES
+from plumbline.model.grouping import grouped
 from plumbline.storage.results_store import write_atomically
 from reports.stored_results import Record, Results
-from reports.verdicts import count_all_verdicts, format_number, shown_verdict
+from reports.verdicts import count_all_verdicts, count_verdicts, format_number, shown_verdict
 
 MAX_SUMMARY_BYTES = 1_000_000  # bytes; GitHub drops a step's summary above 1 MiB = 1,048,576 bytes
 _MARKDOWN_SPECIAL = re.compile(r"[^0-9A-Za-z .,;:()/+%=\u0080-\uffff-]")
@@ -91,9 +92,7 @@ def render(results: Results) -> str:
 
 def _verdict_table(results: Results) -> list[str]:
     """Counts of each verdict by family and engine; the first hundred families where there are more."""
-    cells: dict[tuple[str, str], Counter[str]] = {}
-    for row in results.rows:
-        cells.setdefault((row["family"], row["engine"]), Counter())[shown_verdict(row)] += 1
+    cells = grouped(results.rows, itemgetter("family", "engine"))
     families = list(dict.fromkeys(row["family"] for row in results.rows))
     heads = [
         f"{escape_markdown(e['title'])} {escape_markdown(e['version'] or '')}"
@@ -103,7 +102,7 @@ def _verdict_table(results: Results) -> list[str]:
     for family in families[:100]:
         texts = []
         for engine in results.engines:
-            counts = cells.get((family, engine), Counter())
+            counts = count_verdicts(cells.get((family, engine), ()))
             texts.append(
                 " ".join(f"{s.glyph}&nbsp;{counts[v]}" for v, s in SHOWN_STYLES.items() if counts[v])
             )

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from plumbline.model.datatypes import Indices, Int
+from plumbline.model.grouping import grouped
 from plumbline.storage.results_store import read_results, read_table
 from plumbline.storage.schema_upgrade import findings_of_records
 from plumbline.storage.script_index import read_script_index, scripts_folder
@@ -184,8 +185,6 @@ def group_rows(columns: Columns, *by: str) -> Iterator[tuple[tuple[str, ...], In
     """
     if not columns:
         return
-    found: dict[tuple[str, ...], list[int]] = {}
-    for index, key in enumerate(zip(*(columns[name].tolist() for name in by), strict=True)):
-        found.setdefault(key, []).append(index)
-    for key, indices in found.items():
+    keys = list(zip(*(columns[name].tolist() for name in by), strict=True))
+    for key, indices in grouped(range(len(keys)), keys.__getitem__).items():
         yield key, np.array(indices)

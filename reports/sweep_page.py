@@ -8,12 +8,14 @@ from bisect import bisect_right
 from collections import Counter
 from collections.abc import Sequence
 from itertools import pairwise
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow.parquet as pq
 
+from plumbline.model.grouping import grouped
 from plumbline.storage.results_store import write_atomically
 from reports import html_report
 from reports.stored_results import Record, replace_unprintable
@@ -77,9 +79,6 @@ def render(parameters: Sequence[str], rows: Sequence[Record], sweep_info: Record
     varied = [name for name in parameters if len({row[name] for row in rows}) > 1] or list(parameters)
     across = make_axis(varied[0], rows)
     down = make_axis(varied[1], rows) if len(varied) > 1 else None
-    implementations: dict[str, list[Record]] = {}
-    for row in rows:
-        implementations.setdefault(row["implementation"], []).append(row)
     maps = [
         {
             "name": name,
@@ -88,7 +87,7 @@ def render(parameters: Sequence[str], rows: Sequence[Record], sweep_info: Record
             "counts": count_verdicts(theirs),
             **map_cells(theirs, column, across, down),
         }
-        for name, theirs in implementations.items()
+        for name, theirs in grouped(rows, itemgetter("implementation")).items()
         for column, title in MAP_COLUMNS[name == "reference"]
     ]
     poor = [row for row in rows if row["verdict"] not in ("agrees", "not installed")]
@@ -133,14 +132,14 @@ def map_cells(rows: Sequence[Record], column: str, across: Axis, down: Axis | No
         step of the value's logarithm. ``low`` and ``high``: smallest and largest positive value, or None.
 
     """
-    held: dict[tuple[int, int], list[Record]] = {}
-    for row in rows:
-        place = down.index_of(row[down.name]) if down else 0, across.index_of(row[across.name])
-        held.setdefault(place, []).append(row)
+
+    def place_of(row: Record) -> tuple[int, int]:
+        return down.index_of(row[down.name]) if down else 0, across.index_of(row[across.name])
 
     def size(row: Record) -> float:
         return -math.inf if row[column] is None or math.isnan(row[column]) else float(row[column])
 
+    held = grouped(rows, place_of)
     largest = {place: max(map(size, theirs)) for place, theirs in held.items()}
     logs = {place: math.log10(value) for place, value in largest.items() if 0 < value < math.inf}
     low, high = min(logs.values(), default=0.0), max(logs.values(), default=0.0)

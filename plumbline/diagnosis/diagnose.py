@@ -49,6 +49,7 @@ from plumbline.diagnosis.terms import Terms, force_places, is_spanned
 from plumbline.engines.registry import load_adapter
 from plumbline.equations.tree import SUMS
 from plumbline.model.datatypes import Array, Model, StateQuantities
+from plumbline.model.grouping import grouped
 from plumbline.model.kinematics import complete_state
 from plumbline.truth.ground_truth import StateTruth
 
@@ -398,9 +399,7 @@ class _Diagnosing:
             if cause.kind != "unexplained" or cause.change:
                 found.append(cause)
                 continue
-            groups: dict[tuple[str, ...], list[str]] = {}
             needs = find_needs(self.model, states, cause.quantities, self.evaluate)
-            for quantity in cause.quantities:
-                groups.setdefault(needs[quantity], []).append(quantity)
-            found += [replace(self._unexplained(some), needs=needs) for needs, some in groups.items()]
+            groups = grouped(cause.quantities, needs.__getitem__)
+            found += [replace(self._unexplained(some), needs=lacking) for lacking, some in groups.items()]
         return found

@@ -23,6 +23,7 @@ from packaging.version import InvalidVersion, Version
 from plumbline.diagnosis.cause import Cause, Condition, Occurrence, describe, join_words
 from plumbline.judging.rows import PLACE, VERDICT_STYLES, WRONG_CALL, Row, Verdict
 from plumbline.judging.state_level import STATE_UNITS
+from plumbline.model.grouping import grouped
 
 CLASSES = {  # of quantities, in the order in which one follows from another
     "accelerations": ("acceleration", "angular_acceleration"),
@@ -152,10 +153,9 @@ def find_findings(rows: Iterable[Row], bodies: Mapping[str, int]) -> list[Findin
             groups.add(_plain_identity(row), row)
     disputed = [row for row in wrong if row.known_issue is None and row.verdict == Verdict.DISAGREES]
     groups.add_causes([row for row in disputed if row.level != "model"])
-    right: dict[tuple[str, ...], list[str]] = {}
-    for row in every:
-        if row.verdict == Verdict.AGREES and "@" in row.engine:
-            right.setdefault(_cell_of_any_version(row), []).append(row.engine_version)
+    right = grouped(
+        (row for row in every if row.verdict == Verdict.AGREES and "@" in row.engine), _cell_of_any_version
+    )
     found = [group.finding(bodies, right) for group in groups.every()]
     found.sort(key=lambda f: (f.known_issue is not None, -VERDICT_STYLES[f.verdict].severity,
                               -(f.largest_ratio or 0.0), f.name))  # fmt: skip
@@ -191,7 +191,7 @@ class _Group:
     rows: dict[str, Row] = field(default_factory=dict)  # by key
     causes: dict[str, Cause] = field(default_factory=dict)  # by key of the row
 
-    def finding(self, bodies: Mapping[str, int], right: Mapping[tuple[str, ...], list[str]]) -> Finding:
+    def finding(self, bodies: Mapping[str, int], right: Mapping[tuple[str, ...], list[Row]]) -> Finding:
         """Make the finding."""
 
         def order_of(row: Row) -> tuple[Any, ...]:
@@ -200,7 +200,8 @@ class _Group:
 
         order = sorted(self.rows.values(), key=order_of)
         first, shown = order[0], {row.engine_version for row in order}
-        versions = {v for row in order for v in right.get(_cell_of_any_version(row), ())} - shown
+        agreeing = (one for row in order for one in right.get(_cell_of_any_version(row), ()))
+        versions = {one.engine_version for one in agreeing} - shown
         cause = self.causes.get(first.key)
         if cause is not None:
             cause = _candidate(cause, self.identities)

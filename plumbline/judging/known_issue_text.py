@@ -10,6 +10,7 @@ from typing import Any
 from plumbline.judging.findings import CLASSES, Finding
 from plumbline.judging.known_issues import DIAGNOSED_LEVELS, FOLLOWING_LEVELS
 from plumbline.judging.rows import Row, Verdict
+from plumbline.model.grouping import grouped
 
 MATCHED_BY_CAUSE = (*DIAGNOSED_LEVELS, *FOLLOWING_LEVELS)
 MARGIN = 3.0  # of the largest error seen: what a new entry covers
@@ -41,9 +42,7 @@ def entry_of(finding: Finding) -> Entry:
     elif finding.verdict == Verdict.DISAGREES:
         entry["mechanism"] = "equations"
     entry |= {"evidence": "…", "reason": "…"}
-    groups: dict[tuple[str, str, str], list[Row]] = {}
-    for row in finding.rows:
-        groups.setdefault((row.level, row.integrator, row.verdict), []).append(row)
+    groups = grouped(finding.rows, lambda row: (row.level, row.integrator, row.verdict))
     entry["rows"] = [
         _selection(rows, *names, is_about_scenarios=not (has_cause and names[0] in MATCHED_BY_CAUSE))
         for names, rows in groups.items()
@@ -75,12 +74,13 @@ def _one_or_list(names: Iterator[str]) -> str | list[str]:
 
 def merge_entries(entries: Sequence[Entry]) -> list[Entry]:
     """Merge the entries of one engine that have one reason: an entry each, with the rows that it covers."""
-    groups: dict[str, list[Entry]] = {}
-    for entry in entries:
-        common = {name: entry.get(name) for name in ("engine", "versions", "since", "mechanism", "reason")}
-        own = entry["id"] if "rows" in entry else ""
-        groups.setdefault(json.dumps([common, own], sort_keys=True), []).append(entry)
-    return [some[0] if len(some) == 1 else _merged(some) for some in groups.values()]
+
+    def common(entry: Entry) -> tuple[Any, ...]:
+        names = "engine", "versions", "since", "mechanism", "reason"
+        return (*map(entry.get, names), entry["id"] if "rows" in entry else "")
+
+    groups = grouped(entries, common).values()
+    return [some[0] if len(some) == 1 else _merged(some) for some in groups]
 
 
 def _merged(entries: Sequence[Entry]) -> Entry:

@@ -10,8 +10,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 
+from plumbline.diagnosis.cause import join_words
 from plumbline.judging.rows import Deviation, Level, Row, Verdict
 from plumbline.judging.state_level import STATE_UNITS, VARIANT_QUANTITIES
+from plumbline.model.grouping import grouped
 from plumbline.model.invariants import INVARIANT_UNITS, LIMITS, LONG_RUN_QUANTITIES
 
 # What is compared with the truth; steps are with each method's formula, relations with the engine itself.
@@ -93,7 +95,7 @@ def _truth_of(row: Row) -> tuple[str, str]:
 
 
 def _describe_doubt(rows: Sequence[Row], are_alike: bool) -> str:
-    names = _join_words(list(dict.fromkeys(row.engine for row in rows)))
+    names = join_words(list(dict.fromkeys(row.engine for row in rows)))
     ratios = [row.ratio or 0.0 for row in rows]
     alike = ", and agree with each other" if are_alike else ""
     return (
@@ -132,28 +134,25 @@ def describe_outliers(rows: Sequence[Row], is_certified: bool) -> str:
         The end of a sentence; "" where nothing disagrees.
 
     """
-    wrong: dict[str, list[str]] = {}
-    for row in filter(_is_state_disagreement, rows):
-        wrong.setdefault(row.engine, []).append(row.quantity.replace("_", " "))
+    wrong = grouped(filter(_is_state_disagreement, rows), lambda row: row.engine)
     if not wrong:
         return ""
-    disputed = {row.quantity for row in rows if _is_state_disagreement(row)}
+    disputed = {row.quantity for some in wrong.values() for row in some}
     right = [row for row in rows if row.level == "state" and row.verdict == Verdict.AGREES]
     agree = list(dict.fromkeys(r.engine for r in right if r.quantity in disputed and r.engine not in wrong))
     truth = "the certified truth" if is_certified else "the reference, which is the truth here"
-    outliers = "; ".join(f"{engine} in {_join_words(quantities)}" for engine, quantities in wrong.items())
+    outliers = "; ".join(
+        f"{engine} in {join_words([row.quantity.replace('_', ' ') for row in some])}"
+        for engine, some in wrong.items()
+    )
     if not set(agree) - (set() if is_certified else {"reference"}):
         doubt = "" if is_certified else ", and the truth is not certified: it may itself be wrong"
         return f"{outliers}: no other engine agrees with {truth}{doubt}"
     noun, verb, each = ("outliers" if len(wrong) > 1 else "outlier"), "agrees", ""
     if len(agree) > 1:
         verb, each = "agree", " and, within the sum of their bounds, with each other"
-    return f"{noun}: {outliers}; {_join_words(agree)} {verb} with {truth}{each}"
+    return f"{noun}: {outliers}; {join_words(agree)} {verb} with {truth}{each}"
 
 
 def _is_state_disagreement(row: Row) -> bool:
     return row.level == "state" and row.verdict == Verdict.DISAGREES
-
-
-def _join_words(words: Sequence[str]) -> str:
-    return " and ".join(filter(None, (", ".join(words[:-1]), words[-1])))

@@ -19,6 +19,7 @@ import numpy as np
 from plumbline.importers.lumping import fixed_parts, lump_fixed_bodies, merge_bodies
 from plumbline.importers.neutral_model import CanonicalState, ModelQuantities, NeutralBody, NeutralModel
 from plumbline.model.datatypes import Array
+from plumbline.model.grouping import grouped
 from plumbline.model.kinematics import rotation_matrix
 from plumbline.model_files.certified_model import CertifiedModelQuantities, pose_tolerances, rough_quantities
 from plumbline.model_files.model_comparison import (
@@ -46,7 +47,6 @@ from plumbline.model_files.parameter_changes import (
     differences,
     differs,
     energy_omissions,
-    grouped,
     joint_kinds,
     omissions,
 )

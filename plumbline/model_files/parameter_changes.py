@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
 from plumbline.importers.neutral_model import ElementaryJoint, NeutralBody, NeutralModel, Source
 from plumbline.model.datatypes import Array
+from plumbline.model.grouping import grouped
 from plumbline.model.kinematics import rotation_matrix
 
 RELATIVE_CHANGE = 1e-11  # differences of descriptions below this are rounding
@@ -38,16 +39,6 @@ FIELD_WORDS = {
     "attitude": "attitude in its parent", "reference": "reference coordinate", "joints": "joints",
 }  # fmt: skip
 SHOWN_NAMES, SHOWN_PLACES = 4, 6  # of several
-Item = TypeVar("Item")
-Key = TypeVar("Key", bound=Hashable)
-
-
-def grouped(items: Sequence[Item], key: Callable[[Item], Key]) -> dict[Key, list[Item]]:
-    """Group items by a key, in the order of their first occurrence."""
-    groups: dict[Key, list[Item]] = {}
-    for item in items:
-        groups.setdefault(key(item), []).append(item)
-    return groups
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,7 @@ import pyarrow as pa
 from plumbline.judging.rows import Level, Row
 from plumbline.judging.smallest_detectable_mistake import COVERED_LEVELS, CoverageEntry, scenario_coverage
 from plumbline.model.datatypes import BALL, JOINT_ELEMENTS, ROD
+from plumbline.model.grouping import grouped
 from plumbline.model.sampling import compared_states
 from plumbline.processes.cpu_time import CpuTimes
 from plumbline.processes.exceptions import PlumblineError
@@ -56,14 +57,11 @@ def measure_coverage(
         CoverageFailure: a call failed.
 
     """
-    by_scenario: dict[str, list[Row]] = {s.name: [] for s in scenarios}
-    for row in rows:
-        if row.scenario in by_scenario:
-            by_scenario[row.scenario].append(row)
+    by_scenario = grouped(rows, lambda row: row.scenario)
     tasks = []
     for s in sorted(scenarios, key=lambda s: -s.model.n):  # no long task alone at the end
         states = compared_states(s.model, s.state, s.seed, state_count)
-        arguments = s.name, s.model, s.state, s.times, states, by_scenario[s.name], levels
+        arguments = s.name, s.model, s.state, s.times, states, by_scenario.get(s.name, []), levels
         for first in range(0, len(list_parameters(s.model, s.state)), PARAMETERS_PER_TASK):
             part = slice(first, first + PARAMETERS_PER_TASK)
             tasks.append(Task((s.name, first), scenario_coverage, (*arguments, part), executor.limits))
@@ -137,11 +135,8 @@ def summarize_coverage(entries: Iterable[CoverageEntry]) -> list[CoverageSummary
         The summaries, in the order of first appearance.
 
     """
-    groups: dict[tuple[Level, str], list[CoverageEntry]] = {}
-    for entry in entries:
-        groups.setdefault((entry.level, entry.kind), []).append(entry)
     found = []
-    for (level, kind), members in groups.items():
+    for (level, kind), members in grouped(entries, lambda entry: (entry.level, entry.kind)).items():
         seen = sorted(entry.smallest for entry in members if entry.smallest is not None)
         proven = sum(bool(entry.proof) for entry in members)
         found.append(

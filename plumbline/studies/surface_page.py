@@ -21,7 +21,9 @@ from plumbline.engines.surface import (
     exercised_rows,
 )
 from plumbline.judging.known_issues import recorded_mistakes
+from plumbline.judging.state_level import STATE_UNITS
 from plumbline.layout import ROOT, generated_page
+from plumbline.model.grouping import grouped
 
 _TITLES = {COMPARED: "Compared", NOT_YET: "Not compared yet", OUTSIDE_STATUS: "Outside"}
 _NAMES = {"mujoco": "MuJoCo", "pinocchio": "Pinocchio", "exudyn": "Exudyn"}
@@ -46,9 +48,7 @@ def surface_pages() -> dict[str, str]:
 
 
 def _engine_tables(surface: Surface) -> Iterator[str]:
-    places: dict[str, list[SurfaceName]] = {}
-    for one in surface.names:
-        places.setdefault(one.place, []).append(one)
+    places = grouped(surface.names, lambda one: one.place)
     yield "## Wrong so far\n"
     for wrong in recorded_mistakes():
         if wrong.engine.partition("-")[0] == surface.engine:
@@ -78,9 +78,7 @@ def _engine_tables(surface: Surface) -> Iterator[str]:
 
 def _by_rows(names: Sequence[SurfaceName], rows: Mapping[str, Sequence[str]]) -> Iterator[str]:
     """A table of names, those together that turn the same rows red."""
-    groups: dict[str, list[SurfaceName]] = {}
-    for one in names:
-        groups.setdefault(_shortened(rows[one.name]), []).append(one)
+    groups = grouped(names, lambda one: _shortened(rows[one.name]))
     if groups:
         yield "| exercised names | rows that a change turns red |\n|---|---|"
         for words, own in groups.items():
@@ -89,9 +87,7 @@ def _by_rows(names: Sequence[SurfaceName], rows: Mapping[str, Sequence[str]]) ->
 
 
 def _by_detail(names: Sequence[SurfaceName]) -> Iterator[str]:
-    details: dict[str, list[SurfaceName]] = {}
-    for one in names:
-        details.setdefault(one.detail, []).append(one)
+    details = grouped(names, lambda one: one.detail)
     for detail, own in sorted(details.items()):
         yield f"- {detail}: {_listed(own)}"
     if details:
@@ -103,8 +99,6 @@ def _listed(names: Sequence[SurfaceName]) -> str:
 
 
 # Quantities of the level "state", of variants with an ending: together where they are most of a list.
-_STATE = ("acceleration", "angular_acceleration", "angular_momentum", "joint_moment", "joint_reaction",
-          "kinetic_energy", "mass_matrix", "potential_energy")  # fmt: skip
 _KINDS = {"": "state", "_by_option": "state by option", "_by_spelling": "state by spelling",
           "_by_vectors": "state by vectors"}  # fmt: skip
 
@@ -113,8 +107,8 @@ def _shortened(rows: Sequence[str]) -> str:
     """The rows in words: families of the level "state" by one word each."""
     found, left = list[str](), list(rows)
     for ending, word in _KINDS.items():
-        family = [row for row in left if row.removesuffix(ending) in _STATE and row.endswith(ending)]
-        if len(family) > len(_STATE) // 2:
+        family = [row for row in left if row.removesuffix(ending) in STATE_UNITS and row.endswith(ending)]
+        if len(family) > len(STATE_UNITS) // 2:
             found.append(word)
             left = [row for row in left if row not in family]
     return ", ".join(found + left)

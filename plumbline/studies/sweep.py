@@ -6,7 +6,6 @@ the same horizon (`plumbline.judging.trajectory_level`).
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import product
 from typing import Any
@@ -20,6 +19,7 @@ from plumbline.judging.rows import Row, RowContext, Verdict
 from plumbline.judging.trajectory_level import judge_trajectory
 from plumbline.measurements.order_and_limit import refinement_resolutions
 from plumbline.model.datatypes import Integrator, Trajectory
+from plumbline.model.grouping import grouped
 from plumbline.model.invariants import compute_invariants, position_error
 from plumbline.processes.worker_pool import Outcome, Task, WorkerPool
 from plumbline.scenario.loader import Scenario
@@ -113,10 +113,8 @@ class _Progress:
 
 def _batches(valid: Mapping[int, Scenario]) -> list[list[int]]:
     """Indices of cells that have the same duration and sample interval, in batches of limited size."""
-    groups: dict[tuple[float, float], list[int]] = defaultdict(list)
-    for index, scenario in valid.items():
-        groups[scenario.duration, scenario.sample_interval].append(index)
-    return [group[k : k + BATCH_SIZE] for group in groups.values() for k in range(0, len(group), BATCH_SIZE)]
+    groups = grouped(valid, lambda index: (valid[index].duration, valid[index].sample_interval)).values()
+    return [group[k : k + BATCH_SIZE] for group in groups for k in range(0, len(group), BATCH_SIZE)]
 
 
 def _reference_record(index: int, verdict: Verdict, reason: str) -> Record:
