@@ -167,22 +167,17 @@ def scenario_coverage(
             engine: _sharpest([by_quantity[q] for q in STATE_UNITS if q in names])
             for engine, names in (offered or {"": set(STATE_UNITS)}).items()
         }
-        found += _entries(
-            name,
-            "state",
-            model,
-            parameters,
-            by_engine,
-            _proofs(model, states, parameters, by_engine, "state")
-            | ({} if is_initial_compared else _uncompared_initial_state(parameters)),
-        )
+        proofs = _proofs(model, states, parameters, by_engine, "state")
+        if not is_initial_compared:
+            why = "the initial pose is singular, and no engine is compared at it"
+            proofs |= {i: why for i, one in enumerate(parameters) if one.kind in STATE_KINDS}
+        found += _entries(name, "state", model, parameters, by_engine, proofs)
     if "step" in levels and not model.has_loops and model.n <= MAX_STEP_BODIES:
         some = states[:STEP_STATES]
         of_run = run_ratios(STEP_METHOD, model, state, parameters)
         by_engine = {"": _sharpest([_step_ratios(model, some, parameters), of_run])}
-        found += _entries(
-            name, "step", model, parameters, by_engine, _proofs(model, some, parameters, by_engine, "step")
-        )
+        proofs = _proofs(model, some, parameters, by_engine, "step")
+        found += _entries(name, "step", model, parameters, by_engine, proofs)
     # with a mistake, an overconstrained loop locks: it has no motion to compare
     motion_levels = [x for x in ("trajectory", "invariants") if x in levels and not model.has_loops]
     of_runs = [row for row in judged if row.level in motion_levels and row.compared_until is not None]
@@ -228,31 +223,23 @@ def _state_ratios(
     model: Model, states: Sequence[State], parameters: Sequence[Parameter], is_initial_first: bool
 ) -> dict[str, _Ratios]:
     """Effects over rounding bounds at all states, by quantity; mistakes in the initial state at the first."""
-    of_model = [i for i, one in enumerate(parameters) if one.kind not in STATE_KINDS]
-    of_state = [i for i, one in enumerate(parameters) if one.kind in STATE_KINDS]
-    ratios = {quantity: _Ratios(len(parameters)) for quantity in STATE_UNITS}
-    effects_of_model = effects_at_states(model, states, [parameters[i] for i in of_model])
-    of_initial = effects_at_states(model, states[:1], [parameters[i] for i in of_state])
-    for number, state in enumerate(states):
-        bounds = remembered_rounding_bound(model, state)
-        found = [(of_model, effects_of_model[number])]
-        if number == 0 and is_initial_first:
-            found.append((of_state, of_initial[0]))
-        for indices, effects in found:
-            for quantity, effect in effects.items():
-                bound = np.maximum(bounds.tolerance(quantity), TINY)
-                with np.errstate(over="ignore"):  # a bound of zero, as that of the energy at rest
-                    worst = np.max(effect / bound, axis=1)
-                for i, value in zip(indices, worst, strict=True):
-                    ratios[quantity].add(i, value * parameters[i].scale, quantity)
-    _add_squares(model, states, parameters, of_model, ratios)
+    kinds = [one.kind in STATE_KINDS for one in parameters]
+    cases = [(np.flatnonzero(np.logical_not(kinds)), states)]
     if is_initial_first:
-        _add_squares(model, states[:1], parameters, of_state, ratios)
+        cases.append((np.flatnonzero(kinds), states[:1]))
+    ratios = {quantity: _Ratios(len(parameters)) for quantity in STATE_UNITS}
+    for indices, some in cases:
+        effects = effects_at_states(model, some, [parameters[i] for i in indices])
+        for found in _effects_in_sizes(model, some, effects, "state"):
+            for quantity, effect in found.items():
+                for i, value in zip(indices, effect, strict=True):
+                    ratios[quantity].add(i, value * parameters[i].scale, quantity)
+        _add_squares(model, some, parameters, indices, ratios)
     return ratios
 
 
 def _add_squares(
-    model: Model, states: Sequence[State], parameters: Sequence[Parameter], indices: Sequence[int],
+    model: Model, states: Sequence[State], parameters: Sequence[Parameter], indices: Iterable[int],
     ratios: Mapping[str, _Ratios],
 ) -> None:  # fmt: skip
     """Add the effects that grow with the square of a mistake, where that of first order is not seen."""
@@ -260,17 +247,16 @@ def _add_squares(
     some = [parameters[i] for i in unseen]
     if not some:
         return
-    sizes = [_natural_sizes(model, state, "state") for state in states]
-    scale, worst = np.array([one.scale for one in some]), dict[str, list[Array]]()
-    for mistake in (MAX_MISTAKE, MAX_MISTAKE / 3):
+    scale = np.array([one.scale for one in some])
+
+    def worst(mistake: float) -> dict[str, Array]:
         effects = difference_effects(model, states, some, mistake)
-        for name in sizes[0].keys() & effects[0].keys():
-            parts = [
-                np.max(effect[name] / own[name], axis=1) for effect, own in zip(effects, sizes, strict=True)
-            ]
-            worst.setdefault(name, []).append(np.max(parts, axis=0) * scale * mistake)
-    for name, (large, small) in worst.items():
-        is_square = (large > 1) & (large > LARGER_MISTAKE * small)
+        found = _effects_in_sizes(model, states, effects, "state")
+        return {name: np.max([one[name] for one in found], axis=0) * scale * mistake for name in found[0]}
+
+    small = worst(MAX_MISTAKE / 3)
+    for name, large in worst(MAX_MISTAKE).items():
+        is_square = (large > 1) & (large > LARGER_MISTAKE * small[name])
         for k in np.flatnonzero(is_square):
             ratios[name].add(unseen[k], float(np.sqrt(large[k])) / MAX_MISTAKE, name)
 
@@ -594,12 +580,6 @@ def _proofs(
     return found | _vanishing(model, states, parameters, blunt & ~of_state, level)
 
 
-def _uncompared_initial_state(parameters: Sequence[Parameter]) -> dict[int, str]:
-    """The parameters of an initial state at which nothing is compared."""
-    why = "the initial pose is singular, and no engine is compared at it"
-    return {i: why for i, one in enumerate(parameters) if one.kind in STATE_KINDS}
-
-
 def _vanishing(
     model: Model, states: Sequence[State], parameters: Sequence[Parameter], doubtful: NDArray[np.bool_],
     level: Level,
@@ -609,33 +589,42 @@ def _vanishing(
     At state level no compared quantity changes by its bound, along a motion no acceleration by `NO_EFFECT`.
     Changes at smaller mistakes count in proportion.
     """
-    sizes = [_natural_sizes(model, state, level) for state in states]
     what = "quantity" if level == "state" else "acceleration"
     left = [int(i) for i in np.flatnonzero(doubtful)]
     for mistake in (MAX_MISTAKE, -MAX_MISTAKE, MAX_MISTAKE / 3, -MAX_MISTAKE / 3):
+        if not left:
+            break
         some = [parameters[i] for i in left]
-        effects = difference_effects(model, states, some, mistake) if left else []
-        largest = np.zeros(len(left))
-        for effect, own in zip(effects, sizes, strict=False):
-            for name in own.keys() & effect.keys():
-                largest = np.maximum(largest, np.max(effect[name] / own[name], axis=1))
+        effects = difference_effects(model, states, some, mistake)
+        found = _effects_in_sizes(model, states, effects, level)
+        largest = np.max([effect for one in found for effect in one.values()], axis=0)
         scale = np.array([one.scale for one in some])
         left = [i for i, ratio in zip(left, largest * scale * MAX_MISTAKE, strict=True) if ratio <= 1]
-    places = {
-        i: "at the initial state"
-        if parameters[i].kind in STATE_KINDS
-        else _PLACES.get(level, "along the whole motion")
+
+    def place(one: Parameter) -> str:
+        at_start = one.kind in STATE_KINDS
+        return "at the initial state" if at_start else _PLACES.get(level, "along the whole motion")
+
+    return {
+        i: f"no {what} {place(parameters[i])} changes with it, at mistakes of up to {MAX_MISTAKE:g}"
         for i in left
     }
-    return {
-        i: f"no {what} {at} changes with it, at mistakes of up to {MAX_MISTAKE:g}" for i, at in places.items()
-    }
 
 
-def _natural_sizes(model: Model, state: State, level: Level) -> dict[str, Array]:
-    """What a change must pass to count, by quantity: bounds, or fractions of the accelerations."""
-    bounds = remembered_rounding_bound(model, state)
-    if level == "state":
-        return {name: np.maximum(bounds.tolerance(name), TINY) for name in STATE_UNITS}
-    names = ["acceleration", "angular_acceleration"]
-    return {name: MAX_MISTAKE * NO_EFFECT * np.max(np.asarray(bounds.scale[name])) for name in names}
+def _effects_in_sizes(
+    model: Model, states: Sequence[State], effects: Sequence[Mapping[str, Array]], level: Level
+) -> list[dict[str, Array]]:
+    """Of each state by quantity the largest effect (P,) on any body, over what a change must pass to count.
+
+    At state level that is the bound, at others a fraction of the accelerations.
+    """
+    names, found = ["acceleration", "angular_acceleration"], []
+    for state, effect in zip(states, effects, strict=True):
+        bounds = remembered_rounding_bound(model, state)
+        if level == "state":
+            sizes = {name: np.maximum(bounds.tolerance(name), TINY) for name in STATE_UNITS}
+        else:
+            sizes = {n: MAX_MISTAKE * NO_EFFECT * np.max(np.asarray(bounds.scale[n])) for n in names}
+        with np.errstate(over="ignore"):  # a bound of zero, as that of the energy at rest
+            found.append({n: np.max(effect[n] / size, axis=1) for n, size in sizes.items() if n in effect})
+    return found
