@@ -14,7 +14,7 @@ from itertools import combinations
 
 from plumbline.engines.adapter import EngineInfo
 from plumbline.engines.environments import split_version
-from plumbline.judging.rows import RUN_FAMILY, Fingerprints, Row, Verdict
+from plumbline.judging.rows import RUN_FAMILY, Fingerprints, Row, RowContext, Verdict
 from plumbline.model.datatypes import Array, StateQuantities, Trajectory
 
 MIN_SCENARIOS = 3  # generic scenarios that two columns share before equal bits are an accusation
@@ -133,9 +133,8 @@ class IdentityCheck:
             what = f"every run of {info.title} with {integrator} equals that of {twin} with {one[1]}"
         else:
             what = f"the {quantity.replace('_', ' ')} of {info.title} equals that of {twin}"
-        return Row(
-            RUN_SCENARIO, RUN_FAMILY, engine, info.version, "relations", integrator,
-            f"identity with {' '.join(part for part in one[:2] if part != '-')}", "1", None, None,
+        return RowContext(RUN_SCENARIO, RUN_FAMILY, engine, info.title, info.version).make_row(
+            "relations", integrator, f"identity with {' '.join(part for part in one[:2] if part != '-')}",
             Verdict.DISAGREES,
             f"{what} bit for bit on all {count} generic scenarios, and no alias is declared: it is the same "
             "computation under two names",

@@ -54,26 +54,14 @@ def judge_trajectory(
         The rows, and the tables of convergence, curves over time and poses.
 
     """
+    missing = partial(context.make_row, "trajectory", integrator.name, "all")
     if study.unsupported is not None:
-        return JudgingResult(
-            [
-                context.make_row(
-                    "trajectory",
-                    integrator.name,
-                    "all",
-                    Verdict.UNSUPPORTED,
-                    study.unsupported,
-                    gap=study.gap,
-                    place=study.place,
-                )
-            ]
-        )
+        row = missing(Verdict.UNSUPPORTED, study.unsupported, gap=study.gap, place=study.place)
+        return JudgingResult([row])
     finest = study.runs[-1]
     if finest.trajectory is None:
         reason = f"at the finest resolution {finest.resolution:g}: {finest.failure}"
-        failed = Verdict.FAILED
-        row = context.make_row("trajectory", integrator.name, "all", failed, reason, place=finest.place)
-        return JudgingResult([row])
+        return JudgingResult([missing(Verdict.FAILED, reason, place=finest.place)])
     analysis = RefinementAnalysis(context, model, truth, integrator, study.runs, truth.horizon)
     rows = [*trajectory_rows(analysis), *invariant_rows(analysis)]
     deviations = {

@@ -13,8 +13,9 @@ from __future__ import annotations
 import json
 import sys
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 from plumbline.engines.engine_calls import SURFACE_STATES, Evaluation, StepAttempt, evaluate_states
 from plumbline.engines.registry import load_adapter
@@ -58,26 +59,23 @@ def exercised_names(
 
     """
     found = defaultdict[str, set[str]](set)
+    bare = replace(evaluation, surface={}, variants={})
+
+    def compare(call: Call, judge: Callable[..., list[Row]], *both: dict[str, Any]) -> None:
+        _add_red_rows(found, call, *(judge(_CONTEXT, truth, replace(bare, **changes)) for changes in both))
+
     for quantity, calls in evaluation.surface.items():
         for call, value in calls.items():
-            rows = [
-                judge_surface(_CONTEXT, truth, replace(evaluation, surface={quantity: {call: x}}))
-                for x in (value, value * (1 + CHANGE))
-            ]
-            _add_red_rows(found, call, *rows)
+            both = ({"surface": {quantity: {call: x}}} for x in (value, value * (1 + CHANGE)))
+            compare(call, judge_surface, *both)
     for kind, variants in evaluation.variants.items():
         for call, answers in variants.items():
-            if isinstance(answers, NoAnswer):
-                continue
-            rows = [
-                judge_variants(_CONTEXT, truth, replace(evaluation, variants={kind: {call: x}}))
-                for x in (answers, _changed(answers))
-            ]
-            _add_red_rows(found, call, *rows)
-    bare = replace(evaluation, surface={}, variants={})
+            if not isinstance(answers, NoAnswer):
+                some = ({"variants": {kind: {call: x}}} for x in (answers, _changed(answers)))
+                compare(call, judge_variants, *some)
+    states = [{"quantities": x} for x in (bare.quantities, _changed(bare.quantities))]
     for call in column_names:
-        both = (replace(bare, quantities=x) for x in (bare.quantities, _changed(bare.quantities)))
-        _add_red_rows(found, call, *(judge_states(_CONTEXT, truth, one).rows for one in both))
+        compare(call, lambda *given: judge_states(*given).rows, *states)
     return found
 
 

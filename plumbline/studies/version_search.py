@@ -7,7 +7,7 @@ an environment of its own, which `plumbline.engines.environments` makes once and
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from importlib import metadata
 from typing import Any
 
@@ -55,7 +55,8 @@ class VersionChange:
     def sentence(self) -> str:
         """The result in one sentence."""
         if not self.first_after:
-            return f"{self.engine} {self.oldest} and {self.newest} answer alike: {self.first.text}"
+            alike = self.answers[self.oldest].text
+            return f"{self.engine} {self.oldest} and {self.newest} answer alike: {alike}"
         return (
             f"{self.engine} {self.last_before}: {self.answers[self.last_before].text}; "
             f"since {self.first_after}: {self.answers[self.first_after].text}"
@@ -70,37 +71,6 @@ class VersionChange:
         if {before, after} <= set(Verdict):
             return f"{self.last_before}: {before}; since {self.first_after}: {after}."
         return f"{self.last_before} answers otherwise than {self.first_after}, the next version."
-
-    @property
-    def first(self) -> VersionAnswer:
-        """The answer of the oldest version."""
-        return self.answers[self.oldest]
-
-
-@dataclass
-class _Answers:
-    """Asks versions, each once."""
-
-    ask: Callable[[str], VersionAnswer]
-    on_answer: Callable[[str, str], None]
-    found: dict[str, VersionAnswer] = field(default_factory=dict)
-    skipped: dict[str, str] = field(default_factory=dict)
-
-    def first_usable(self, versions: Sequence[str]) -> str:
-        """The first of the versions that answers; empty where none does."""
-        for version in versions:
-            if version in self.skipped:
-                continue
-            if version not in self.found:
-                try:
-                    self.found[version] = self.ask(version)
-                except VersionUnusable as reason:
-                    self.skipped[version] = str(reason)
-                    self.on_answer(version, f"skipped: {reason}")
-                    continue
-                self.on_answer(version, self.found[version].text)
-            return version
-        return ""
 
 
 def find_change(
@@ -124,24 +94,39 @@ def find_change(
         NoSearch: fewer than two versions give an answer.
 
     """
-    answers = _Answers(ask, on_answer)
-    oldest = answers.first_usable(versions)
-    newest = answers.first_usable([v for v in reversed(versions) if v != oldest])
+    found, skipped = dict[str, VersionAnswer](), dict[str, str]()
+
+    def first_usable(some: Sequence[str]) -> str:
+        """Return the first of some versions that answers; empty where none does. Each is asked once."""
+        for version in some:
+            if version not in found.keys() | skipped.keys():
+                try:
+                    found[version] = ask(version)
+                    on_answer(version, found[version].text)
+                except VersionUnusable as reason:
+                    skipped[version] = str(reason)
+                    on_answer(version, f"skipped: {reason}")
+            if version in found:
+                return version
+        return ""
+
+    oldest = first_usable(versions)
+    newest = first_usable([v for v in reversed(versions) if v != oldest])
     if not newest:
-        reasons = "; ".join(f"{version}: {reason}" for version, reason in answers.skipped.items())
+        reasons = "; ".join(f"{version}: {reason}" for version, reason in skipped.items())
         raise NoSearch(f"fewer than two versions of {engine} can be compared{reasons and ': ' + reasons}")
-    change = VersionChange(engine, oldest, newest, answers.found, answers.skipped)
-    wanted = answers.found[newest].key
-    if answers.found[oldest].key == wanted:
+    change = VersionChange(engine, oldest, newest, found, skipped)
+    wanted = found[newest].key
+    if found[oldest].key == wanted:
         return change
     low, high = versions.index(oldest), versions.index(newest)
     while True:
         middle = (low + high) / 2
         between = sorted(range(low + 1, high), key=lambda k: abs(k - middle))
-        version = answers.first_usable([versions[k] for k in between])
+        version = first_usable([versions[k] for k in between])
         if not version:
             return replace(change, last_before=versions[low], first_after=versions[high])
-        if answers.found[version].key == wanted:
+        if found[version].key == wanted:
             high = versions.index(version)
         else:
             low = versions.index(version)
@@ -195,23 +180,6 @@ def choose_versions(
     return chosen, notes
 
 
-def versioned_name(engine: str, version: str, package: str) -> str:
-    """Name a version of an engine; the installed one needs no environment.
-
-    Args:
-        version: one that the package index has.
-
-    Returns:
-        ``engine`` or ``engine@version``.
-
-    """
-    try:
-        is_installed = metadata.version(package) == version
-    except metadata.PackageNotFoundError:
-        is_installed = False
-    return engine if is_installed else f"{engine}@{version}"
-
-
 def search_versions(
     plan: ModelPlan | Plan, engine: str, good: str, bad: str, on_answer: Callable[[str, str], None],
     row: Mapping[str, Any] | None = None,
@@ -236,11 +204,16 @@ def search_versions(
     package = declared(engine, "package")
     versions, notes = choose_versions(package, declared(engine, "supported_versions") or "", good, bad)
 
+    try:
+        installed = metadata.version(package)
+    except metadata.PackageNotFoundError:
+        installed = ""
+
     def ask(version: str) -> VersionAnswer:
-        name = versioned_name(engine, version, package)
-        return (
-            _ask_reading(plan, name) if isinstance(plan, ModelPlan) else _ask_verdict(plan, name, row or {})
-        )
+        name = engine if version == installed else f"{engine}@{version}"  # the one here needs no environment
+        if isinstance(plan, ModelPlan):
+            return _ask_reading(plan, name)
+        return _ask_verdict(plan, name, row or {})
 
     return find_change(engine, versions, ask, on_answer), notes
 
