@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from operator import itemgetter
 from pathlib import Path
 
+from plumbline.model.grouping import grouped
 from reports.stored_results import Record, study_records
 
 
@@ -19,35 +22,25 @@ def coverage_tables(folder: Path) -> Record | None:
     if not records:
         return None
     levels, kinds = (list(dict.fromkeys(record[name] for record in records)) for name in ("level", "kind"))
-    scenarios: dict[str, dict[tuple[str, str], Record]] = {}
-    total: dict[tuple[str, str], Record] = {}
-    proofs: dict[tuple[str, str, str], dict[str, None]] = {}
-    for record in records:
-        cell = record["level"], record["kind"]
-        _add(scenarios.setdefault(record["scenario"], {}), cell, record["smallest"])
-        _add(total, cell, record["smallest"])
-        if record["proof"]:
-            key = record["level"], record["parameter"], record["proof"]
-            proofs.setdefault(key, {})[record["scenario"]] = None
+    proven = grouped((r for r in records if r["proof"]), itemgetter("level", "parameter", "proof"))
     return {
         "levels": levels,
         "kinds": kinds,
-        "total": total,
-        "scenarios": scenarios,
+        "total": _cells(records),
+        "scenarios": {name: _cells(some) for name, some in grouped(records, itemgetter("scenario")).items()},
         "proofs": [
-            {"level": level, "parameter": parameter, "proof": proof, "scenarios": list(names)}
-            for (level, parameter, proof), names in proofs.items()
+            some[0] | {"scenarios": list(dict.fromkeys(r["scenario"] for r in some))}
+            for some in proven.values()
         ],
         "count": len(records),
     }
 
 
-def _add(cells: dict[tuple[str, str], Record], cell: tuple[str, str], smallest: float | None) -> None:
-    """Count an entry; a smallest mistake that is None is one that is not seen."""
-    found = cells.setdefault(cell, {"least": None, "most": None, "seen": 0, "count": 0})
-    found["count"] += 1
-    if smallest is None:
-        return
-    found["seen"] += 1
-    found["least"] = smallest if found["least"] is None else min(found["least"], smallest)
-    found["most"] = smallest if found["most"] is None else max(found["most"], smallest)
+def _cells(records: Sequence[Record]) -> dict[tuple[str, str], Record]:
+    """Count entries by level and kind; a smallest mistake that is None is one that is not seen."""
+    found = {}
+    for cell, some in grouped(records, itemgetter("level", "kind")).items():
+        seen = [record["smallest"] for record in some if record["smallest"] is not None]
+        least, most = min(seen, default=None), max(seen, default=None)
+        found[cell] = {"least": least, "most": most, "seen": len(seen), "count": len(some)}
+    return found

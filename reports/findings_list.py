@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from operator import itemgetter
 from typing import Any
 
 from plumbline.judging.rows import RUN_FAMILY
 from plumbline.model.datatypes import Model
+from plumbline.model.grouping import grouped
 from reports import robot_drawing
 from reports.earlier_runs import History
 from reports.stored_results import Record, Results
@@ -47,14 +49,12 @@ def findings_for_page(results: Results, history: History) -> list[Record]:
 
 def declared_gaps(results: Results) -> list[Record]:
     """Group what engines declare not to do, by engine and sentence."""
-    gaps: dict[tuple[str, str, str], Record] = {}
-    for row in results.rows:
-        if row["is_declared"]:
-            key = row["engine"], row["known_issue"], row["reason"]
-            gap = gaps.setdefault(key, {"row": row, "count": 0, "scenarios": {}})
-            gap["count"] += 1
-            gap["scenarios"][row["scenario"]] = None
-    return sorted(gaps.values(), key=lambda gap: (gap["row"]["engine"], -gap["count"]))
+    declared = (row for row in results.rows if row["is_declared"])
+    gaps = [
+        {"row": rows[0], "count": len(rows), "scenarios": dict.fromkeys(row["scenario"] for row in rows)}
+        for rows in grouped(declared, itemgetter("engine", "known_issue", "reason")).values()
+    ]
+    return sorted(gaps, key=lambda gap: (gap["row"]["engine"], -gap["count"]))
 
 
 def _drawing(scenario: Record, row: Record) -> Record | None:

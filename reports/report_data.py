@@ -149,8 +149,7 @@ def index_chunk(results: Results, history: History, texts: dict[str, int]) -> st
         rows[name] = packer.add(np.array([place[value] for value in values], dtype=kind))
     rows["severity"] = packer.add(np.array([severity(row) for row in results.rows], dtype=np.uint8))
     rows["fresh"] = packer.add(np.array([history.is_new(row) for row in results.rows], dtype=np.uint8))
-    quotients = [error_ratio(row) for row in results.rows]
-    rows["ratio"] = packer.add(log_scale_codes(np.array([np.nan if q is None else q for q in quotients])))
+    rows["ratio"] = packer.add(log_scale_codes(np.array([error_ratio(row) for row in results.rows], float)))
     header["rows"] = rows
     return packer.encode(header)
 
@@ -322,16 +321,8 @@ def _motion_frames(
     frames = int(np.clip(MAX_MOTION_BYTES * points / 300 / (n * (14 + 6 * len(best))), 24, points))
     pick = np.unique(np.linspace(0, len(t) - 1, min(frames, len(t))).round().astype(int))
     span = float(np.max(np.abs(r0))) or 1.0
-    header: Record = {
-        "t": packer.add(t[pick].astype(np.float32)),
-        "bodies": n,
-        "base": list(base),
-        "span": span,
-        "r": packer.add(_few_levels(r0[pick] / span, 32767, POSE_LEVELS).astype(np.int16)),
-        "p": packer.add(_few_levels(p0[pick], 32767, POSE_LEVELS).astype(np.int16)),
-        "shape": _body_shapes(scenario),
-        "runs": [],
-    }
+    header = _poses(scenario, packer, base, t[pick], r0[pick] / span, p0[pick], POSE_LEVELS)
+    header |= {"span": span, "runs": []}
     for key in best:
         r, p, times = _run_poses(poses, runs[key], n)
         if len(times) != len(t) or np.any(np.abs(times - t) > 1e-9 * max(1.0, t[-1])):
@@ -356,6 +347,15 @@ def _motion_frames(
     return header
 
 
+def _poses(
+    scenario: Record, packer: ChunkBuilder, base: Sequence[str], t: Array, r: Array, p: Array, levels: int
+) -> Record:
+    """Encode the poses of one run, positions and quaternions in −1 … 1."""
+    r, p = (packer.add(_few_levels(x, 32767, levels).astype(np.int16)) for x in (r, p))
+    times, shape = packer.add(t.astype(np.float32)), _body_shapes(scenario)
+    return {"t": times, "bodies": int(scenario["bodies"]), "base": list(base), "r": r, "p": p, "shape": shape}
+
+
 def _few_levels(x: Array, most: int, levels: int) -> Array:
     """Round −1 … 1 to multiples of −most … most that a picture distinguishes; fewer compress better."""
     return np.round(np.round(x * levels) * (most / levels))
@@ -368,16 +368,9 @@ def _still(scenario: Record, packer: ChunkBuilder) -> Record | None:
     r, p = (np.array(scenario["state"][name], float) for name in ("r", "p"))
     span = float(np.max(np.abs(r))) or 1.0
     none = {"scale": packer.add(np.zeros(1, np.float32)), "d": packer.add(np.zeros(6 * len(r), np.int8))}
-    return {
-        "t": packer.add(np.zeros(1, np.float32)),
-        "bodies": len(r),
-        "base": ["", "t = 0"],
-        "span": span,
-        "r": packer.add(np.round(r / span * 32767).astype(np.int16)),
-        "p": packer.add(np.round(p * 32767).astype(np.int16)),
-        "shape": _body_shapes(scenario),
-        "runs": [{"engine": "", "integrator": "t = 0", **none}],
-    }
+    runs = [{"engine": "", "integrator": "t = 0", **none}]
+    poses = _poses(scenario, packer, ("", "t = 0"), np.zeros(1), r / span, p, 32767)
+    return poses | {"span": span, "runs": runs}
 
 
 def _loop_facts(scenario: Record) -> Record | None:
@@ -418,22 +411,22 @@ def _body_shapes(scenario: Record) -> list[Record]:
     model = Model.from_fields(scenario["model"])
     shapes: list[Record] = []
 
-    def axes_in(k: int, side: int, numbers: list[int]) -> list[list[float | None]]:
-        turned = rotation_matrix(model.turn[k, side])
-        return [[_json_number(x, 4) for x in turned[:, i]] for i in numbers]
+    def rounded(rows: Array) -> list[list[float | None]]:
+        return [[_json_number(x, 4) for x in row] for row in rows]
 
     for k, kind in enumerate(model.kinds):
         moving = [axis for _, axis in kind.motions]  # the last in the near body, the others in the far one
+        (hang, near), (far_axes, near_axes) = rounded(model.point[k]), rotation_matrix(model.turn[k]).mT
         shapes.append(
             {
                 "is_free": kind.holds_nothing,
                 "is_apart": kind.holds_distance or (kind.is_unbounded and not kind.holds_nothing),
                 "far": int(model.body[k, 0]),
                 "body": int(model.body[k, 1]),
-                "hang": [_json_number(x, 4) for x in model.point[k, 0]],
-                "near": [_json_number(x, 4) for x in model.point[k, 1]],
-                "far_axes": axes_in(k, 0, moving[:-1]),
-                "near_axes": axes_in(k, 1, moving[-1:]),
+                "hang": hang,
+                "near": near,
+                "far_axes": rounded(far_axes[moving[:-1]]),
+                "near_axes": rounded(near_axes[moving[-1:]]),
                 "axes": [],
                 "half": [],
             }
@@ -441,8 +434,7 @@ def _body_shapes(scenario: Record) -> list[Record]:
         if k < model.n:
             moments, axes = np.linalg.eigh(model.inertia[k])
             half = np.sqrt(np.clip(1.5 / model.mass[k] * (moments.sum() - 2 * moments), 0, None))
-            shapes[k]["axes"] = [[_json_number(x, 4) for x in axis] for axis in axes.T]
-            shapes[k]["half"] = [_json_number(x, 4) for x in half]
+            shapes[k]["axes"], (shapes[k]["half"],) = rounded(axes.T), rounded(half[None])
     return shapes
 
 
@@ -501,9 +493,7 @@ def history_chunk(results: Results, history: History) -> str:
     found = [[night.get(row["key"]) for night in nights] for row in results.rows]
 
     def table(of: Any) -> np.ndarray:
-        return np.array(
-            [[np.nan if r is None or of(r) is None else of(r) for r in line] for line in found], float
-        )
+        return np.array([[None if r is None else of(r) for r in line] for line in found], float)
 
     header = {
         "nights": [
