@@ -156,7 +156,9 @@ class _Diagnosing:
         if self.largest <= MIN_DIAGNOSABLE_RATIO or not np.isfinite(self.largest):
             return (self._unexplained(self.wrong(), "close" if np.isfinite(self.largest) else ""),)
         wrong = self.wrong(MIN_DIAGNOSABLE_RATIO)
-        self.loss = self._digit_loss(wrong)
+        if self.evaluate and not self.model.has_loops:
+            problem = worst_difference(self.model, self.reported, self.truth, wrong)
+            self.loss = find_digit_loss(problem, self.evaluate)
         found = self._in_words(wrong) or self._single(View()) or self._outputs_alone(wrong)
         if not found and self.loss:
             return (*_distinct(self.named), self.loss)
@@ -190,12 +192,6 @@ class _Diagnosing:
 
     def _unexplained(self, quantities: Sequence[str], change: str = "") -> Cause:
         return Cause("unexplained", quantity_words(quantities), "", change, quantities=tuple(quantities))
-
-    def _digit_loss(self, quantities: Sequence[str]) -> Cause | None:
-        if not self.evaluate or self.model.has_loops:
-            return None
-        problem = worst_difference(self.model, self.reported, self.truth, quantities)
-        return find_digit_loss(problem, self.evaluate)
 
     # -- causes in what is evaluated -----------------------------------------------------------------
 

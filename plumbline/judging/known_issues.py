@@ -151,20 +151,16 @@ class KnownIssue:
             kind: engine (with or without ``@version``), its version, level, integrator and quantity of a row.
 
         Returns:
-            True where all patterns match and the version is in range.
+            True where all patterns match and the version is in range; pre-releases count.
 
         """
         engine, version, *others = kind
         names = engine.partition("@")[0], *others
         patterns = self.engine, self.level, self.integrator, self.quantity
-        return all(map(fnmatchcase, names, patterns)) and self._matches_version(version)
-
-    def _matches_version(self, version: str) -> bool:
-        """Whether an engine's version is in the entry's range; pre-releases count."""
-        if not self.versions:
-            return True
         try:
-            return SpecifierSet(self.versions).contains(Version(version), prereleases=True)
+            return all(map(fnmatchcase, names, patterns)) and (
+                not self.versions or SpecifierSet(self.versions).contains(Version(version), prereleases=True)
+            )
         except InvalidVersion:
             return False
 
@@ -255,14 +251,6 @@ def _scatter_of(row: Row) -> float | None:
     return row.ratio * float(row.extra["scatter"]) if "scatter" in row.extra else None
 
 
-def _as_list(value: Any) -> Any:
-    return value if isinstance(value, list) else [value]
-
-
-def _as_ratios(value: Any) -> Any:
-    return value if isinstance(value, dict) else {ANY_LENGTH: value}
-
-
 def _check_ratio(value: float) -> float:
     if value > MAX_RATIO:
         valid = f"a number up to {MAX_RATIO:g}: beyond it is no error that an engine's cause explains"
@@ -299,7 +287,12 @@ _Since = Annotated[
     ),
 ]
 _Ratio = Annotated[PositiveFloat, AfterValidator(_check_ratio)]
-_Texts = Annotated[list[str], BeforeValidator(_as_list), Field(min_length=1)]
+_Texts = Annotated[
+    list[str], BeforeValidator(lambda x: x if isinstance(x, list) else [x]), Field(min_length=1)
+]
+_Ratios = Annotated[
+    dict[PositiveInt, _Ratio], BeforeValidator(lambda x: x if isinstance(x, dict) else {ANY_LENGTH: x})
+]
 
 
 def _field(description: str, default: Any = ...) -> Any:
@@ -319,7 +312,7 @@ class _Selector(BaseModel):
     verdict: Literal["disagrees", "unresolved", "unsupported", "failed"] = _field(
         "The expected verdict.", "disagrees"
     )
-    max_ratio: Annotated[dict[PositiveInt, _Ratio], BeforeValidator(_as_ratios)] = _field(
+    max_ratio: _Ratios = _field(
         "The largest ratio of error and tolerance, or a mapping from numbers of bodies to it.", {}
     )
     max_ratio_by_inertia: _Ratio | None = _field(
@@ -473,7 +466,7 @@ def _load_entries(
         entries = TypeAdapter(list[Entry]).validate_python(source.data)
     except ValidationError as error:
         found = error.errors()
-        for one in found:  # `_as_ratios` adds a key that the file does not have
+        for one in found:  # `_Ratios` adds a key that the file does not have
             one["loc"] = tuple(key for key in one["loc"] if key != ANY_LENGTH)
         problems = problems_from_validation(source, found, Entry)
         raise ScenarioError([*source.problems, *problems]) from None
@@ -555,25 +548,14 @@ def _problem(
 
 def _quantities() -> set[str]:
     """Every quantity that a row may have, except of information."""
-    trajectory = ("order", *LIMITS)
-    own = (*REDESCRIPTIONS, WELDED_HALVES, REVERSED_IN_TIME, REPEATABILITY)
-    relations = (*(r.name for r in STATE_RELATIONS), *own)
-    others = *OTHER_FORMULATIONS, *(f"by {text}" for text in declared_texts())
-    steps = (*STEP_QUANTITIES, *CONSTRAINED_QUANTITIES, *RUN_QUANTITIES)
     return {
-        "all",
-        *STATE_UNITS,
-        SINGULAR_POSE,
-        *SURFACE_QUANTITIES,
-        *VARIANT_QUANTITIES,
-        *MODEL_UNITS,
-        *steps,
-        *trajectory,
-        *INVARIANT_UNITS,
-        *LONG_RUN_QUANTITIES,
-        *relations,
-        *others,
-    }
+        "all", "order", SINGULAR_POSE, WELDED_HALVES, REVERSED_IN_TIME, REPEATABILITY,
+        *STATE_UNITS, *SURFACE_QUANTITIES, *VARIANT_QUANTITIES, *MODEL_UNITS,
+        *STEP_QUANTITIES, *CONSTRAINED_QUANTITIES, *RUN_QUANTITIES,
+        *LIMITS, *INVARIANT_UNITS, *LONG_RUN_QUANTITIES,
+        *REDESCRIPTIONS, *OTHER_FORMULATIONS, *(relation.name for relation in STATE_RELATIONS),
+        *(f"by {text}" for text in declared_texts()),
+    }  # fmt: skip
 
 
 class KnownIssues:

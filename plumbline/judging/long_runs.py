@@ -60,7 +60,8 @@ def judge_long_runs(
     for quantity, unit in INVARIANT_UNITS.items():
         if quantity in study.runs[-1].windows:
             judge = _DriftJudge(context, integrator, study, quantity, unit)
-            rows.append(judge.window_row())
+            # a shorter window never overrules a longer one's disagreement
+            rows.append(first_decided(judge.judge_window(judge.drift(end)) for end in judge.window_ends))
             has_bound = integrator.is_symmetric and integrator.kind == "step" and is_regular
             if quantity == "energy_drift" and has_bound:
                 rows.append(judge.growth_row())
@@ -113,19 +114,9 @@ class _DriftJudge:
         """Ends of the windows that are long enough to decide [s], longest first."""
         return decisive_windows(self.finest, self.quantity, self.study.plan)
 
-    @property
-    def solver_note(self) -> str:
-        """The end of a derivation where steps were solved less closely than the integrator declares."""
-        solved = self.finest.solver_rtol
-        return f"; steps solved to {solved:g}" if solved > self.integrator.solver_rtol else ""
-
     def drift(self, end: float) -> InvariantDrift:
         """The drift in the window up to ``end``."""
         return InvariantDrift(self.study.runs, self.integrator, self.quantity, end)
-
-    def window_row(self) -> Row:
-        """The row of the longest window that decides; a shorter one never overrules its disagreement."""
-        return first_decided(self.judge_window(self.drift(end)) for end in self.window_ends)
 
     def judge_window(self, drift: InvariantDrift) -> Row:
         """The verdict in one window."""
@@ -234,6 +225,8 @@ class _DriftJudge:
             )
         if self.integrator.kind == "tolerance":
             order = None
+        if (solved := self.finest.solver_rtol) > self.integrator.solver_rtol:
+            derivation += f"; steps solved to {solved:g}"  # less closely than the integrator declares
         return self.make_row(
             f"{self.quantity}_long",
             verdict,
@@ -241,7 +234,7 @@ class _DriftJudge:
             self.unit,
             value=drift.max_drift,
             tolerance=tolerance,
-            derivation=derivation + self.solver_note + self.study.plan.shortening_note,
+            derivation=derivation + self.study.plan.shortening_note,
             compared_until=end,
             order=order,
             declared_order=self.integrator.order if order else None,

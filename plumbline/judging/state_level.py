@@ -27,6 +27,7 @@ from plumbline.judging.rows import (
 )
 from plumbline.judging.surface_rows import judge_surface
 from plumbline.model.datatypes import Array
+from plumbline.model.grouping import grouped
 from plumbline.model.loops import MIN_SINGULAR_VALUE
 from plumbline.truth.ground_truth import StateTruth
 from plumbline.truth.rounding_bound import MAX_RELATIVE_BOUND, TINY
@@ -99,8 +100,7 @@ def judge_variants(context: RowContext, truth: StateTruth, evaluation: Evaluatio
     """
     rows = list[Row]()
     for kind, answers in evaluation.variants.items():
-        found: dict[str, list[tuple[Row, str]]] = {}
-        missing = list[tuple[NoAnswer, str]]()
+        found, missing = list[tuple[Row, str]](), list[tuple[NoAnswer, str]]()
         for call, answer in answers.items():
             names = ", ".join(call)
             if isinstance(answer, NoAnswer):
@@ -110,13 +110,9 @@ def judge_variants(context: RowContext, truth: StateTruth, evaluation: Evaluatio
             true = replace(truth, quantities=truth.quantities[first], bounds=truth.bounds[first])
             other = replace(evaluation, quantities=answer)
             for quantity in STATE_UNITS:
-                if (
-                    getattr(answer[0], quantity) is not None
-                    and getattr(true.quantities[0], quantity) is not None
-                ):
-                    row, _, _ = _judge_quantity(context, quantity, true, other)
-                    found.setdefault(quantity, []).append((row, names))
-        for quantity, judged in found.items():
+                if all(getattr(one, quantity) is not None for one in (answer[0], true.quantities[0])):
+                    found.append((_judge_quantity(context, quantity, true, other)[0], names))
+        for quantity, judged in grouped(found, lambda one: one[0].quantity).items():
             judged.sort(key=lambda one: (one[0].verdict == Verdict.DISAGREES, one[0].ratio or 0.0))
             row, names = judged[-1]
             ratios = {by: one.ratio or 0.0 for one, by in judged if one.verdict == Verdict.DISAGREES}

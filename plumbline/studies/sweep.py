@@ -166,14 +166,11 @@ def _run_reference_batch(group: Sequence[tuple[int, Scenario]]) -> list[Record]:
 def _measure_motion(scenario: Scenario, motion: Trajectory) -> Record:
     """The columns that need no truth."""
     invariants = compute_invariants(scenario.model, motion)
-    x, y, z = (float(coordinate) for coordinate in motion.r[-1, -1])
     return {
         "energy_drift": float(np.max(np.abs(invariants.energy_drift))),
         "joint_gap": float(np.max(np.linalg.norm(invariants.joint_gap, axis=-1))),
         "reach": float(np.max(np.linalg.norm(motion.r[:, -1], axis=-1))),
-        "x": x,
-        "y": y,
-        "z": z,
+        **dict(zip("xyz", motion.r[-1, -1].tolist(), strict=True)),
         "steps": motion.steps,
     }
 
@@ -202,7 +199,10 @@ def _run_engines(
     for name, index in product(installed, lost):
         reason = f"no truth to judge by: the reference failed: {lost[index]}"
         yield record(index, name, Verdict.HARNESS_FAILED, reason)
-    integrators = {name: _integrator(info, sweep.engines[name]) for name, info in installed.items()}
+    integrators = {
+        name: next(one for one in info.integrators if one.name == sweep.engines[name])
+        for name, info in installed.items()
+    }
     tasks = [
         Task(
             (index, name),
@@ -224,10 +224,6 @@ def _run_engines(
             continue
         row, errors = _judge_cell(installed[name], integrators[name], scenarios[index], outcome.value, truth)
         yield record(index, name, row.verdict, row.reason) | errors
-
-
-def _integrator(info: EngineInfo, name: str) -> Integrator:
-    return next(integrator for integrator in info.integrators if integrator.name == name)
 
 
 def _compute_truths(counted: _Progress, scenarios: Mapping[int, Scenario]) -> dict[int, MotionTruth | str]:
@@ -265,14 +261,15 @@ def _judge_cell(
     who = RowContext(scenario.name, scenario.family, info.name, info.title, info.version)
     rows = judge_trajectory(who, scenario.model, truth, integrator, study).rows
     by_quantity = {row.quantity: row for row in rows}
-    errors: Record = {}
-    for column, quantity, field in (
-        ("position_error", "position_limit", "value"),
-        ("attitude_error", "attitude", "value"),
-        ("uncertainty", "position_limit", "uncertainty"),
-        ("finest_error", "position", "value"),
-    ):
-        errors[column] = getattr(by_quantity.get(quantity), field, None)
+    errors: Record = {
+        column: getattr(by_quantity.get(quantity), field, None)
+        for column, quantity, field in (
+            ("position_error", "position_limit", "value"),
+            ("attitude_error", "attitude", "value"),
+            ("uncertainty", "position_limit", "uncertainty"),
+            ("finest_error", "position", "value"),
+        )
+    }
     finest = study.runs[-1].trajectory if study.runs else None
     if finest is not None:
         errors |= _measure_motion(scenario, finest)
