@@ -176,11 +176,13 @@ def _edit(
 
 
 def _number(
-    term: str, place: str, name: str, at: tuple[Any, ...], value: Any, scale: float, unit: str = "",
+    model: Model, term: str, place: str, name: str, at: tuple[Any, ...], scale: float = 0.0, unit: str = "",
     general: str = "", can_vanish: bool = True,
 ) -> Edit:  # fmt: skip
-    general = general or WORDS.get(name, name)
-    return _edit(term, place, at_place(name, at), value, scale, unit, general, can_vanish)
+    """Edit one number of a field, or one vector; its own size is the scale where none is given."""
+    value, general = getattr(model, name)[at], general or WORDS.get(name, name)
+    size = scale or abs(float(value)) or 1.0
+    return _edit(term, place, at_place(name, at), value, size, unit, general, can_vanish)
 
 
 def _factor(term: str, place: str, change: NumberChange, **more: Any) -> Edit:
@@ -193,7 +195,7 @@ def _gravity(model: Model) -> Iterator[Edit]:
         yield _factor("size of gravity", "", scaled({"gravity": 1.0}), general="gravity")
     for i, axis in AXES:
         term = f"{axis.strip()} component of gravity" if axis else "vector of gravity"
-        yield _number(term, "", "gravity", (i,), model.gravity[i], size, UNITS["gravity"])
+        yield _number(model, term, "", "gravity", (i,), size, UNITS["gravity"])
 
 
 def _bodies(model: Model) -> Iterator[Edit]:
@@ -201,15 +203,14 @@ def _bodies(model: Model) -> Iterator[Edit]:
     length = float(np.max(np.abs(model.point))) or 1.0
     for k in range(model.n):
         place, mass = f"body {k + 1}", float(model.mass[k])
-        yield _number("mass", place, "mass", (k,), mass, mass, UNITS["mass"], can_vanish=False)
+        yield _number(model, "mass", place, "mass", (k,), mass, UNITS["mass"], can_vanish=False)
         trace = float(np.trace(model.inertia[k])) or mass * length**2  # a point mass may be given one
         for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)):
-            term, at, unit = f"inertia {'xyz'[i]}{'xyz'[j]}", (k, i, j), UNITS["inertia"]
-            yield _number(term, place, "inertia", at, model.inertia[at], trace, unit, can_vanish=i != j)
+            term, unit = f"inertia {'xyz'[i]}{'xyz'[j]}", UNITS["inertia"]
+            yield _number(model, term, place, "inertia", (k, i, j), trace, unit, can_vanish=i != j)
         for a, axis in AXES:
             for name, weight in (("force", mass * size), ("moment", mass * size * length)):
-                value = getattr(model, name)[k, a]
-                yield _number(f"{WORDS[name]}{axis}", place, name, (k, a), value, weight, UNITS[name])
+                yield _number(model, f"{WORDS[name]}{axis}", place, name, (k, a), weight, UNITS[name])
             if axis and not model.kinds[k].holds_nothing:
                 term = "centre of mass"
                 yield _edit(f"{term}{axis}", place, _shifted_centre(k, a), 0.0, length, " m", term)
@@ -218,7 +219,7 @@ def _bodies(model: Model) -> Iterator[Edit]:
                 yield _edit(f"attitude about{axis}", place, change, 0.0, 1.0, " rad", "attitude")
         for name, weight in (("drag_force", mass), ("drag_moment", trace)):
             if not getattr(model, name)[k]:
-                yield _number(WORDS[name], place, name, (k,), 0.0, weight, UNITS[name])
+                yield _number(model, WORDS[name], place, name, (k,), weight, UNITS[name])
 
 
 def coordinates(model: Model) -> list[tuple[int, int]]:
@@ -236,27 +237,22 @@ def _joints(model: Model) -> Iterator[Edit]:
     for k, i in coordinates(model):
         for name in JOINT_ELEMENTS:
             if name not in ("rest", "effort") or not model.kinds[k].is_spherical:
-                value = float(getattr(model, name)[k, i])
-                place = coordinate_place(model, k, i)
-                yield _number(WORDS.get(name, name), place, name, (k, i), value, abs(value) or 1.0)
+                yield _number(model, WORDS.get(name, name), coordinate_place(model, k, i), name, (k, i))
     for i in range(len(model.spring_body)):
         for name in SPRING_FIELDS[2:]:
-            value = float(getattr(model, name)[i])
-            place, size = f"spring {i + 1}", abs(value) or 1.0
-            yield _number(WORDS[name], place, name, (i,), value, size, general=OF_SPRINGS[name])
+            yield _number(model, WORDS[name], f"spring {i + 1}", name, (i,), general=OF_SPRINGS[name])
     for k, kind in enumerate(model.kinds):
         if kind.holds_nothing:
             continue
         place = f"joint {k + 1}"
         if own := kind.own_number:
-            value, unit = float(model.length[k]), " m" if kind.holds_distance else " m/rad"
-            size, can_vanish = abs(value) or 0.1, not kind.holds_distance
-            yield _number(own, place, "length", (k,), value, size, unit, own, can_vanish)
+            size, unit = abs(float(model.length[k])) or 0.1, " m" if kind.holds_distance else " m/rad"
+            yield _number(model, own, place, "length", (k,), size, unit, own, not kind.holds_distance)
         if kind.motions and kind.motions[0][0] == "slide" and _shift_is_askew(model, k):
             yield _edit("origin of the slide", place, _shifted_slide(k), 0.0, 0.1, " m")
         for (side, where), (a, axis) in product(enumerate(("far", "near")), AXES):
-            term, at = f"{where} point", (k, side, a)
-            yield _number(f"{term}{axis}", place, "point", at, model.point[at], 0.1, " m", term)
+            term = f"{where} point"
+            yield _number(model, f"{term}{axis}", place, "point", (k, side, a), 0.1, " m", term)
             if not kind.has_attitude and (side == 0 or not kind.is_rigid):  # equal to a far turn
                 axes, term = np.atleast_2d(np.eye(3)[a]), f"turn{axis and ' about' + axis} of the axes"
                 change, side_place = turned("turn", (k, side), axes), f"{place} in the {where} body"
