@@ -27,6 +27,7 @@ from reports.findings_list import declared_gaps, findings_for_page
 from reports.stored_results import Record, Results
 from reports.verdicts import (
     count_all_verdicts,
+    count_verdicts,
     css_class,
     error_ratio,
     format_number,
@@ -157,28 +158,23 @@ def _row_link(row: Record) -> str:
 def _matrix_by_family(results: Results) -> dict[str, Any]:
     """Arrange the matrix by family: for each scenario and engine the row that stands for the cell."""
     cells = grouped(results.rows, itemgetter("scenario", "engine"))
-    families: dict[str, Any] = {}
+
+    def shown(rows: list[Record]) -> Record:
+        worst, known = max(rows, key=rank), sum(row.get("known_issue") is not None for row in rows)
+        return {"row": worst, "ratio": error_ratio(worst), "known": known}
+
+    lines: list[Record] = []
     for place, (name, scenario) in enumerate(results.scenarios.items()):
-        line = {}
-        for engine in results.engines:
-            rows = cells.get((name, engine))
-            if rows:
-                worst = max(rows, key=rank)
-                line[engine] = {
-                    "row": worst,
-                    "ratio": error_ratio(worst),
-                    "known": sum(r.get("known_issue") is not None for r in rows),
-                }
-        family = families.setdefault(scenario["family"], {"lines": [], "summary": {}})
-        family["lines"].append({"name": name, "scenario": scenario, "cells": line, "place": place})
-    for family in families.values():
-        for engine in results.engines:
-            family["summary"][engine] = Counter(
-                shown_verdict(line["cells"][engine]["row"])
-                for line in family["lines"]
-                if engine in line["cells"]
-            )
-    return families
+        own = {e: shown(cells[name, e]) for e in results.engines if (name, e) in cells}
+        lines.append({"name": name, "scenario": scenario, "cells": own, "place": place})
+
+    def summary(lines: list[Record], engine: str) -> Counter[str]:
+        return count_verdicts(line["cells"][engine]["row"] for line in lines if engine in line["cells"])
+
+    return {
+        family: {"lines": some, "summary": {engine: summary(some, engine) for engine in results.engines}}
+        for family, some in grouped(lines, lambda line: line["scenario"]["family"]).items()
+    }
 
 
 def _changes_since_last_passed(results: Results, history: History) -> Record | None:
@@ -264,9 +260,9 @@ def template_environment() -> Environment:
         "when": _format_time,
         "seconds": _format_duration,
         "css_class": css_class,
+        "shown_verdict": shown_verdict,
     }
     made.globals["verdict_styles"] = SHOWN_STYLES
-    made.filters["shown_verdict"] = shown_verdict
     return made
 
 

@@ -120,33 +120,30 @@ def index_chunk(results: Results, history: History, texts: dict[str, int]) -> st
 
     """
     packer = ChunkBuilder(texts)
-    header: dict[str, Any] = {
-        "scenarios": list(results.scenarios),
+    lists = {
+        "scenario": list(results.scenarios),
+        "engine": list(results.engines),
+        "verdict": list(SHOWN_STYLES),
+        **{
+            name: list(dict.fromkeys(row[name] for row in results.rows))
+            for name in ("level", "integrator", "quantity")
+        },
+    }
+    header: dict[str, Any] = {f"{name}s": values for name, values in lists.items()} | {
         "families": [s["family"] for s in results.scenarios.values()],
         "titles": [s["title"] for s in results.scenarios.values()],
-        "engines": list(results.engines),
         "engine_titles": [e["title"] for e in results.engines.values()],
-        "verdicts": list(SHOWN_STYLES),
         "glyphs": [style.glyph for style in SHOWN_STYLES.values()],
         "slugs": [css_class(verdict) for verdict in SHOWN_STYLES],
         "reasons": packer.add_texts([row["reason"] for row in results.rows]),
         "commit": results.run.get("commit"),
         "passed": history.last_passed.run["started"] if history.last_passed else None,
     }
-    for name in ("level", "integrator", "quantity"):
-        header[name + "s"] = list(dict.fromkeys(row[name] for row in results.rows))
     rows: dict[str, Any] = {}
-    for name, plural, kind in (
-        ("scenario", "scenarios", np.uint16),
-        ("engine", "engines", np.uint8),
-        ("verdict", "verdicts", np.uint8),
-        ("level", "levels", np.uint8),
-        ("integrator", "integrators", np.uint8),
-        ("quantity", "quantitys", np.uint16),
-    ):
-        place = {value: k for k, value in enumerate(header[plural])}
-        values = [shown_verdict(row) if name == "verdict" else row[name] for row in results.rows]
-        rows[name] = packer.add(np.array([place[value] for value in values], dtype=kind))
+    for name, values in lists.items():
+        place = {value: k for k, value in enumerate(values)}
+        given = [place[shown_verdict(row) if name == "verdict" else row[name]] for row in results.rows]
+        rows[name] = packer.add(np.array(given, np.uint16 if name in ("scenario", "quantity") else np.uint8))
     rows["severity"] = packer.add(np.array([severity(row) for row in results.rows], dtype=np.uint8))
     rows["fresh"] = packer.add(np.array([history.is_new(row) for row in results.rows], dtype=np.uint8))
     rows["ratio"] = packer.add(log_scale_codes(np.array([error_ratio(row) for row in results.rows], float)))

@@ -204,7 +204,7 @@ def coverage(
                 found = study.measure_coverage(executor, chosen, rows, RANDOM_STATES, levels, progress)
         path = write_table(study.coverage_table(found), folder / study.FILE)
         report = _write_report_again(folder)
-    summary = [asdict(one) for one in study.summarize_coverage(found)]
+    summary = study.summarize_coverage(found)
     if as_json:
         entries = [asdict(entry) for entry in found]
         print_json({"summary": summary, "blind_spots": study.blind_spots(found), "entries": entries})

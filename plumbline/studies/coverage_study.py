@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any
 
 import pyarrow as pa
@@ -110,47 +110,35 @@ def coverage_table(entries: Iterable[CoverageEntry]) -> pa.Table:
     return make_table([asdict(entry) for entry in entries], COVERAGE_TABLE)
 
 
-@dataclass(frozen=True)
-class CoverageSummary:
-    """One kind of parameter at one level, over all bodies and scenarios."""
-
-    level: Level
-    kind: str
-    entries: int
-    seen: int
-    sharpest: float | None  # smallest mistake over its scale, the least of all entries
-    median: float | None
-    bluntest: float | None
-    invisible: int  # entries with a proof
-    blind: int  # entries that are neither seen nor proven to be invisible
-
-
-def summarize_coverage(entries: Iterable[CoverageEntry]) -> list[CoverageSummary]:
-    """Summarize entries by level and kind of parameter.
+def summarize_coverage(entries: Iterable[CoverageEntry]) -> list[dict[str, Any]]:
+    """Summarize entries by level and kind of parameter, over all bodies and scenarios.
 
     Args:
         entries: of any scenarios.
 
     Returns:
-        The summaries, in the order of first appearance.
+        The summaries, in the order of first appearance: numbers of ``entries``, of those ``seen``, of those
+        with a proof (``invisible``) and of the others (``blind``); ``sharpest``, ``median`` and ``bluntest``
+        smallest mistake over its scale, None where none is seen.
 
     """
     found = []
     for (level, kind), members in grouped(entries, lambda entry: (entry.level, entry.kind)).items():
         seen = sorted(entry.smallest for entry in members if entry.smallest is not None)
         proven = sum(bool(entry.proof) for entry in members)
+        sharpest, median, bluntest = (seen[0], seen[len(seen) // 2], seen[-1]) if seen else [None] * 3
         found.append(
-            CoverageSummary(
-                level,
-                kind,
-                len(members),
-                len(seen),
-                sharpest=seen[0] if seen else None,
-                median=seen[len(seen) // 2] if seen else None,
-                bluntest=seen[-1] if seen else None,
-                invisible=proven,
-                blind=len(members) - len(seen) - proven,
-            )
+            {
+                "level": level,
+                "kind": kind,
+                "entries": len(members),
+                "seen": len(seen),
+                "sharpest": sharpest,
+                "median": median,
+                "bluntest": bluntest,
+                "invisible": proven,
+                "blind": len(members) - len(seen) - proven,
+            }
         )
     return found
 

@@ -74,12 +74,16 @@ def _measure_variant(
 ) -> Iterator[dict[str, Any]]:
     """The rows of one variant at one tolerance: runs to the first and to the last affordable time."""
     key = {"scenario": s.name, "variant": variant, "rtol": rtol}
-    within: Sequence[float] = times[:1]
     reasons = dict.fromkeys(times, "")
-    try:
+
+    def measured(within: Sequence[float]) -> tuple[list[dict[str, Any]], float]:
         began = process_time()
-        found = _drifts(s, variant, rtol, within)
+        rows = _drifts(s, variant, rtol, within)
         spent = process_time() - began
+        return [row | {"cpu_seconds": spent * row["time"] / within[-1], "reason": ""} for row in rows], spent
+
+    try:
+        found, spent = measured(times[:1])
         predicted = {time: spent * time / times[0] for time in times}
         affordable = [time for time in times if predicted[time] <= max_cpu_seconds] or times[:1]
         for time in times[len(affordable) :]:
@@ -89,13 +93,10 @@ def _measure_variant(
         if len(affordable) > 1:
             what = f"{s.name}, {variant}, rtol {rtol:g}"
             log(f"{what}: to {affordable[-1]:g} s, about {predicted[affordable[-1]]:.0f} s of CPU time")
-            began, within = process_time(), affordable
-            found = _drifts(s, variant, rtol, within)
-            spent = process_time() - began
+            found, _ = measured(affordable)
     except ArithmeticError as error:
         found, reasons = [], dict.fromkeys(times, f"failed: {error}")
-    for row in found:
-        yield key | row | {"cpu_seconds": spent * row["time"] / within[-1], "reason": ""}
+    yield from (key | row for row in found)
     for time in times[len(found) :]:
         yield key | {"time": time, "reason": reasons[time]}
 

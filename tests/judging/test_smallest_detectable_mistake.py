@@ -307,7 +307,7 @@ def test_blind_spots_are_found():
     assert "state level: no scenario sees drag_force of a later body on a rod" in found
     assert not any("mass" in spot or "gravity" in spot for spot in found)
     for one in summarize_coverage(entries):
-        assert one.entries == one.seen + one.invisible + one.blind
+        assert one["entries"] == one["seen"] + one["invisible"] + one["blind"]
 
 
 def test_no_parameter_is_blind_at_state_and_step_level():
