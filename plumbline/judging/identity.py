@@ -139,5 +139,5 @@ class IdentityCheck:
             f"{what} bit for bit on all {count} generic scenarios, and no alias is declared: it is the same "
             "computation under two names",
             derivation="independent computations of one number differ by rounding",
-            extra={"scenarios": float(count)},
+            extra={"scenarios": count},
         )  # fmt: skip

@@ -55,8 +55,8 @@ def _invariant_row(study: RefinementAnalysis, quantity: str, unit: str, samples:
     ) -> Row:
         return study.context.make_row(
             "invariants", study.integrator.name, quantity, verdict, reason, unit,
-            value=float(drift[at]), tolerance=tolerance, ratio=ratio, derivation=derivation,
-            compared_until=float(times[at]), extra={"scale": scale, "whole": float(drift[-1]), **extra},
+            value=drift[at], tolerance=tolerance, ratio=ratio, derivation=derivation,
+            compared_until=times[at], extra={"scale": scale, "whole": drift[-1], **extra},
             **study.common_fields,
         )  # fmt: skip
 
@@ -68,8 +68,9 @@ def _invariant_row(study: RefinementAnalysis, quantity: str, unit: str, samples:
         failure = str(error)
     if drift[end] <= floor:
         reason = f"{name} {with_unit(drift[end], unit)}: rounding"
-        ratio = float(drift[end] / floor)
-        return row(Verdict.AGREES, reason, end, floor, ratio=ratio, limit_tolerance=float(tolerance[end]))
+        return row(
+            Verdict.AGREES, reason, end, floor, ratio=drift[end] / floor, limit_tolerance=tolerance[end]
+        )
     if failure:
         return row(Verdict.UNRESOLVED, failure, end, floor)
     limit_drift = np.maximum.accumulate(np.max(np.linalg.norm(limit.y, axis=-1), axis=1))
@@ -87,16 +88,16 @@ def _invariant_row(study: RefinementAnalysis, quantity: str, unit: str, samples:
 
     duration = float(times[-1])
     verdict, reason, at, _ = study.decide(judge_window, duration, duration)
-    to_limit = float(np.max(np.linalg.norm((samples[-1] - limit.y)[: at + 1], axis=-1)))
+    to_limit = np.max(np.linalg.norm((samples[-1] - limit.y)[: at + 1], axis=-1))
     is_off = limit_drift[at] > tolerance[at] and is_trusted
     return row(
         verdict,
         reason,
         at,
-        float(tolerance[at]) + (0.0 if is_off else to_limit),
+        tolerance[at] + (0.0 if is_off else to_limit),
         f"{to_limit:.2g} from the finest step to step zero, itself ± {limit.uncertainty[at]:.2g}; "
         f"{rounding}; {UNCERTAIN} ± {uncertainty:.2g}",
-        float(limit_drift[at] / tolerance[at]),
-        limit=float(limit_drift[at]),
-        limit_tolerance=float(tolerance[at]),
+        limit_drift[at] / tolerance[at],
+        limit=limit_drift[at],
+        limit_tolerance=tolerance[at],
     )

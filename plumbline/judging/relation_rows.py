@@ -34,7 +34,7 @@ def _relation_row(context: RowContext, result: RelationResult) -> Row:
             "relations", result.integrator, result.relation, REFUSALS[result.refusal], result.refusal_reason,
             gap=result.gap, place=result.place,
         )  # fmt: skip
-    extra = {"states": float(result.state_count), "state": float(result.worst_state)}
+    extra: dict[str, float] = {"states": result.state_count, "state": result.worst_state}
     if result.unexplained is not None:
         extra[UNEXPLAINED] = result.unexplained
     if result.relation == REPEATABILITY:

@@ -247,15 +247,18 @@ class RowContext:
             unit: unit of ``value`` and ``tolerance``.
             gap: declared by the engine's column, from which a refusal follows; it is expected then.
             place: of the exception behind a failure or refusal.
-            **more: other fields of `Row`. ``ratio`` is the quotient of ``value`` and ``tolerance`` unless
-                given: of many comparisons the worst ratio need not belong to the largest error.
+            **more: other fields of `Row`; numbers may be numpy's, and those of ``extra`` integers. ``ratio``
+                is the quotient of ``value`` and ``tolerance`` unless given: of many comparisons the worst
+                ratio need not belong to the largest error.
 
         """
-        more = {"value": None, "tolerance": None} | more
+        more = {"value": None, "tolerance": None, "extra": {}} | more
+        more |= {name: x.item() for name, x in more.items() if isinstance(x, np.generic)}
+        more["extra"] = {name: x if isinstance(x, str) else float(x) for name, x in more["extra"].items()}
         if gap and verdict == Verdict.UNSUPPORTED:
             more |= {"known_issue": gap, "is_declared": True}
         if place and verdict in (Verdict.FAILED, Verdict.UNSUPPORTED):
-            more["extra"] = more.get("extra", {}) | {PLACE: place}
+            more["extra"][PLACE] = place
         if more.get("ratio") is None:
             more["ratio"] = error_ratio(more["value"], more["tolerance"])
         return Row(

@@ -145,26 +145,25 @@ def _judge_quantity(
     error, bound, scale = worst["error"], worst["bound"], worst["scale"]
     known, has_scale = np.isfinite(bound), scale > 0
     ratios = np.where(known, error / np.maximum(bound, TINY), 0.0)
-    at, ratio, count = int(np.argmax(ratios)), float(np.max(ratios)), len(ratios)
+    at, ratio, count = np.argmax(ratios), np.max(ratios), len(ratios)
     own = looseness[worst["state"], worst["body"]]
     sharp = (own <= MAX_RELATIVE_BOUND) & np.all(np.isfinite(looseness), axis=1)
-    compared, loosest = int(np.sum(sharp)), float(np.max(looseness))
-    loose_count = int(np.sum(looseness > MAX_RELATIVE_BOUND))
-    relative = float(np.max(error[has_scale] / scale[has_scale], initial=0.0))
-    state, body = int(worst["state"][at]), int(worst["body"][at]) + 1
+    compared, loosest = np.sum(sharp), np.max(looseness)
+    loose_count = np.sum(looseness > MAX_RELATIVE_BOUND)
+    state, body = worst["state"][at], worst["body"][at] + 1
     name, where = quantity.replace("_", " "), f"state {state}, body {body}"
     loose = (
         f"the rounding bound is up to {loosest:.1g} of the quantity's scale (limit {MAX_RELATIVE_BOUND:g}) "
         f"at {count - compared} of {count} states and in {loose_count} of {looseness.size} comparisons, too "
         "loose to detect an error"
     )
-    limit_error = float(np.max(_limit_errors(quantity, evaluation)))
+    limit_error = np.max(_limit_errors(quantity, evaluation))
     share = f"; of it up to {with_unit(limit_error, unit)} is the uncertainty of the engine's limit"
     if ratio > 1:
         verdict = Verdict.DISAGREES
         reason = (
             f"the {name} of {context.title} is off by {with_unit(error[at], unit, 3)} at {where}, "
-            f"{ratio:.3g} times the rounding bound; {int(np.sum(ratios > 1))} of {count} states disagree"
+            f"{ratio:.3g} times the rounding bound; {np.sum(ratios > 1)} of {count} states disagree"
         )
     elif compared and 2 * compared >= count:
         verdict = Verdict.AGREES
@@ -179,20 +178,20 @@ def _judge_quantity(
         verdict,
         reason,
         unit,
-        value=float(error[at]),
-        tolerance=float(bound[at]),
+        value=error[at],
+        tolerance=bound[at],
         ratio=ratio,
         derivation=f"first-order rounding bound per body and state, {with_unit(bound[at], unit)} at {where}, "
         f"and at most {loosest:.1g} of the scale at {count} states, {MAX_RELATIVE_BOUND:g} at {compared} of "
         f"them; truth: {truth.method}" + share * bool(limit_error),
         cpu_time=evaluation.cpu_time,
         extra={
-            "relative": relative,
-            "states": float(count),
-            "compared_states": float(compared),
+            "relative": np.max(error[has_scale] / scale[has_scale], initial=0.0),
+            "states": count,
+            "compared_states": compared,
             "bound_relative": loosest,
-            "state": float(state),
-            "body": float(body),
+            "state": state,
+            "body": body,
         }
         | ({"limit_error": limit_error} if limit_error else {}),
     )

@@ -7,6 +7,7 @@ One step and ten from several states; and every step of a run, each from the eng
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -140,10 +141,10 @@ def _row(
 ) -> Row:  # fmt: skip
     """The row of one quantity: its worst ratio decides, unless most bounds are too loose."""
     error, bound, ratios, looseness = found.errors, found.bounds, found.ratios, found.looseness
-    row, body = at = tuple(int(x) for x in np.unravel_index(np.argmax(ratios), ratios.shape))
+    row, body = at = np.unravel_index(np.argmax(ratios), ratios.shape)
     worst = found.places[row]
     place = f"body {body + 1}, {worst}"
-    ratio, is_sharp = float(ratios[at]), looseness <= MAX_STEP_BOUND
+    ratio, is_sharp = ratios[at], looseness <= MAX_STEP_BOUND
     name, unit = about[0].replace("_", " "), about[1]
     if ratio > 1:
         verdict = Verdict.DISAGREES
@@ -162,12 +163,12 @@ def _row(
         reason = f"{name} within {ratio:.2g} of the rounding bound of the declared step in {note}"
     return context.make_row(
         "step", integrator.name, quantity, verdict, reason, unit,
-        value=float(error[at]), tolerance=float(bound[at]), ratio=ratio, alias_of=alias, cpu_time=cpu_time,
+        value=error[at], tolerance=bound[at], ratio=ratio, alias_of=alias, cpu_time=cpu_time,
         derivation=f"{with_unit(bound[at], unit)} at {place}; in the median {np.median(looseness):.1g} "
         "of the accelerations' effect on a step; truth: the declared formula in extended precision "
         "(docs/integrators.md)",
-        extra={"comparisons": float(error.size), "bound_relative": float(np.max(looseness)),
-               "state": float(worst.state), "step": worst.step, "steps": float(worst.count)},
+        extra={"comparisons": error.size, "bound_relative": np.max(looseness),
+               "state": worst.state, "step": worst.step, "steps": worst.count},
     )  # fmt: skip
 
 
@@ -216,21 +217,21 @@ def _run_rows(
     ]
 
 
-def _left_out_words(found: StepDeviations, unit: str) -> tuple[str, float]:
+def _left_out_words(found: StepDeviations, unit: str) -> tuple[str, int]:
     """What a row says of the steps without a bound, and how many of them are off by more than one."""
     left_out = found.is_left_out
     reasons, numbers = np.unique(found.left_out[left_out], return_counts=True)
     causes = [f"{number} ({why})" for why, number in zip(reasons, numbers, strict=True)]
     off = found.ratios_of_all[left_out]
     is_off = ~(off <= 1)
-    wrong = int(np.count_nonzero(np.any(is_off, axis=1)))
+    wrong = np.count_nonzero(np.any(is_off, axis=1))
     words = f"; {np.count_nonzero(left_out)} steps have no bound: {', '.join(causes)}"
     if wrong:
-        size = float(np.max(found.errors[left_out][is_off]))
+        size = np.max(found.errors[left_out][is_off])
         words += (
             f", of which {wrong} differ by more than one would allow, at most by {with_unit(size, unit, 3)}"
         )
-    return words, float(wrong)
+    return words, wrong
 
 
 def _run_row(
@@ -245,25 +246,25 @@ def _run_row(
     """
     (name, unit), ratios = RUN_QUANTITIES[quantity], found.ratios
     ratios = np.where(np.isnan(ratios), np.inf, ratios)
-    worst, column = (int(x) for x in np.unravel_index(np.argmax(ratios), ratios.shape))
-    ratio, wrong = float(ratios[worst, column]), np.flatnonzero(np.any(ratios > 1, axis=1))
+    worst, column = at = np.unravel_index(np.argmax(ratios), ratios.shape)
+    ratio, wrong = ratios[at], np.flatnonzero(np.any(ratios > 1, axis=1))
     has_bodies, count, left_out = quantity not in TOTALS, len(ratios), found.is_left_out
     body = column if has_bodies else 0
     sharp = (found.bounds <= MAX_STEP_BOUND * found.effects) | (found.effects == 0)
     sharp &= ~left_out[:, None]
-    extra = {"step": h, "worst_step": worst + 1.0, "comparisons": float(ratios.size)}
+    extra: dict[str, Any] = {"step": h, "worst_step": worst + 1, "comparisons": ratios.size}
     what = f"{name} of {count} steps of {h:.4g} s"
     if ratio > 1:
-        first = int(wrong[0])
+        first = wrong[0]
         verdict = Verdict.DISAGREES
         reason = (
             f"{context.title} does not take the declared step of {integrator.name}: {what} is off first at "
             f"step {first + 1} (t = {run.trajectory.t[first]:.6g} s), and at {len(wrong)} in all; at most by "
-            f"{with_unit(found.errors[worst, column], unit, 3)} at step {worst + 1}, {ratio:.3g} times the "
+            f"{with_unit(found.errors[at], unit, 3)} at step {worst + 1}, {ratio:.3g} times the "
             "rounding bound"
         )
         if quantity != "run_mean":
-            extra |= {"first_step": first + 1.0, "wrong_steps": float(len(wrong))}
+            extra |= {"first_step": first + 1, "wrong_steps": len(wrong)}
         else:
             reason = (
                 f"{context.title} does not take the declared step of {integrator.name}: over a run of steps "
@@ -281,16 +282,16 @@ def _run_row(
         reason = f"{what} within {ratio:.2g} of the rounding bound, each from the sample before"
         if quantity == "run_mean":
             reason = f"no direction in the deviations of the steps: {ratio:.2g} of what rounding explains"
-    if quantity != "run_mean" and (number := int(np.count_nonzero(left_out))):
-        words, extra["left_out_steps"] = _left_out_words(found, unit), float(number)
-        reason, extra["left_out_wrong_steps"] = reason + words[0], words[1]
+    if quantity != "run_mean" and (number := np.count_nonzero(left_out)):
+        words, extra["left_out_wrong_steps"] = _left_out_words(found, unit)
+        reason, extra["left_out_steps"] = reason + words, number
     if failure:
         reason += f"; after these {failure}: with this step the method itself does not resolve the rest"
     return context.make_row(
         "step", integrator.name, quantity, verdict, reason, unit,
-        value=float(found.errors[worst, column]), tolerance=float(found.bounds[worst, column]), ratio=ratio,
+        value=found.errors[at], tolerance=found.bounds[at], ratio=ratio,
         alias_of=alias, cpu_time=cpu_time, extra=extra,
-        derivation=f"{with_unit(found.bounds[worst, column], unit)} at step {worst + 1}"
+        derivation=f"{with_unit(found.bounds[at], unit)} at step {worst + 1}"
         + f", body {body + 1}" * has_bodies + "; truth: the declared formula in extended precision, from the "
         "engine's own sample before (docs/integrators.md)",
     )  # fmt: skip

@@ -62,7 +62,7 @@ def _row(context: RowContext, quantity: str, true: SurfaceTruth, evaluation: Eva
     # single entries may have no scale
     scale, loose = np.max(true.scale, axis=1), np.max(true.tolerance, axis=1)
     looseness = np.where(scale > 0, loose / np.where(scale > 0, scale, 1.0), 0.0)
-    sharp, count, loosest = int(np.sum(looseness <= MAX_RELATIVE_BOUND)), len(scale), float(np.max(looseness))
+    sharp, count, loosest = np.sum(looseness <= MAX_RELATIVE_BOUND), len(scale), np.max(looseness)
     if ratio > 1:
         verdict = Verdict.DISAGREES
         reason = (
@@ -84,7 +84,7 @@ def _row(context: RowContext, quantity: str, true: SurfaceTruth, evaluation: Eva
         derivation="a formula on the certified motion; errors of its inputs are propagated to first order, "
         f"its terms are rounded once each; at most {loosest:.1g} of the scale at {count} states",
         cpu_time=evaluation.cpu_time,
-        extra={"states": float(count), "state": float(state), "calls": float(len(found))}
+        extra={"states": count, "state": state, "calls": len(found)}
         | ({WRONG_CALL: most_wrong_call(wrong), FAILED_CALLS: "\n".join(sorted(wrong))} if wrong else {}),
     )  # fmt: skip
 

@@ -222,25 +222,25 @@ def _rows_against_truth(study: RefinementAnalysis, name: str) -> list[Row]:
         resolution, how = "tolerance", f"tightest of {len(samples)} tolerances"
     common = {
         "compared_until": end,
-        "uncertainty": float(limit_uncertainty[at] + truth_uncertainty[at]),
+        "uncertainty": limit_uncertainty[at] + truth_uncertainty[at],
         **study.common_fields,
     }
-    own = float(np.maximum.accumulate(motion_error(name, samples[-1], true))[at])
-    estimate = float(np.max(motion_error(name, samples[-1], limit.y)[: at + 1]) + tolerance[at])
+    own = np.max(motion_error(name, samples[-1], true)[: at + 1])
+    estimate = np.max(motion_error(name, samples[-1], limit.y)[: at + 1]) + tolerance[at]
     finest = study.runs[-1].resolution
     limit_row = make_row(
         f"{name}_limit",
         verdict,
         reason,
-        value=float(off[at]),
-        tolerance=float(tolerance[at]),
-        ratio=float(off[at] / tolerance[at]),
+        value=off[at],
+        tolerance=tolerance[at],
+        ratio=off[at] / tolerance[at],
         derivation=f"up to t = {end:g} s: limit ({how}) ± {limit_uncertainty[at]:.2g}, "
         f"truth ({study.truth.method}) ± {truth_uncertainty[at]:.2g}, "
         f"rounding {study.rounding_description} × {with_unit(study.motion_scales[name], unit, 3)} = "
         f"{rounding[at]:.2g}; a mistake of {DETECTABLE_PARAMETER_ERROR:g} in a parameter changes it by "
         f"{detectable[at]:.2g}",
-        extra={"visible": float(min(detectable[at], 1e308)), "growth": float(study.truth.growth[at])},
+        extra={"visible": min(detectable[at], 1e308), "growth": study.truth.growth[at]},
         **common,
     )
     finest_row = make_row(
