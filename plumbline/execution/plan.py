@@ -24,6 +24,10 @@ LevelSelection = Literal["state", "step", "trajectory", "all"]
 ProgressCallback = Callable[[int, int, str], None]  # finished tasks, all tasks, name of the last one
 
 
+def no_progress(done: int, total: int, what: str) -> None:
+    """Show nothing."""
+
+
 class RunObserver:
     """Follows a run. This base class ignores what it is given."""
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from typing import Any
 
 import pyarrow as pa
 
+from plumbline.execution.plan import ProgressCallback, no_progress
 from plumbline.judging.rows import Level, Row
 from plumbline.judging.smallest_detectable_mistake import COVERED_LEVELS, CoverageEntry, scenario_coverage
 from plumbline.model.datatypes import BALL, JOINT_ELEMENTS, ROD
@@ -38,7 +39,7 @@ def measure_coverage(
     rows: Iterable[Row],
     state_count: int,
     levels: Sequence[Level] = COVERED_LEVELS,
-    progress: Callable[[int, int, str], None] = lambda done, total, what: None,
+    progress: ProgressCallback = no_progress,
     cpu_times: CpuTimes | None = None,
 ) -> list[CoverageEntry]:
     """Compute the coverage of scenarios.
@@ -77,7 +78,7 @@ def run_all(
     executor: Executor,
     tasks: Sequence[Task],
     what: str,
-    progress: Callable[[int, int, str], None],
+    progress: ProgressCallback,
     cpu_times: CpuTimes | None = None,
 ) -> dict[Any, Any]:
     """Run tasks, whose keys begin with a scenario's name: values by key.

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from plumbline.execution.plan import ProgressCallback, no_progress
 from plumbline.model.datatypes import Array, Float, Model, Trajectory
 from plumbline.model.invariants import compute_invariants
 from plumbline.scenario.loader import Scenario
@@ -38,7 +39,7 @@ def measure_drift(
     max_cpu_seconds: float,
     rtols: Sequence[float],
     times: Sequence[float] | None = None,
-    progress: Callable[[int, int, str], None] = lambda done, total, what: None,
+    progress: ProgressCallback = no_progress,
     log: Callable[[str], None] = lambda sentence: None,
 ) -> pa.Table:
     """Measure the drift of the reference's variants.

@@ -7,11 +7,12 @@ both and rows of the state level show either one left out; docs/coverage.md has 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from plumbline.execution.plan import ProgressCallback, no_progress
 from plumbline.model.datatypes import FREE, KINDS, Model, State
 from plumbline.model.features import ROLES, Feature, Place, features, without_feature
 from plumbline.model.kinematics import complete_state, stack_states
@@ -104,7 +105,7 @@ def _is_shown(model: Model, state: State, some: Sequence[Feature]) -> NDArray[np
 def measure_features(
     executor: Executor,
     scenarios: Iterable[Scenario],
-    progress: Callable[[int, int, str], None] = lambda done, total, what: None,
+    progress: ProgressCallback = no_progress,
 ) -> dict[str, list[Feature]]:
     """Compute which features scenarios show.
 

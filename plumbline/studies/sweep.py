@@ -6,7 +6,7 @@ the same horizon (`plumbline.judging.trajectory_level`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
 from typing import Any
 
@@ -15,6 +15,7 @@ import pyarrow as pa
 
 from plumbline.engines.adapter import EngineInfo
 from plumbline.engines.engine_calls import RefinementStudy, run_refinement
+from plumbline.execution.plan import ProgressCallback, no_progress
 from plumbline.judging.rows import Row, RowContext, Verdict
 from plumbline.judging.trajectory_level import judge_trajectory
 from plumbline.measurements.order_and_limit import refinement_resolutions
@@ -58,7 +59,7 @@ def run(
     cells: Sequence[SweepCell],
     workers: WorkerPool,
     engines: Mapping[str, EngineInfo],
-    progress: Callable[[int, int, str], None] = lambda done, total, what: None,
+    progress: ProgressCallback = no_progress,
 ) -> pa.Table:
     """Run and judge all cells of a sweep.
 
@@ -99,7 +100,7 @@ def run(
 class _Progress:
     """Runs tasks and counts them."""
 
-    def __init__(self, workers: WorkerPool, progress: Callable[[int, int, str], None]) -> None:
+    def __init__(self, workers: WorkerPool, progress: ProgressCallback) -> None:
         self.limits, self._workers, self._progress = workers.limits, workers, progress
         self._done, self._total = 0, 0
 

@@ -24,7 +24,7 @@ import copy
 import itertools
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -34,6 +34,7 @@ from pydantic import Field, ValidationError
 
 from plumbline.engines.adapter import EngineInfo
 from plumbline.engines.registry import ENGINES
+from plumbline.execution.plan import ProgressCallback, no_progress
 from plumbline.model.sampling import derive_seed
 from plumbline.scenario import loader as scenarios
 from plumbline.scenario.line_and_column_errors import Problem, ScenarioError, shorten
@@ -146,9 +147,7 @@ class SweepCell:
     invalid_reason: str = ""  # why not
 
 
-def load(
-    path: Path, progress: Callable[[int, int, str], None] = lambda done, total, what: None
-) -> tuple[Sweep, list[SweepCell]]:
+def load(path: Path, progress: ProgressCallback = no_progress) -> tuple[Sweep, list[SweepCell]]:
     """Read a sweep file and make its cells.
 
     Args:

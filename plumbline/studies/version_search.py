@@ -15,7 +15,7 @@ from packaging.specifiers import SpecifierSet
 from packaging.version import Version
 
 from plumbline.engines.environments import declared_attribute, declared_importer_attribute, published_versions
-from plumbline.execution.plan import Plan
+from plumbline.execution.plan import Plan, no_progress
 from plumbline.execution.runner import run_plan
 from plumbline.judging.rows import Row, Verdict
 from plumbline.model_files.model_rows import FileResult
@@ -219,7 +219,7 @@ def search_versions(
 
 
 def _ask_reading(plan: ModelPlan, name: str) -> VersionAnswer:
-    result = run_model_files(replace(plan, importers=(name,), are_importers_required=True), _silent)
+    result = run_model_files(replace(plan, importers=(name,), are_importers_required=True), no_progress)
     if result.problems:
         raise NoSearch("\n".join(map(str, result.problems)))
     if reason := result.engines[name].missing:
@@ -231,7 +231,7 @@ def _ask_verdict(plan: Plan, name: str, row: Mapping[str, Any]) -> VersionAnswer
     level = {"invariants": "trajectory", "surface": "state", "relations": "all"}.get(
         row["level"], row["level"]
     )
-    run = run_plan(replace(plan, engines=[name], level=level), _silent)
+    run = run_plan(replace(plan, engines=[name], level=level), no_progress)
     if reason := run.engines[name].missing:
         raise VersionUnusable(reason)
     return _row_answer(run.rows, row)
@@ -266,7 +266,3 @@ def _row_answer(rows: Sequence[Row], wanted: Mapping[str, Any]) -> VersionAnswer
         text = f"there is no such row{': ' + whole[0] if whole else ''}"
         return VersionAnswer(text, text)
     return VersionAnswer(str(same[0].verdict), f"{same[0].verdict}: {same[0].reason}")
-
-
-def _silent(*_: object) -> None:
-    pass
