@@ -131,7 +131,7 @@ def _render_template(
         drifts=reference_tables.drift_table(results.folder),
         benchmarks=reference_tables.benchmark_table(results.folder),
         decimated=points,
-        notice=(REPORTS_FOLDER / "assets" / "vendor" / "uPlot.LICENSE").read_text(encoding="utf-8"),
+        notice=_asset("vendor/uPlot.LICENSE"),
         rendered=time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),
     )
 
@@ -221,11 +221,10 @@ def bundle_script() -> str:
         ValueError: two modules use a name, or the script contains the end of a script element.
 
     """
-    parts = [(REPORTS_FOLDER / "assets" / "vendor" / "uPlot.iife.min.js").read_text(encoding="utf-8")]
+    parts = [_asset("vendor/uPlot.iife.min.js")]
     names: list[str] = []  # they share one scope, so each must be there once
     for name in SCRIPT_MODULES:
-        text = (REPORTS_FOLDER / "assets" / f"{name}.js").read_text(encoding="utf-8")
-        text = re.sub(r"^import\b[^;]*;\n", "", text, flags=re.MULTILINE)
+        text = re.sub(r"^import\b[^;]*;\n", "", _asset(f"{name}.js"), flags=re.MULTILINE)
         text = re.sub(r"^ *(?://.*|/\*\*(?:[^*]|\*(?!/))*\*/)\n", "", text, flags=re.MULTILINE)
         text = re.sub(r"^export (?=async|function|const|class|let)", "", text, flags=re.MULTILINE)
         names += re.findall(r"^(?:async function|function|const|class|let) (\w+)", text, flags=re.MULTILINE)
@@ -257,7 +256,7 @@ def template_environment() -> Environment:
     )
     made.filters |= {
         "number": format_number,
-        "when": _format_time,
+        "when": lambda iso: str(iso)[:16].replace("T", " "),
         "seconds": _format_duration,
         "css_class": css_class,
         "shown_verdict": shown_verdict,
@@ -275,7 +274,7 @@ def render_page(template: str, script: str = "", **values: Any) -> str:
         values: what the template shows.
 
     """
-    style = stylesheet()
+    style = _asset("vendor/uPlot.min.css") + _asset("style.css")
     scripts = [f"script-src {_csp_hash(script)}"] if script else []
     sources = ["default-src 'none'", *scripts, f"style-src {_csp_hash(style)}", "img-src data:"]
     policy = "; ".join([*sources, "base-uri 'none'", "form-action 'none'"])
@@ -283,18 +282,12 @@ def render_page(template: str, script: str = "", **values: Any) -> str:
     return page.render(policy=policy, css=Markup(style), script=Markup(script), **values)
 
 
-def stylesheet() -> str:
-    """Join uPlot's style and the pages' own."""
-    vendor = (REPORTS_FOLDER / "assets" / "vendor" / "uPlot.min.css").read_text(encoding="utf-8")
-    return vendor + (REPORTS_FOLDER / "assets" / "style.css").read_text(encoding="utf-8")
+def _asset(name: str) -> str:
+    return (REPORTS_FOLDER / "assets" / name).read_text(encoding="utf-8")
 
 
 def _csp_hash(text: str) -> str:
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
-
-
-def _format_time(iso: str) -> str:
-    return str(iso)[:16].replace("T", " ")
 
 
 def _format_duration(duration: Any) -> str:

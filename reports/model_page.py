@@ -36,7 +36,10 @@ def write(folder: Path, document: Record) -> Path:
     write_atomically(folder / "model.json", text.encode())
     path = folder / "model.html"
     write_atomically(path, render(document).encode())
-    write_atomically(folder / "junit.xml", _junit(document))
+    suites = ET.Element("testsuites", name="plumbline model")
+    for file in document["files"]:
+        junit.add_suite(suites, file["file"], file["rows"], {"robot": str(file["name"])})
+    write_atomically(folder / "junit.xml", ET.tostring(suites, encoding="utf-8", xml_declaration=True))
     write_atomically(folder / "model.sarif", json.dumps(sarif(document), indent=1).encode())
     return path
 
@@ -100,11 +103,3 @@ def _marked(file: Record) -> dict[str, list[str]]:
         body: [f"{engine}: {', '.join(dict.fromkeys(found))}" for engine, found in by_engine.items()]
         for body, by_engine in fields.items()
     }
-
-
-def _junit(document: Record) -> bytes:
-    """A suite per file, a test case per check."""
-    suites = ET.Element("testsuites", name="plumbline model")
-    for file in document["files"]:
-        junit.add_suite(suites, file["file"], file["rows"], {"robot": str(file["name"])})
-    return bytes(ET.tostring(suites, encoding="utf-8", xml_declaration=True))

@@ -233,7 +233,9 @@ def _error_curves(name: str, tables: ScenarioTables, packer: ChunkBuilder, point
     for (engine, integrator), rows in group_rows(curves, "engine", "integrator"):
         t = curves["t"][rows].astype(float)
         tolerance = curves["tolerance"][rows].astype(float)
-        judged = _judged_curve(curves, rows)
+        # the tolerance applies to the error of the limit of the steps, if there is one
+        is_limited = "limit_error" in curves and np.isfinite(curves["limit_error"][rows]).any()
+        judged = "limit_error" if is_limited else "position_error"
         above = ~(curves[judged][rows] <= tolerance) & np.isfinite(tolerance)
         shared = t.tobytes()
         if shared not in times:
@@ -280,21 +282,6 @@ def _departures(name: str, results: Results, tables: ScenarioTables) -> Record |
     return {"distance": DEPARTURE, "runs": found}
 
 
-def _judged_curve(curves: Columns, rows: np.ndarray) -> str:
-    """Return the curve that the tolerance applies to: the error of the limit of the steps, if any."""
-    limited = "limit_error" in curves and np.isfinite(curves["limit_error"][rows]).any()
-    return "limit_error" if limited else "position_error"
-
-
-def _final_errors(name: str, tables: ScenarioTables) -> dict[tuple[str, ...], float]:
-    curves = tables["curves"].get(name, {})
-    errors = {}
-    for key, rows in group_rows(curves, "engine", "integrator"):
-        worst = float(np.max(curves["position_error"][rows]))
-        errors[key] = worst if np.isfinite(worst) else np.inf
-    return errors
-
-
 def _motion_frames(
     name: str, scenario: Record, tables: ScenarioTables, packer: ChunkBuilder, points: int
 ) -> Record | None:
@@ -310,7 +297,11 @@ def _motion_frames(
     if not runs:
         return _still(scenario, packer)
     n = int(scenario["bodies"])
-    errors = _final_errors(name, tables)
+    curves = tables["curves"].get(name, {})
+    errors = {
+        key: np.nan_to_num(np.max(curves["position_error"][rows]), nan=np.inf, posinf=np.inf)
+        for key, rows in group_rows(curves, "engine", "integrator")
+    }
     engines = dict.fromkeys(engine for engine, _ in runs)
     best = [min((k for k in runs if k[0] == e), key=lambda k: errors.get(k, np.inf)) for e in engines]
     base = next((k for k in best if k[0] == "reference"), best[0])

@@ -92,7 +92,11 @@ class Results:
         columns: Columns = {}
         for column in table.column_names if table else ():
             values = table[column].to_numpy(zero_copy_only=False)
-            columns[column] = _clean_texts(values) if values.dtype == object else values
+            if values.dtype == object:
+                texts = values.tolist()
+                clean = {text: replace_unprintable(text) for text in set(texts)}
+                values = np.array([clean[text] for text in texts], dtype=object)
+            columns[column] = values
         return columns
 
     @cached_property
@@ -165,12 +169,6 @@ def _table_if_any(folder: Path, name: str) -> Any:
         return read_table(folder, name)
     except FileNotFoundError:
         return None
-
-
-def _clean_texts(values: np.ndarray) -> np.ndarray:
-    texts = values.tolist()
-    clean = {text: replace_unprintable(text) for text in set(texts)}
-    return np.array([clean[text] for text in texts], dtype=object)
 
 
 def group_rows(columns: Columns, *by: str) -> Iterator[tuple[tuple[str, ...], Int[Indices, "records"]]]:

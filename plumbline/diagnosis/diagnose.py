@@ -48,7 +48,7 @@ from plumbline.diagnosis.readings import other_branches
 from plumbline.diagnosis.terms import Terms, force_places, is_spanned
 from plumbline.engines.registry import load_adapter
 from plumbline.equations.tree import SUMS
-from plumbline.model.datatypes import Array, Model, StateQuantities
+from plumbline.model.datatypes import Model, StateQuantities
 from plumbline.model.grouping import grouped
 from plumbline.model.kinematics import complete_state
 from plumbline.truth.ground_truth import StateTruth
@@ -303,16 +303,16 @@ class _Diagnosing:
             found = self._proved(View(), search.explain(mask), mask)
             for one in found:
                 case, right = self._altered(search, one)
-                remaining = [q for q in left_out if q in right and not self._explains(q, right[q])]
+                here = self.difference(View())
+                off = {q: here.given[q] - right[q] for q in left_out if q in right}
+                remaining = [
+                    q for q, x in off.items() if not error_ratio(x, here.bounds[q]) <= ACCEPTED_RATIO
+                ]
                 outputs = self._name_outputs(remaining, self.outputs(case, right))
                 if len(outputs) == len(remaining):
                     causes = self._named(found if not remaining else [one])
                     return (*causes, *_distinct(outputs))
         return ()
-
-    def _explains(self, quantity: str, right: Array) -> bool:
-        here = self.difference(View())
-        return error_ratio(here.given[quantity] - right, here.bounds[quantity]) <= ACCEPTED_RATIO
 
     def _altered(self, search: Search, found: Explanation) -> tuple[Case, Answers]:
         """The mechanism with a cause, and the quantities that follow."""

@@ -16,7 +16,15 @@ import numpy as np
 from plumbline.diagnosis.cause import Cause
 from plumbline.diagnosis.edits import PLURALS, WORDS, Edit, field, with_fields
 from plumbline.diagnosis.prediction import Case, is_closed, single_states
-from plumbline.model.datatypes import JOINT_ELEMENTS, SPRING_FIELDS, VALUE_AXES, Array, Model, State
+from plumbline.model.datatypes import (
+    BODY_FIELDS,
+    JOINT_ELEMENTS,
+    SPRING_FIELDS,
+    VALUE_AXES,
+    Array,
+    Model,
+    State,
+)
 from plumbline.model.kinematics import (
     complete_state,
     cross_matrix,
@@ -429,10 +437,9 @@ def _spring_readings(case: Case, i: int) -> Iterator[Reading]:
 
 def _fields_of_others(model: Model) -> Iterator[tuple[str, str, str, Change]]:
     """A field of all bodies, joints or springs taken from another one, or only of those from one on."""
-    body_values = ("mass", "inertia", "force", "moment", "drag_force", "drag_moment")
     for name, thing in {
         **dict.fromkeys(JOINT_ELEMENTS, "joint"),
-        **dict.fromkeys(body_values, "body"),
+        **dict.fromkeys(("mass", "inertia", *BODY_FIELDS), "body"),
         **dict.fromkeys(SPRING_FIELDS[1:], "spring"),
     }.items():
         values, term = getattr(model, name), WORDS.get(name, name)

@@ -56,10 +56,7 @@ def run_fingerprints(integrator: str, runs: Mapping[float, Trajectory]) -> Finge
 
 
 def _hash_bits(arrays: Sequence[Array]) -> bytes:
-    digest = hashlib.sha256()
-    for array in arrays:
-        digest.update(array.tobytes())
-    return digest.digest()[:16]
+    return hashlib.sha256(b"".join(array.tobytes() for array in arrays)).digest()[:16]
 
 
 class IdentityCheck:

@@ -26,6 +26,7 @@ from plumbline.execution.random_batch import RandomBatch
 from plumbline.execution.runner import RunResult, make_executor, run_plan, save
 from plumbline.judging.findings import Finding, find_findings
 from plumbline.judging.rows import Row
+from plumbline.model.datatypes import JOINT_ELEMENTS
 from plumbline.model.features import features
 from plumbline.processes.cpu_time import CpuTimes
 from plumbline.processes.exceptions import PlumblineError
@@ -41,7 +42,6 @@ MAX_SHRINKINGS = 60  # smaller scenarios that are tried of one finding
 MAX_STORED = 50  # findings with a scenario file
 REMOVABLE = ("load", "drag")  # fields of bodies
 CONTENT = ("name", "mass", "inertia", *REMOVABLE)  # of a body, whatever joint it is on
-ELEMENTS = ("armature", "damping", "stiffness", "rest", "effort")  # fields of joints
 
 Document = dict[str, Any]
 
@@ -233,7 +233,7 @@ def _smaller(document: Document) -> Iterator[Document]:
             if body.get(name):
                 yield _without(document, "bodies", k, name)
         joint = body.get("joint")
-        for name in ELEMENTS if isinstance(joint, dict) else ():
+        for name in JOINT_ELEMENTS if isinstance(joint, dict) else ():
             if joint.get(name):
                 yield _without(document, "bodies", k, "joint", name)
 
