@@ -88,21 +88,13 @@ class Finding:
 
     def record(self) -> dict[str, Any]:
         """Return what results.json holds of it."""
-        return {
-            "name": self.name,
-            "engine": self.engine,
-            "verdict": str(self.verdict),
-            "title": self.title,
-            "sentence": self.sentence,
-            "known_issue": self.known_issue,
-            "versions": self.versions,
-            "right_versions": list(self.right_versions),
-            "scenarios": self.scenarios,
-            "quantities": self.quantities,
-            "largest_ratio": self.largest_ratio,
-            "identity": list(self.identity),
-            "rows": [row.key for row in self.rows],
-        }
+        names = (
+            "name", "engine", "verdict", "title", "sentence", "known_issue", "versions", "right_versions",
+            "scenarios", "quantities", "largest_ratio", "identity",
+        )  # fmt: skip
+        found = {name: getattr(self, name) for name in names}
+        found |= {name: list(found[name]) for name in ("right_versions", "identity")}
+        return found | {"verdict": str(self.verdict), "rows": [row.key for row in self.rows]}
 
 
 def version_order(text: str) -> tuple[bool, Version, str]:
@@ -162,12 +154,8 @@ def find_findings(rows: Iterable[Row], bodies: Mapping[str, int]) -> list[Findin
     return _with_names(found)
 
 
-def _engine(row: Row) -> str:
-    return row.engine.partition("@")[0]
-
-
 def _cell_of_any_version(row: Row) -> tuple[str, ...]:
-    return row.scenario, _engine(row), row.level, row.integrator, row.quantity
+    return row.scenario, row.engine_name, row.level, row.integrator, row.quantity
 
 
 def _plain_identity(row: Row) -> Identity:
@@ -176,9 +164,15 @@ def _plain_identity(row: Row) -> Identity:
         return "", row.verdict, row.quantity
     if row.verdict in (Verdict.UNSUPPORTED, Verdict.FAILED):
         if place := row.extra.get(PLACE):  # one failure says other numbers of every mechanism
-            return _engine(row), row.verdict, str(place), NUMBER.sub("#", row.reason)
-        return _engine(row), row.verdict, str(row.extra.get(WRONG_CALL, row.reason))
-    return _engine(row), row.verdict, row.level, row.integrator, str(row.extra.get(WRONG_CALL, row.quantity))
+            return row.engine_name, row.verdict, str(place), NUMBER.sub("#", row.reason)
+        return row.engine_name, row.verdict, str(row.extra.get(WRONG_CALL, row.reason))
+    return (
+        row.engine_name,
+        row.verdict,
+        row.level,
+        row.integrator,
+        str(row.extra.get(WRONG_CALL, row.quantity)),
+    )
 
 
 @dataclass
@@ -270,7 +264,7 @@ class _Groups:
 
     def add(self, identity: Identity, row: Row, *, known: bool = False) -> None:
         """Add a row of a group that has no cause, or is recorded."""
-        engine = "" if row.verdict == Verdict.HARNESS_FAILED and not known else _engine(row)
+        engine = "" if row.verdict == Verdict.HARNESS_FAILED and not known else row.engine_name
         group = self._plain.setdefault(
             identity, _Group(engine, {identity[1:]}, identity[0] if known else None)
         )
@@ -287,7 +281,7 @@ class _Groups:
                 left.append(row)
         of_cells: dict[tuple[str, ...], list[tuple[Cause, _Group]]] = {}
         for row, cause in sorted(named, key=lambda one: len(one[1].equal)):
-            group = self._group_of(_engine(row), cause)
+            group = self._group_of(row.engine_name, cause)
             group.rows[row.key], group.causes[row.key] = row, cause
             of_cells.setdefault((row.scenario, row.engine, row.integrator), []).append((cause, group))
         for row in left:

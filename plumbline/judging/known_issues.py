@@ -148,14 +148,14 @@ class KnownIssue:
         """Return whether the entry is about rows of this kind, in its scenarios.
 
         Args:
-            kind: engine (with or without ``@version``), its version, level, integrator and quantity of a row.
+            kind: engine (without ``@version``), its version, level, integrator and quantity of a row.
 
         Returns:
             True where all patterns match and the version is in range; pre-releases count.
 
         """
         engine, version, *others = kind
-        names = engine.partition("@")[0], *others
+        names = engine, *others
         patterns = self.engine, self.level, self.integrator, self.quantity
         try:
             return all(map(fnmatchcase, names, patterns)) and (
@@ -185,7 +185,7 @@ class KnownIssue:
         fitting = [limit for limit in self.max_ratio if bodies <= limit]
         return self.max_ratio[min(fitting)] if fitting else 0.0 if self.max_ratio else math.inf
 
-    def scatter_of(self, row: Row, scatter: Mapping[str, float]) -> float | None:
+    def scatter_of(self, row: Row, scatter: Mapping[tuple[str, str], float]) -> float | None:
         """Return how far results for equivalent descriptions of a row's problem differ.
 
         Args:
@@ -196,16 +196,17 @@ class KnownIssue:
 
         """
         own = None if self.shown_by else _scatter_of(row)
-        return scatter.get(self.shown_by or row.engine.partition("@")[0]) if own is None else own
+        shown_by = self.shown_by or row.engine_name
+        return scatter.get((shown_by, row.engine_version)) if own is None else own
 
-    def objection(self, row: Row, covered: float, scatter: Mapping[str, float]) -> str:
+    def objection(self, row: Row, covered: float, scatter: Mapping[tuple[str, str], float]) -> str:
         """Find out whether a row of the expected verdict exceeds what the entry describes.
 
         Args:
             row: a row that the entry's patterns and verdict match.
             covered: the entry's `covered_ratio` for the scenario.
-            scatter: by engine how far its results for equivalent descriptions of the problem differ, in
-                tolerances, in this scenario and version.
+            scatter: by engine and version how far its results for equivalent descriptions of the problem
+                differ, in tolerances, in this scenario.
 
         Returns:
             Why the entry does not cover the row; empty where it does.
@@ -589,9 +590,9 @@ class KnownIssues:
         """
         if row.verdict == Verdict.INFORMATION:
             return []
-        kind = row.engine, row.engine_version, row.level, row.integrator, row.quantity
+        engine = row.engine_name
+        kind = engine, row.engine_version, row.level, row.integrator, row.quantity
         if kind not in self._by_kind:
-            engine = row.engine.partition("@")[0]
             if engine not in self._by_engine:
                 self._by_engine[engine] = [e for e in self.issues if fnmatchcase(engine, e.engine)]
             self._by_kind[kind] = [e for e in self._by_engine[engine] if e.matches_kind(kind)]
@@ -616,11 +617,11 @@ class KnownIssues:
             diagnosis where they have none.
 
         """
-        scatter: dict[str, dict[str, float]] = {}  # by version of the engine, then by engine
+        scatter: dict[tuple[str, str], float] = {}
         for row in rows:
             if (size := _scatter_of(row)) is not None:
-                of, name = scatter.setdefault(row.engine_version, {}), row.engine.partition("@")[0]
-                of[name] = max(size, of.get(name, 0.0))
+                engine = row.engine_name, row.engine_version
+                scatter[engine] = max(size, scatter.get(engine, 0.0))
         chain = bodies, inertia_ratio
         marked = dict[int, Row]()
         compared, shown = set[tuple[str, str]](), set[tuple[str, str, str]]()  # engines at states and steps
@@ -631,10 +632,10 @@ class KnownIssues:
                 entries,
                 {e.id for e in entries if not self._is_shown(e, row, compared, shown)},
                 chain,
-                scatter.get(row.engine_version, {}),
+                scatter,
             )
             if row.level in DIAGNOSED_LEVELS and Verdict(row.verdict).is_comparison:
-                engine = row.engine.partition("@")[0], row.engine_version
+                engine = row.engine_name, row.engine_version
                 compared.add(engine)
                 shown.add((*engine, found.known_issue or ""))
         return [marked[place] for place in range(len(rows))]
@@ -645,12 +646,12 @@ class KnownIssues:
         """Whether states or steps show what a row of a motion follows from, if the run compares them."""
         if row.level not in FOLLOWING_LEVELS or entry.name not in self._shown_by_states:
             return True
-        engine = entry.shown_by or row.engine.partition("@")[0], row.engine_version
+        engine = entry.shown_by or row.engine_name, row.engine_version
         return engine not in compared or (*engine, entry.name) in shown
 
     def _mark(
         self, row: Row, entries: Sequence[KnownIssue], unshown: Set[str], chain: tuple[int, float],
-        scatter: Mapping[str, float],
+        scatter: Mapping[tuple[str, str], float],
     ) -> Row:  # fmt: skip
         self.matched_ids.update(e.id for e in entries)
         expecting = [e for e in entries if e.verdict == row.verdict]

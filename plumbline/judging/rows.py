@@ -206,6 +206,11 @@ class Row:
         return "/".join((self.scenario, self.engine, self.level, self.integrator, self.quantity))
 
     @property
+    def engine_name(self) -> str:
+        """The engine without a version."""
+        return self.engine.partition("@")[0]
+
+    @property
     def style(self) -> VerdictStyle:
         """How the row is shown."""
         return SHOWN_STYLES[shown_verdict(self.verdict, self.known_issue)]

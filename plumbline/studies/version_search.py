@@ -153,9 +153,9 @@ def choose_versions(
     """
     published = published_versions(package)
     usable = [v for v in published.usable if not supported or Version(v) in SpecifierSet(supported)]
-    ends = []
+    ends, last = list[int](), len(usable) - 1
     for text in filter(None, (good, bad)):
-        same = [v for v in usable if Version(v) == Version(text)]
+        same = [k for k, v in enumerate(usable) if Version(v) == Version(text)]
         if not same:
             reason = f"there are: {', '.join(usable)}"
             if any(Version(v) == Version(text) for v in published.without_wheel):
@@ -165,11 +165,9 @@ def choose_versions(
             raise NoSearch(f"{package} {text} cannot be used: {reason}")
         ends += same
     if len(ends) == 1:
-        oldest, newest = usable[0], usable[-1]
-        wanted = newest if good else oldest
-        ends.append(wanted if wanted != ends[0] else (oldest if good else newest))
-    places = sorted(usable.index(v) for v in ends) or [0, len(usable) - 1]
-    chosen = usable[places[0] : places[-1] + 1]
+        wanted = last if good else 0
+        ends.append(wanted if wanted != ends[0] else last - wanted)
+    chosen = usable[min(ends, default=0) : max(ends, default=last) + 1]
     notes = []
     if published.without_wheel:
         rest = ", ".join(published.without_wheel)
