@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from plumbline.judging.rows import RUN_FAMILY, SHOWN_STYLES
+from plumbline.judging.rows import LEVEL_OF_RUN, RUN_FAMILY, SHOWN_STYLES
 from plumbline.model.datatypes import Array, Model, State
 from plumbline.model.invariants import DEPARTURE, LONG_RUN_QUANTITIES, first_departure
 from plumbline.model.kinematics import (
@@ -37,13 +37,6 @@ CURVE_COLUMNS = (
     "norm_drift",
 )
 STUDY_COLUMNS = ("resolution", "error", "cost", "order")
-CLI_LEVEL = {
-    "state": "state",
-    "surface": "state",
-    "step": "step",
-    "trajectory": "trajectory",
-    "invariants": "trajectory",
-}
 DEFAULT_LONG_RUN_SECONDS = 100.0  # s: the default of the nightly's --long-run-seconds
 CATALOGUE_FOLDER = Path(__file__).parent.parent / "scenarios"
 RERUN_FOLDER = "repeated"
@@ -93,7 +86,7 @@ def rerun_command(row: Record, scenario: Record) -> str:
         asked = (row.get("extra") or {}).get("asked", DEFAULT_LONG_RUN_SECONDS)
         words += [] if asked == DEFAULT_LONG_RUN_SECONDS else ["--long-run-seconds", f"{asked:g}"]
     else:
-        words += ["--level", CLI_LEVEL.get(row["level"], "all")]
+        words += ["--level", LEVEL_OF_RUN.get(row["level"], "all")]
     words += ["--out", RERUN_FOLDER]
     if scenario.get("family") == RUN_FAMILY:  # a row about the whole run
         return shlex.join(words)

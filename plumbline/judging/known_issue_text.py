@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from plumbline.judging.findings import CLASSES, Finding
-from plumbline.judging.known_issues import DIAGNOSED_LEVELS, FOLLOWING_LEVELS
+from plumbline.judging.known_issues import DIAGNOSED_LEVELS, FOLLOWING_LEVELS, Selector
 from plumbline.judging.rows import Row, Verdict
 from plumbline.model.grouping import grouped
 
@@ -16,10 +16,7 @@ MATCHED_BY_CAUSE = (*DIAGNOSED_LEVELS, *FOLLOWING_LEVELS)
 MARGIN = 3.0  # of the largest error seen: what a new entry covers
 LINE = 118  # characters
 LARGE = 1e5  # a number that is easier to read with an exponent
-SELECTING = (
-    "scenario", "engine", "level", "integrator", "quantity", "verdict", "max_ratio", "max_ratio_by_inertia",
-    "min_bodies", "min_loops", "joints", "failed_calls", "shown_by", "intermittent", "extra_refinements_only",
-)  # fmt: skip
+SELECTING = [name for name in Selector.model_fields if name != "engine"]  # some rows of an engine
 Entry = dict[str, Any]
 
 
@@ -84,11 +81,9 @@ def merge_entries(entries: Sequence[Entry]) -> list[Entry]:
 
 
 def _merged(entries: Sequence[Entry]) -> Entry:
-    first = {name: value for name, value in entries[0].items() if name not in SELECTING or name == "engine"}
+    first = {name: value for name, value in entries[0].items() if name not in SELECTING}
     evidence = " ".join(dict.fromkeys(entry["evidence"].strip() for entry in entries))
-    rows = [
-        {name: entry[name] for name in SELECTING if name in entry and name != "engine"} for entry in entries
-    ]
+    rows = [{name: entry[name] for name in SELECTING if name in entry} for entry in entries]
     return first | {"evidence": evidence, "rows": rows}
 
 

@@ -21,7 +21,7 @@ from fnmatch import fnmatchcase
 from functools import cache
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from packaging.specifiers import SpecifierSet
 from packaging.version import InvalidVersion, Version
@@ -62,7 +62,6 @@ RowKind = tuple[str, str, str, str, str]  # of a row: engine, its version, level
 KNOWN_ISSUES_FILE = Path(__file__).with_name("known_issues.yaml")
 DIAGNOSED_LEVELS = ("state", "step")  # whose rows have causes
 FOLLOWING_LEVELS = ("surface", "trajectory", "invariants")  # whose rows follow from those
-LEVELS: tuple[Level, ...] = ("state", "surface", "step", "invariants", "trajectory", "relations", "model")
 ANY_LENGTH = 10**9  # bodies
 # Bounds are 64 roundings of the largest term and more: an answer that is off by a million times the quantity
 # is 1e20 bounds off.
@@ -300,7 +299,7 @@ def _field(description: str, default: Any = ...) -> Any:
     return Field(default, description=description)
 
 
-class _Selector(BaseModel):
+class Selector(BaseModel):
     """Rows that an entry covers: lists stand for each name, of which each must occur."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -357,7 +356,7 @@ class _Selector(BaseModel):
             common: fields of the entry.
 
         """
-        own = {one: getattr(self, one) for one in _Selector.model_fields}
+        own = {one: getattr(self, one) for one in Selector.model_fields}
         own["engine"] = self.engine or common["engine"]
         own |= {"min_bodies": self.min_bodies or 0, "min_loops": self.min_loops or 0}
         own |= {"joints": tuple(self.joints or ()), "failed_calls": tuple(self.failed_calls or ())}
@@ -378,7 +377,7 @@ class _Cause(BaseModel):
     change: str = _field("missing, doubled, reversed, in the body frame, …", "")
 
 
-class Entry(_Selector):
+class Entry(Selector):
     """An entry as the file has it: a finding, and the rows that it covers."""
 
     id: _Name = _field("A name of the entry, unique in all files: the finding's.")
@@ -393,7 +392,7 @@ class Entry(_Selector):
     evidence: _Sentence = _field("A measurement, a script, a document.")
     reason: _Sentence = _field("The cause.")
     script: str = _field("A file of docs/surface that shows it.", "")
-    rows: list[_Selector] | None = _field(
+    rows: list[Selector] | None = _field(
         "Rows that it covers, by default those of the entry's own patterns; an empty list: none, because the "
         "adapter goes around it.",
         None,
@@ -407,7 +406,7 @@ class Entry(_Selector):
         return self
 
     @property
-    def _selectors(self) -> Sequence[_Selector]:
+    def _selectors(self) -> Sequence[Selector]:
         return [self] if self.rows is None else self.rows
 
     @property
@@ -427,7 +426,7 @@ class Entry(_Selector):
         for number, selector in enumerate(self.rows or (), 1):
             yield from selector.issues(f"{self.id} ({number})", common)
         if self.rows is None:
-            yield from _Selector.issues(self, self.id, common)
+            yield from Selector.issues(self, self.id, common)
 
 
 def load_known_issues(
@@ -520,12 +519,12 @@ def _name_problems(source: YamlSource, entries: Sequence[Entry], others: set[str
         },
         "engine": {*ENGINES, *IMPORTERS, *USER_ENGINES},
         "shown_by": set(ENGINES),
-        "level": set(map(str, LEVELS)),
+        "level": set(get_args(Level)),
         "integrator": {"-", *declared_integrators()},
         "quantity": _quantities(),
     }
     for number, entry in enumerate(entries):
-        places: list[tuple[tuple[PathKey, ...], _Selector]] = [((number,), entry)]
+        places: list[tuple[tuple[PathKey, ...], Selector]] = [((number,), entry)]
         places += [((number, "rows", i), selector) for i, selector in enumerate(entry.rows or ())]
         for (at, selector), (name, words) in product(places, known.items()):
             given = getattr(selector, name)

@@ -13,6 +13,11 @@ import numpy as np
 from plumbline.model.datatypes import Array, Float
 
 Level = Literal["state", "surface", "step", "invariants", "trajectory", "relations", "model"]
+# by level of rows that of a run which compares them; a run of all levels compares the others
+LEVEL_OF_RUN: dict[str, Literal["state", "step", "trajectory"]] = {
+    "state": "state", "surface": "state", "step": "step",
+    "trajectory": "trajectory", "invariants": "trajectory",
+}  # fmt: skip
 # hash of an answer's bits, by integrator ("-" at states), quantity and resolution ("" at states)
 Fingerprints = dict[tuple[str, str, str], bytes]
 Columns = dict[str, Any]  # column name → its values (n,), or the one value of all n records

@@ -17,7 +17,7 @@ from packaging.version import Version
 from plumbline.engines.environments import declared_attribute, declared_importer_attribute, published_versions
 from plumbline.execution.plan import Plan, no_progress
 from plumbline.execution.runner import run_plan
-from plumbline.judging.rows import Row, Verdict
+from plumbline.judging.rows import LEVEL_OF_RUN, Row, Verdict
 from plumbline.model_files.model_rows import FileResult
 from plumbline.model_files.model_run import ModelPlan, run_model_files
 from plumbline.processes.exceptions import PlumblineError
@@ -226,9 +226,7 @@ def _ask_reading(plan: ModelPlan, name: str) -> VersionAnswer:
 
 
 def _ask_verdict(plan: Plan, name: str, row: Mapping[str, Any]) -> VersionAnswer:
-    level = {"invariants": "trajectory", "surface": "state", "relations": "all"}.get(
-        row["level"], row["level"]
-    )
+    level = LEVEL_OF_RUN.get(row["level"], "all")
     run = run_plan(replace(plan, engines=[name], level=level), no_progress)
     if reason := run.engines[name].missing:
         raise VersionUnusable(reason)
