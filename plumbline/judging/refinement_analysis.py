@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,7 +22,6 @@ from plumbline.measurements.refinement_study import run_samples
 from plumbline.model.datatypes import Array, Float, Integrator, Model, Trajectory
 from plumbline.model.invariants import (
     MOTION_UNITS,
-    Invariants,
     compute_invariants,
     invariant_scales,
     motion_errors,
@@ -43,55 +41,48 @@ class WindowVerdict(NamedTuple):
     remark: str = ""  # on the time that the window does not cover
 
 
-@dataclass
 class RefinementAnalysis:
-    """The runs of a refinement study, coarse to fine, and what follows from all of them together."""
+    """The runs of a refinement study, coarse to fine, and what follows from all of them together.
 
-    context: RowContext
-    model: Model
-    truth: MotionTruth
-    integrator: Integrator
-    runs: Sequence[RefinementRun]
-    horizon: float  # s, up to which positions may be compared
-    finest: Trajectory = field(init=False)
-    # by the names of `MOTION_UNITS`, per run (T, N, ·); NaN where the run failed
-    samples: dict[str, list[Array]] = field(init=False)
-    true_samples: dict[str, Array] = field(init=False)  # of the truth, by the same names
-    motion_scales: dict[str, float] = field(init=False)  # of rounding in them
-    scaled_states: list[Float[Array, "samples bodies 6"]] = field(
-        init=False
-    )  # per run: r and ṙ over their scales
-    invariant_drifts: list[Invariants | None] = field(init=False)
-    invariant_scales: dict[str, float] = field(init=False)  # of the true motion, units as `INVARIANT_UNITS`
-    # of a run and its steps' solver, grown, for a scale of 1
-    rounding: Float[Array, "samples"] = field(init=False)
-    observed: ObservedOrder = field(init=False)
-    observed_until: float = field(init=False)  # s, end of the window in which the order was observed
+    Attributes:
+        horizon: up to which positions may be compared [s].
+        samples: by the names of `MOTION_UNITS`, per run (T, N, ·); NaN where the run failed.
+        true_samples: of the truth, by the same names.
+        motion_scales: of rounding in them.
+        scaled_states: per run r and ṙ (T, N, 6) over their scales.
+        invariant_scales: of the true motion, units as `INVARIANT_UNITS`.
+        rounding: (T,) of a run and its steps' solver, grown, for a scale of 1.
+        observed_until: end of the window in which the order was observed [s].
 
-    def __post_init__(self) -> None:
-        last = self.runs[-1].trajectory
-        assert last is not None
-        self.finest = last
-        r, p, v, pdot = (run_samples(self.runs, name) for name in ("r", "p", "v", "pdot"))
+    """
+
+    def __init__(
+        self, context: RowContext, model: Model, truth: MotionTruth, integrator: Integrator,
+        runs: Sequence[RefinementRun], horizon: float,
+    ) -> None:  # fmt: skip
+        """Measure samples, scales, invariants and the order."""
+        self.context, self.model, self.truth, self.integrator = context, model, truth, integrator
+        self.runs, self.horizon = runs, horizon
+        trajectories = [run.trajectory for run in runs]
+        assert trajectories[-1] is not None
+        self.finest: Trajectory = trajectories[-1]
+        r, p, v, pdot = (run_samples(runs, name) for name in ("r", "p", "v", "pdot"))
         omega = [angular_velocity(*pair) for pair in zip(p, pdot, strict=True)]
         self.samples = dict(zip(MOTION_UNITS, (r, p, v, omega), strict=True))
-        self.true_samples = motion_samples(self.truth.trajectory)
-        self.motion_scales = motion_scales(self.model, self.truth.trajectory, self.truth.length)
-        self.invariant_scales = invariant_scales(self.model, self.truth.trajectory, self.truth.length)
+        self.true_samples = motion_samples(truth.trajectory)
+        self.motion_scales = motion_scales(model, truth.trajectory, truth.length)
+        self.invariant_scales = invariant_scales(model, truth.trajectory, truth.length)
         # Positions alone may converge faster than the method: symplectic Euler from a state without
         # torque is a leapfrog in r, and shows its order 1 in ṙ only.
-        sizes = self.truth.length, self.invariant_scales["gap_rate"]
+        length, speed = truth.length, self.invariant_scales["gap_rate"]
         self.scaled_states = [
-            np.concatenate([a / sizes[0], b / sizes[1]], axis=-1) for a, b in zip(r, v, strict=True)
+            np.concatenate([a / length, b / speed], axis=-1) for a, b in zip(r, v, strict=True)
         ]
-        trajectories = [run.trajectory for run in self.runs]
-        self.invariant_drifts = [
-            None if t is None else compute_invariants(self.model, t) for t in trajectories
-        ]
+        self.invariant_drifts = [None if t is None else compute_invariants(model, t) for t in trajectories]
         # The equations of an implicit step are solved to a tolerance: independent errors of so many steps add
         # up like a random walk.
         solved = self.finest.solver_rtol * np.sqrt(self.finest.steps)
-        self.rounding = (RUN_ROUNDING + solved) * self.truth.growth
+        self.rounding = (RUN_ROUNDING + solved) * truth.growth
         self.observed, self.observed_until = self._observe_order()
 
     @property

@@ -390,9 +390,8 @@ def test_scales_are_sizes_of_what_the_invariants_are_made_of():
     assert scales["momentum_drift"] == pytest.approx(sum(model.mass) * arm * speed + inertia * spin)
     assert scales["joint_gap"] == max(LENGTH, arm) and scales["norm_drift"] == 1.0
     assert scales["gap_rate"] == pytest.approx(max(speed, spin * LENGTH), rel=1e-12)
-    still = replace(
-        held, truth=make_truth(trajectory=replace(true, v=0 * true.v, pdot=0 * true.pdot))
-    ).invariant_scales
+    truth = make_truth(trajectory=replace(true, v=0 * true.v, pdot=0 * true.pdot))
+    still = RefinementAnalysis(WHO, model, truth, METHOD, held.runs, 2.0).invariant_scales
     assert still["energy_drift"] == pytest.approx(max(potential, height_energy), rel=1e-12)
     over = (
         np.linspace(1, -1, 17)[:, None, None] * TRUE_TRAJECTORY.r[0]
@@ -400,9 +399,8 @@ def test_scales_are_sizes_of_what_the_invariants_are_made_of():
     turned = replace(TRUE_TRAJECTORY, r=over, v=0 * TRUE_TRAJECTORY.v, pdot=0 * TRUE_TRAJECTORY.pdot)
     raised = 2 * abs(MODEL.mass[0] * TRUE_TRAJECTORY.r[0, 0] @ MODEL.gravity)
     assert analysis(trajectory=turned).invariant_scales["energy_drift"] == pytest.approx(raised, rel=1e-12)
-    long = replace(
-        held, truth=make_truth(trajectory=true, length=50.0)
-    ).invariant_scales  # a fall is faster than this
+    truth = make_truth(trajectory=true, length=50.0)  # a fall is faster than this
+    long = RefinementAnalysis(WHO, model, truth, METHOD, held.runs, 2.0).invariant_scales
     assert long["joint_gap"] == 50.0
     assert long["gap_rate"] == pytest.approx(
         max(np.sqrt(g * 50), np.max(np.linalg.norm(omega, axis=-1)) * 50)
