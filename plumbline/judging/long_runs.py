@@ -11,8 +11,8 @@ motion, must not grow with time (E. Hairer, C. Lubich, G. Wanner, Geometric Nume
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -22,9 +22,7 @@ from plumbline.measurements.drift_order import (
     BLOCK_COUNT,
     MAX_RELATIVE_DRIFT,
     SIGMA_FACTOR,
-    DriftWindow,
     InvariantDrift,
-    LongRun,
 )
 from plumbline.measurements.long_run_study import LongRunStudy, decisive_windows, leaves_range
 from plumbline.model.datatypes import Integrator, Model
@@ -57,9 +55,9 @@ def judge_long_runs(
         )  # fmt: skip
         return JudgingResult([row])
     rows = []
-    for quantity, unit in INVARIANT_UNITS.items():
+    for quantity in INVARIANT_UNITS:
         if quantity in study.runs[-1].windows:
-            judge = _DriftJudge(context, integrator, study, quantity, unit)
+            judge = _DriftJudge(context, integrator, study, quantity)
             # a shorter window never overrules a longer one's disagreement
             rows.append(first_decided(judge.judge_window(judge.drift(end)) for end in judge.window_ends))
             has_bound = integrator.is_symmetric and integrator.kind == "step" and is_regular
@@ -84,35 +82,18 @@ def _missing_runs(study: LongRunStudy) -> tuple[Verdict, str] | None:
     return None
 
 
-@dataclass(frozen=True)
 class _DriftJudge:
     """One invariant of one integrator's long runs."""
 
-    context: RowContext
-    integrator: Integrator
-    study: LongRunStudy
-    quantity: str
-    unit: str
-
-    @property
-    def name(self) -> str:
-        """The quantity in words."""
-        return self.quantity.replace("_", " ")
-
-    @property
-    def finest(self) -> LongRun:
-        """The run that is judged."""
-        return self.study.runs[-1]
-
-    @property
-    def windows(self) -> dict[float, DriftWindow]:
-        """The finest run's drifts of this invariant, by window."""
-        return self.finest.windows[self.quantity]
-
-    @property
-    def window_ends(self) -> list[float]:
-        """Ends of the windows that are long enough to decide [s], longest first."""
-        return decisive_windows(self.finest, self.quantity, self.study.plan)
+    def __init__(
+        self, context: RowContext, integrator: Integrator, study: LongRunStudy, quantity: str
+    ) -> None:
+        self.integrator, self.study, self.quantity = integrator, study, quantity
+        self.name, self.unit = quantity.replace("_", " "), INVARIANT_UNITS[quantity]
+        self.finest = study.runs[-1]  # the run that is judged
+        self.windows = self.finest.windows[quantity]
+        self.window_ends = decisive_windows(self.finest, quantity, study.plan)  # s, longest first
+        self.make_row = partial(context.make_row, "invariants", integrator.name)
 
     def drift(self, end: float) -> InvariantDrift:
         """The drift in the window up to ``end``."""
@@ -243,10 +224,4 @@ class _DriftJudge:
                 "asked": self.study.plan.requested_seconds,
                 **{f"by {t:g} s": self.windows[t].max_drift for t in sorted(self.windows)},
             },
-        )
-
-    def make_row(self, quantity: str, verdict: Verdict, reason: str, unit: str, **more: Any) -> Row:
-        """A row about this integrator."""
-        return self.context.make_row(
-            "invariants", self.integrator.name, quantity, verdict, reason, unit, **more
         )
