@@ -55,13 +55,10 @@ def check_rows(comparison: Comparison, rows: Sequence[Row]) -> None:
 
     """
     if problems := [row for row in rows if row in comparison.problems]:
-        pytest.fail("\n".join(map(_words, problems)), pytrace=False)
+        found = (filter(None, (f"{row.key}: {row.reason}", row.diagnosis)) for row in problems)
+        pytest.fail("\n".join(map("; ".join, found)), pytrace=False)
     if not any(row.verdict == Verdict.AGREES for row in rows):
         pytest.skip(rows[0].reason if rows else "the mechanism has no such quantity")
-
-
-def _words(row: Row) -> str:
-    return f"{row.key}: {row.reason}; {row.diagnosis}" if row.diagnosis else f"{row.key}: {row.reason}"
 
 
 def _specification(adapter: type[Adapter]) -> str:

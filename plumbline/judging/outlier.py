@@ -49,30 +49,27 @@ def doubt_truth(
         The rows in the same order; where the harness is in doubt, the verdict says so.
 
     """
+    decided = (
+        row
+        for row in rows
+        if row.quantity in COMPARED_WITH_TRUTH.get(row.level, ())
+        and row.verdict in (Verdict.AGREES, Verdict.DISAGREES)
+        and row.known_issue is None
+    )
     doubtful: dict[tuple[str, str], str] = {}
-    for level, quantities in COMPARED_WITH_TRUTH.items():
-        for quantity in quantities:
-            decided = [
-                row
-                for row in rows
-                if (row.level, row.quantity) == (level, quantity)
-                and row.verdict in (Verdict.AGREES, Verdict.DISAGREES)
-                and row.known_issue is None
-            ]
-            if all(row.verdict == Verdict.AGREES for row in decided):
-                continue
-            families = {row.engine: family_of(row.engine) for row in decided}
-            decided = [row for row in decided if families[row.engine] != defines_truth]
-            against = {families[row.engine]: row for row in decided}
-            if len(against) < MIN_FAMILIES or any(row.verdict == Verdict.AGREES for row in decided):
-                continue
-            are_alike = all(
-                one.key in deviations and deviations[one.key].is_like(deviations[other.key])
-                for one, other in combinations(decided, 2)
-                if families[one.engine] != families[other.engine]
-            )
-            if are_alike or len(against) >= ENOUGH_FAMILIES:
-                doubtful[level, quantity] = _describe_doubt(decided, are_alike)
+    for compared, some in grouped(decided, lambda row: (row.level, row.quantity)).items():
+        families = {row.engine: family_of(row.engine) for row in some}
+        witnesses = [row for row in some if families[row.engine] != defines_truth]
+        against = {families[row.engine] for row in witnesses}
+        if len(against) < MIN_FAMILIES or any(row.verdict == Verdict.AGREES for row in witnesses):
+            continue
+        are_alike = all(
+            one.key in deviations and deviations[one.key].is_like(deviations[other.key])
+            for one, other in combinations(witnesses, 2)
+            if families[one.engine] != families[other.engine]
+        )
+        if are_alike or len(against) >= ENOUGH_FAMILIES:
+            doubtful[compared] = _describe_doubt(witnesses, are_alike)
     return [
         replace(
             row,
