@@ -125,12 +125,15 @@ def _shifted_centre(k: int, axis: int) -> NumberChange:
     return change
 
 
+def _slide_axis(model: Model, k: int) -> Array:
+    return rotation_matrix(model.turn[k, 0])[:, model.kinds[k].motions[0][1]]
+
+
 def _shifted_slide(k: int) -> NumberChange:
     """Count a slide's coordinate, spring included, from a point further along its axis."""
 
     def change(case: Case, x: Array) -> Case:
-        model = case.model
-        along = rotation_matrix(model.turn[k, 0])[:, model.kinds[k].motions[0][1]]
+        model, along = case.model, _slide_axis(case.model, k)
         point, rest = model.point.copy(), model.rest.copy()
         point[..., k, 0, :] += x[0] * along
         rest[..., k, 0] -= x[0]
@@ -261,8 +264,7 @@ def _joints(model: Model) -> Iterator[Edit]:
 
 def _shift_is_askew(model: Model, k: int) -> bool:
     """Whether another origin of a slide is more than a coordinate of its far point."""
-    along = rotation_matrix(model.turn[k, 0])[:, model.kinds[k].motions[0][1]]
-    return bool(model.stiffness[k, 0] or np.count_nonzero(np.abs(along) > ASKEW) > 1)
+    return bool(model.stiffness[k, 0] or np.count_nonzero(np.abs(_slide_axis(model, k)) > ASKEW) > 1)
 
 
 @dataclass(frozen=True)

@@ -83,14 +83,13 @@ class _SingleSteps(_Steps):
         self, model: Model, states: Sequence[State], method: JointSpaceMethod, answer: StepEvaluation
     ) -> None:
         super().__init__(model, states, method)
-        found = [(a.state, a.step, a.run) for a in answer.attempts if a.run is not None]
-        self.runs = [run for *_, run in found]
-        self.starts = [(index, h, run.angle_axes) for index, h, run in found]
+        self.runs = [run for *_, run in answer.runs]
+        self.starts = [(index, h, run.angle_axes) for index, h, run in answer.runs]
         self.steps = FormulaSteps(method, model, states, self.starts)
         compared = self.steps.compare(self.runs).values()
         pairs = [(x, at) for c in compared for row, at in zip(c.ratios, c.places, strict=True) for x in row]
         self.ratios = [ratio for ratio, _ in pairs]
-        first = Place(*found[0][:2], 1)
+        first = Place(*self.starts[0][:2], 1)
         _, self.worst = max(pairs, key=lambda pair: pair[0], default=(0.0, first))
         wrong = {(at.state, at.step) for ratio, at in pairs if not ratio <= 1}
         self.differing = [a for a in answer.attempts if (a.state, a.step) in wrong]
@@ -216,8 +215,7 @@ def explain_steps(
 
     """
     if isinstance(method, ConstrainedMethod):
-        found = [(a.state, a.step, a.run) for a in answer.attempts if a.run is not None]
-        return _explain_constrained_steps(model, states, method, found)
+        return _explain_constrained_steps(model, states, method, answer.runs)
     steps = _SingleSteps(model, states, method, answer)
     causes = _explained(steps, max(steps.ratios, default=0.0))
     if causes == (UNEXPLAINED,) and len(steps.differing) < len(steps.runs):

@@ -184,11 +184,16 @@ class Outputs:
             yield f"of another {thing}, the one on which it hangs", right[:, hangs]
         if quantity == "angular_momentum":
             momentum = np.sum(model.mass[..., None] * state.v, axis=1)
-            centre = np.sum(model.mass[..., None] * state.r, axis=1) / np.sum(model.mass, axis=-1)[..., None]
             spin = rotate_vectors(model.inertia, state.omega)
-            yield "about the centre of mass", right - cross(centre, momentum)
+            yield "about the centre of mass", right - cross(self._centre, momentum)
             turned = right - np.sum(np.matvec(turns, spin) - spin, axis=1)
             yield "with the spin in body axes of all bodies", turned
+
+    @cached_property
+    def _centre(self) -> Array:
+        """(S, 3) centre of mass of the whole."""
+        mass, r = self.case.model.mass, self.case.state.r
+        return np.asarray(np.sum(mass[..., None] * r, axis=1) / np.sum(mass, axis=-1)[..., None])
 
     @cached_property
     def _turns(self) -> Array:
@@ -513,9 +518,8 @@ class Outputs:
         for k in range(model.n):
             if model.kinds[k].is_rigid and far[k] >= 0:
                 carrying[:, k] = carrying[:, far[k]]
-        centre = np.sum(model.mass[..., None] * state.r, axis=1) / np.sum(model.mass, axis=-1)[..., None]
         points = {"the centres of mass": state.r[:, model.body[:, 1]], "the world's origin": 0 * self._near,
-                  "the centre of mass of the whole": np.broadcast_to(centre[:, None], self._near.shape),
+                  "the centre of mass of the whole": np.broadcast_to(self._centre[:, None], self._near.shape),
                   "the far points": hung, "the points of the joints that carry welds": carrying}  # fmt: skip
         parts = list[Part]()
         for what, point in points.items():

@@ -106,6 +106,11 @@ class StepEvaluation:
     cpu_time: float  # CPU s
     run: StepAttempt | None = None  # many steps from the first state
 
+    @property
+    def runs(self) -> list[tuple[int, float, StepRun]]:
+        """Index of the state, step [s] and the steps of the attempts that have some."""
+        return [(one.state, one.step, one.run) for one in self.attempts if one.run is not None]
+
 
 def describe_engine(engine: str) -> EngineInfo:
     """Load an engine and describe it.

@@ -99,8 +99,7 @@ def _single_step_rows(
     context: RowContext, integrator: Integrator, model: Model, states: Sequence[State], answer: StepEvaluation
 ) -> list[Row]:
     method, verdict, reason, gap, place = integrator.method, Verdict.UNSUPPORTED, "", "", ""
-    attempts = [attempt for attempt in answer.attempts if attempt.run is not None]
-    runs = [(attempt.state, attempt.step, attempt.run) for attempt in attempts if attempt.run is not None]
+    attempts, runs = [attempt for attempt in answer.attempts if attempt.run is not None], answer.runs
     is_constrained = isinstance(method, ConstrainedMethod)  # where fewer steps than asked for have failed
     failed = [one for one in answer.attempts if one.failure and (is_constrained or one.run is None)]
     if failed:
