@@ -59,7 +59,12 @@ def render(document: Record) -> str:
                 **file,
                 "columns": {name: {row["quantity"]: row for row in rows} for name, rows in engines.items()},
                 "worst": {name: max(rows, key=rank) for name, rows in engines.items()},
-                "findings": [row for row in file["rows"] if _is_finding(row)],
+                # what no cause explains; the table has the words of whole columns
+                "findings": [
+                    row
+                    for row in file["rows"]
+                    if row["quantity"] != "all" and needs_attention(row) and not row["diagnosis"]
+                ],
                 "errors": [row for row in file["rows"] if row["verdict"] == "disagrees"],
                 "drawing": robot_drawing.draw(file["drawing"], _marked(file)),
                 "counts_not_compared": Counter(feature["what"] for feature in file["not_compared"]),
@@ -76,11 +81,6 @@ def render(document: Record) -> str:
         counts=count_verdicts(row for file in document["files"] for row in file["rows"]),
         is_state_given=document["options"]["at"] is not None,
     )
-
-
-def _is_finding(row: Record) -> bool:
-    """Whether a row is listed: what no cause explains; the table has the words of whole columns."""
-    return row["quantity"] != "all" and needs_attention(row) and not row["diagnosis"]
 
 
 def _sentence(document: Record) -> str:

@@ -104,7 +104,7 @@ def _without_one(model: Model, states: list[State]) -> Iterator[tuple[str, Itera
         yield "motion", [(model, [_at_rest(s) for s in states])]
     for what, names in ABSENT_FIELDS.items():
         if any(np.any(getattr(model, name)) for name in names):
-            yield what, [(_without(model, *names), states)]
+            yield what, [(model.changed(**{name: 0 * getattr(model, name) for name in names}), states)]
     if np.any(model.inertia * (1 - np.eye(3))):
         yield "products of inertia", [(replace(model, inertia=model.inertia * np.eye(3)), states)]
     for kind in dict.fromkeys(model.kind):
@@ -122,11 +122,6 @@ def _turns(model: Model) -> Flags:
     """Where a joint's axes are turned in a body (J, 2); joints that have none are not."""
     of_kind = [not kind.has_attitude for kind in model.kinds]
     return np.asarray(np.any(model.turn[..., 1:] != 0, axis=-1) & np.array(of_kind)[:, None])
-
-
-def _without(model: Model, *names: str) -> Model:
-    changes: dict[str, np.ndarray] = {name: 0 * getattr(model, name) for name in names}
-    return replace(model, **changes)  # type: ignore[arg-type]
 
 
 def _at_rest(s: State) -> State:

@@ -237,11 +237,10 @@ def _title(identity: Identity, cause: Cause | None, row: Row) -> str:
     if cause is None:
         if by := row.extra.get(WRONG_CALL):
             return f"{'wrong' if row.verdict == Verdict.DISAGREES else row.verdict} by {by}"
+        what, by = row.quantity.replace("_", " "), "" if row.integrator == "-" else row.integrator
         if row.verdict == Verdict.DISAGREES:
-            at = "" if row.integrator == "-" else f" of {row.integrator}"
-            return f"{row.quantity.replace('_', ' ')}{at} at level {row.level}"
-        at = "" if row.integrator == "-" else f", {row.integrator}"
-        return f"{row.verdict}: {row.quantity.replace('_', ' ')} at level {row.level}{at}"
+            return f"{what}{by and f' of {by}'} at level {row.level}"
+        return f"{row.verdict}: {what} at level {row.level}{by and f', {by}'}"
     kind, term, *rest = identity
     if kind == "rounding":
         return f"{term} lose digits"

@@ -48,6 +48,7 @@ class RefinementAnalysis:
         horizon: up to which positions may be compared [s].
         samples: by the names of `MOTION_UNITS`, per run (T, N, ·); NaN where the run failed.
         true_samples: of the truth, by the same names.
+        limit_error: (T,) of the finest run in its unit, by the same names; 0 where it is not itself a limit.
         motion_scales: of rounding in them.
         scaled_states: per run r and ṙ (T, N, 6) over their scales.
         invariant_scales: of the true motion, units as `INVARIANT_UNITS`.
@@ -70,6 +71,7 @@ class RefinementAnalysis:
         omega = [angular_velocity(*pair) for pair in zip(p, pdot, strict=True)]
         self.samples = dict(zip(MOTION_UNITS, (r, p, v, omega), strict=True))
         self.true_samples = motion_samples(truth.trajectory)
+        self.limit_error = motion_errors(self.finest, self.finest.softer or self.finest)
         self.motion_scales = motion_scales(model, truth.trajectory, truth.length)
         self.invariant_scales = invariant_scales(model, truth.trajectory, truth.length)
         # Positions alone may converge faster than the method: symplectic Euler from a state without
@@ -100,11 +102,6 @@ class RefinementAnalysis:
         """Fields that all rows of this study share."""
         alias = None if self.model.has_drag else self.integrator.alias_of  # with drag the two methods differ
         return {"alias_of": alias, "cpu_time": sum(run.cpu_time for run in self.runs)}
-
-    @property
-    def limit_error(self) -> dict[str, Array]:
-        """Of each name of `MOTION_UNITS` (T,), in its unit: of the finest run, where it is itself a limit."""
-        return motion_errors(self.finest, self.finest.softer or self.finest)
 
     @property
     def rounding_description(self) -> str:
