@@ -423,10 +423,8 @@ class Entry(Selector):
         common["cause"] = {name: value for name, value in cause.items() if value}
         common["needs"] = None if self.needs is None else tuple(self.needs)
         common["entry"] = self.id
-        for number, selector in enumerate(self.rows or (), 1):
-            yield from selector.issues(f"{self.id} ({number})", common)
-        if self.rows is None:
-            yield from Selector.issues(self, self.id, common)
+        for number, selector in enumerate(self._selectors, 1):
+            yield from selector.issues(self.id if self.rows is None else f"{self.id} ({number})", common)
 
 
 def load_known_issues(
