@@ -74,7 +74,7 @@ QUATERNIONS: dict[str, Callable[[Array], Array]] = {
 def reading_edits(case: Case) -> Iterator[Edit]:
     """List the readings of a mechanism that change it, each once."""
     known: set[object] = {()}
-    for term, place, words, change in _every_reading(case):
+    for term, place, words, change in _every_reading(case.model):
         key = change_key(change(case), case)
         if key in known:
             continue
@@ -116,8 +116,7 @@ def _attitude_key(q: Array, model: Model | None) -> Array:
     return np.asarray(q[..., :, None] * q[..., None, :])
 
 
-def _every_reading(case: Case) -> Iterator[tuple[str, str, str, Change]]:
-    model = case.model
+def _every_reading(model: Model) -> Iterator[tuple[str, str, str, Change]]:
     groups: dict[tuple[str, ...], list[list[Piece]]] = {}
     for thing, count, readings in (
         ("body", model.n, _body_readings),
@@ -125,7 +124,7 @@ def _every_reading(case: Case) -> Iterator[tuple[str, str, str, Change]]:
         ("spring", len(model.spring_body), _spring_readings),
     ):
         for k in range(count):
-            for term, words, pieces, where in readings(case, k):
+            for term, words, pieces, where in readings(model, k):
                 groups.setdefault((thing, term, words, where), []).append(pieces)
                 if count <= MAX_PLACES:
                     yield term, f"{thing} {k + 1}{where}", words, _replaced(pieces)
@@ -275,8 +274,7 @@ OF_BODIES: tuple[tuple[str, str, dict[str, Read]], ...] = (
 )  # fmt: skip
 
 
-def _body_readings(case: Case, k: int) -> Iterator[Reading]:
-    model = case.model
+def _body_readings(model: Model, k: int) -> Iterator[Reading]:
     kind = model.kinds[k]
     is_read = {"p": kind.has_attitude, "omega": kind.has_attitude, "v": kind.holds_nothing}
     for term, name, readings in OF_BODIES:
@@ -330,8 +328,7 @@ def _inertia_readings(model: Model, k: int) -> Iterator[Reading]:
 # -- joints --------------------------------------------------------------------------------------------
 
 
-def _joint_readings(case: Case, k: int) -> Iterator[Reading]:
-    model = case.model
+def _joint_readings(model: Model, k: int) -> Iterator[Reading]:
     kind = model.kinds[k]
     if k < model.n:
         yield from _coordinate_readings(model, k)
@@ -416,9 +413,8 @@ def _axes_readings(model: Model, k: int) -> Iterator[Reading]:
 # -- springs, fields of others, and all ----------------------------------------------------------------
 
 
-def _spring_readings(case: Case, i: int) -> Iterator[Reading]:
+def _spring_readings(model: Model, i: int) -> Iterator[Reading]:
     """Points of springs negated, left out or exchanged; rates not divided by the length."""
-    model = case.model
     points = model.spring_point[i]
     yield Reading("points", "exchanged", [_constant("spring_point", i, points[::-1])])
     for side, where in enumerate(("first", "second")):
