@@ -166,13 +166,8 @@ def _plain_identity(row: Row) -> Identity:
         if place := row.extra.get(PLACE):  # one failure says other numbers of every mechanism
             return row.engine_name, row.verdict, str(place), NUMBER.sub("#", row.reason)
         return row.engine_name, row.verdict, str(row.extra.get(WRONG_CALL, row.reason))
-    return (
-        row.engine_name,
-        row.verdict,
-        row.level,
-        row.integrator,
-        str(row.extra.get(WRONG_CALL, row.quantity)),
-    )
+    what = str(row.extra.get(WRONG_CALL, row.quantity))
+    return row.engine_name, row.verdict, row.level, row.integrator, what
 
 
 @dataclass

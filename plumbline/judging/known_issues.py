@@ -154,10 +154,9 @@ class KnownIssue:
 
         """
         engine, version, *others = kind
-        names = engine, *others
         patterns = self.engine, self.level, self.integrator, self.quantity
         try:
-            return all(map(fnmatchcase, names, patterns)) and (
+            return all(map(fnmatchcase, (engine, *others), patterns)) and (
                 not self.versions or SpecifierSet(self.versions).contains(Version(version), prereleases=True)
             )
         except InvalidVersion:
