@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from plumbline.engines.engine_calls import StepEvaluation
+from plumbline.engines.engine_calls import StepAttempt, StepEvaluation
 from plumbline.judging.rows import JudgingResult, Row, RowContext, Verdict, with_unit
 from plumbline.measurements.single_steps import run_counts
 from plumbline.model.datatypes import EngineFailure, Integrator, Model, State, StepRun
@@ -98,29 +98,29 @@ def all_steps_agree(rows: Sequence[Row]) -> bool:
 def _single_step_rows(
     context: RowContext, integrator: Integrator, model: Model, states: Sequence[State], answer: StepEvaluation
 ) -> list[Row]:
-    method, verdict, reason, gap, place = integrator.method, Verdict.UNSUPPORTED, "", "", ""
+    method = integrator.method
+
+    def one(verdict: Verdict, reason: str, at: StepAttempt | None = None) -> list[Row]:
+        gap, place = (at.gap, at.place) if at else ("", "")
+        return [context.make_row("step", integrator.name, "all", verdict, reason, gap=gap, place=place)]
+
     attempts, runs = [attempt for attempt in answer.attempts if attempt.run is not None], answer.runs
     is_constrained = isinstance(method, ConstrainedMethod)  # where fewer steps than asked for have failed
-    failed = [one for one in answer.attempts if one.failure and (is_constrained or one.run is None)]
+    failed = [a for a in answer.attempts if a.failure and (is_constrained or a.run is None)]
     if failed:
-        verdict, reason, place = Verdict.FAILED, failed[0].failure, failed[0].place
-    elif not runs:
-        reason, gap, place = next((one.refusal, one.gap, one.place) for one in answer.attempts)
-    elif not HAS_EXTENDED_PRECISION:
-        reason = NO_EXTENDED_PRECISION
-    elif isinstance(method, JointSpaceMethod) and not keeps_dependent_rows(model, states[0]):
-        verdict, reason = Verdict.INFORMATION, OPEN_ROWS
-    if reason:
-        return [context.make_row("step", integrator.name, "all", verdict, reason, gap=gap, place=place)]
+        return one(Verdict.FAILED, failed[0].failure, failed[0])
+    if not runs:
+        return one(Verdict.UNSUPPORTED, answer.attempts[0].refusal, answer.attempts[0])
+    if not HAS_EXTENDED_PRECISION:
+        return one(Verdict.UNSUPPORTED, NO_EXTENDED_PRECISION)
+    if isinstance(method, JointSpaceMethod) and not keeps_dependent_rows(model, states[0]):
+        return one(Verdict.INFORMATION, OPEN_ROWS)
     if isinstance(method, JointSpaceMethod):
         starts = [(index, h, run.angle_axes) for index, h, run in runs]
         steps = FormulaSteps(method, model, states, starts)
         for i, attempt in enumerate(attempts):
             if attempt.failure and steps.is_stable(i):
-                failure, place = attempt.failure, attempt.place
-                return [
-                    context.make_row("step", integrator.name, "all", Verdict.FAILED, failure, place=place)
-                ]
+                return one(Verdict.FAILED, attempt.failure, attempt)
         found, table = steps.compare([run for *_, run in runs]), STEP_QUANTITIES
     else:
         assert isinstance(method, ConstrainedMethod)
