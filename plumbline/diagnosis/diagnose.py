@@ -273,12 +273,13 @@ class _Diagnosing:
         return Outputs(case, here.true | {q: right[q] for q in here.names}, previous, here.bounds)
 
     def _name_outputs(self, quantities: Sequence[str], outputs: Outputs) -> dict[str, tuple[Cause, ...]]:
-        named = dict[str, tuple[Cause, ...]]()
-        for quantity in quantities:
-            found = outputs.name(quantity, self.difference(View()).given[quantity])
-            about = [replace(one, states=len(self.places), quantities=(quantity,)) for one in found]
-            named |= {quantity: tuple(about)} if about else {}
-        return named
+        given, count = self.difference(View()).given, len(self.places)
+        found = {q: outputs.name(q, given[q]) for q in quantities}
+        return {
+            q: tuple(replace(one, states=count, quantities=(q,)) for one in some)
+            for q, some in found.items()
+            if some
+        }
 
     def _outputs_alone(self, wrong: Sequence[str]) -> tuple[Cause, ...]:
         """One cause in each wrong quantity; none where a quantity has no name."""

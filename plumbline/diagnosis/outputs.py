@@ -273,10 +273,11 @@ class Outputs:
 
     def _parts(self, quantity: str) -> list[Part]:
         if quantity in WRENCHES:
-            own, i = list[Part](), WRENCHES.index(quantity)
-            for part in self._wrench_parts:
-                free = None if part.free is None else part.free[i]
-                own.append(replace(part, value=part.value[i], free=free))
+            i = WRENCHES.index(quantity)
+            own = [
+                replace(part, value=part.value[i], free=None if part.free is None else part.free[i])
+                for part in self._wrench_parts
+            ]
             return own + (self._levers if quantity == "joint_moment" else [])
         names = dict(zip(SUMS, ("_kinetic", "_potential", "_momentum"), strict=True))
         return getattr(self, names[quantity]) if quantity in names else []

@@ -489,10 +489,8 @@ def _visited_states(motion: AccurateMotion, count: int) -> list[State]:
     """So many states along the motion."""
     model, samples = motion.model, motion.samples.swapaxes(-1, -2)
     along = np.linspace(0, len(samples) - 1, count).astype(int)
-    found = [
-        project_to_manifold(model, q[:, :3], q[:, 3:], rate[:, :3], rate[:, 3:]) for q, rate in samples[along]
-    ]
-    return [with_joint_coordinates(model, one) for one in found]
+    cases = ((q[:, :3], q[:, 3:], rate[:, :3], rate[:, 3:]) for q, rate in samples[along])
+    return [with_joint_coordinates(model, project_to_manifold(model, *case)) for case in cases]
 
 
 def _motion_effects(
