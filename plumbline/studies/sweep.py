@@ -146,22 +146,21 @@ def _run_references(counted: _Progress, valid: Mapping[int, Scenario]) -> Iterat
 
 def _run_reference_batch(group: Sequence[tuple[int, Scenario]]) -> list[Record]:
     """The reference's rows of one batch, in a worker; raise ArithmeticError where a cell fails."""
-    cases, times, records = [(s.model, s.state) for _, s in group], group[0][1].times, []
+    cases, times = [(s.model, s.state) for _, s in group], group[0][1].times
     runs = (
         trajectories(integrate_batch(cases, times, rtol, max_steps=MAX_REFERENCE_STEPS), cases)
         for rtol in REFERENCE_RTOLS
     )
-    for (index, scenario), coarse, motion in zip(group, *runs, strict=True):
-        reason = "the reference; its uncertainty is the change to the tighter tolerance"
-        records.append(
-            {
-                **_reference_record(index, Verdict.AGREES, reason),
-                "integrator": "collocation",
-                "uncertainty": float(np.max(position_error(coarse.r, motion.r))),
-                **_measure_motion(scenario, motion),
-            }
-        )
-    return records
+    reason = "the reference; its uncertainty is the change to the tighter tolerance"
+    return [
+        {
+            **_reference_record(index, Verdict.AGREES, reason),
+            "integrator": "collocation",
+            "uncertainty": float(np.max(position_error(coarse.r, motion.r))),
+            **_measure_motion(scenario, motion),
+        }
+        for (index, scenario), coarse, motion in zip(group, *runs, strict=True)
+    ]
 
 
 def _measure_motion(scenario: Scenario, motion: Trajectory) -> Record:
