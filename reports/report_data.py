@@ -332,9 +332,14 @@ def _poses(
     scenario: Record, packer: ChunkBuilder, base: Sequence[str], t: Array, r: Array, p: Array, levels: int
 ) -> Record:
     """Encode the poses of one run, positions and quaternions in −1 … 1."""
-    r, p = (packer.add(_few_levels(x, 32767, levels).astype(np.int16)) for x in (r, p))
-    times, shape = packer.add(t.astype(np.float32)), _body_shapes(scenario)
-    return {"t": times, "bodies": int(scenario["bodies"]), "base": list(base), "r": r, "p": p, "shape": shape}
+    return {
+        "t": packer.add(t.astype(np.float32)),
+        "bodies": int(scenario["bodies"]),
+        "base": list(base),
+        "r": packer.add(_few_levels(r, 32767, levels).astype(np.int16)),
+        "p": packer.add(_few_levels(p, 32767, levels).astype(np.int16)),
+        "shape": _body_shapes(scenario),
+    }
 
 
 def _few_levels(x: Array, most: int, levels: int) -> Array:

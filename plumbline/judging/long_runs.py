@@ -13,6 +13,7 @@ from __future__ import annotations
 import itertools
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -154,7 +155,7 @@ class _DriftJudge:
         end = self.finest.reached_time
         window, first_half = self.windows[end], self.windows[end].max_drift_first_half
         growth = float(np.log2(window.max_drift / first_half)) if first_half > 0 else 0.0
-        derivation, common = "", {"value": growth, "tolerance": MAX_SYMMETRIC_GROWTH}
+        derivation, common = "", dict[str, Any](value=growth, tolerance=MAX_SYMMETRIC_GROWTH)
         unstable = [
             (a, b)
             for b, a in itertools.pairwise(self.window_ends)

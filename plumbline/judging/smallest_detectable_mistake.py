@@ -224,9 +224,9 @@ def _state_ratios(
 ) -> dict[str, _Ratios]:
     """Effects over rounding bounds at all states, by quantity; mistakes in the initial state at the first."""
     kinds = [one.kind in STATE_KINDS for one in parameters]
-    cases = [(np.flatnonzero(np.logical_not(kinds)), states)]
+    cases = [(np.flatnonzero(np.logical_not(kinds)).tolist(), states)]
     if is_initial_first:
-        cases.append((np.flatnonzero(kinds), states[:1]))
+        cases.append((np.flatnonzero(kinds).tolist(), states[:1]))
     ratios = {quantity: _Ratios(len(parameters)) for quantity in STATE_UNITS}
     for indices, some in cases:
         effects = effects_at_states(model, some, [parameters[i] for i in indices])

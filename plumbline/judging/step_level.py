@@ -141,7 +141,7 @@ def _row(
     """The row of one quantity: its worst ratio decides, unless most bounds are too loose."""
     error, bound, ratios, looseness = found.errors, found.bounds, found.ratios, found.looseness
     row, body = at = np.unravel_index(np.argmax(ratios), ratios.shape)
-    worst = found.places[row]
+    worst = found.places[int(row)]
     place = f"body {body + 1}, {worst}"
     ratio, is_sharp = ratios[at], looseness <= MAX_STEP_BOUND
     name, unit = about[0].replace("_", " "), about[1]
@@ -223,7 +223,7 @@ def _left_out_words(found: StepDeviations, unit: str) -> tuple[str, int]:
     causes = [f"{number} ({why})" for why, number in zip(reasons, numbers, strict=True)]
     off = found.ratios_of_all[left_out]
     is_off = ~(off <= 1)
-    wrong = np.count_nonzero(np.any(is_off, axis=1))
+    wrong = int(np.count_nonzero(np.any(is_off, axis=1)))
     words = f"; {np.count_nonzero(left_out)} steps have no bound: {', '.join(causes)}"
     if wrong:
         size = np.max(found.errors[left_out][is_off])

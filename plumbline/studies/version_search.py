@@ -15,7 +15,7 @@ from packaging.specifiers import SpecifierSet
 from packaging.version import Version
 
 from plumbline.engines.environments import declared_attribute, declared_importer_attribute, published_versions
-from plumbline.execution.plan import Plan, no_progress
+from plumbline.execution.plan import LevelSelection, Plan, no_progress
 from plumbline.execution.runner import run_plan
 from plumbline.judging.rows import LEVEL_OF_RUN, Row, Verdict
 from plumbline.model_files.model_rows import FileResult
@@ -226,7 +226,7 @@ def _ask_reading(plan: ModelPlan, name: str) -> VersionAnswer:
 
 
 def _ask_verdict(plan: Plan, name: str, row: Mapping[str, Any]) -> VersionAnswer:
-    level = LEVEL_OF_RUN.get(row["level"], "all")
+    level: LevelSelection = LEVEL_OF_RUN.get(row["level"], "all")
     run = run_plan(replace(plan, engines=[name], level=level), no_progress)
     if reason := run.engines[name].missing:
         raise VersionUnusable(reason)
