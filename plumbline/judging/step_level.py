@@ -282,8 +282,9 @@ def _run_row(
         if quantity == "run_mean":
             reason = f"no direction in the deviations of the steps: {ratio:.2g} of what rounding explains"
     if quantity != "run_mean" and (number := np.count_nonzero(left_out)):
-        words, extra["left_out_wrong_steps"] = _left_out_words(found, unit)
-        reason, extra["left_out_steps"] = reason + words, number
+        words, off = _left_out_words(found, unit)
+        extra |= {"left_out_steps": number, "left_out_wrong_steps": off}
+        reason += words
     if failure:
         reason += f"; after these {failure}: with this step the method itself does not resolve the rest"
     return context.make_row(
