@@ -15,7 +15,7 @@ import shutil
 import struct
 import types
 from collections.abc import Callable
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -32,7 +32,7 @@ from plumbline.processes.user_cache import (
     describe_failure,
     user_cache_folder,
 )
-from plumbline.processes.worker_pool import Outcome, Pickled, ResultCache, Task
+from plumbline.processes.worker_pool import Outcome, Packed, ResultCache, Task
 
 MAX_BYTES = 2 * 2**30  # of the cells that runs share
 MAX_UNFINISHED_NIGHTS = 4  # that keep their cells
@@ -209,54 +209,14 @@ def task_hash(task: Task) -> str:
         The SHA-256 as hexadecimal text.
 
     Raises:
-        TypeError: an argument is of a type without a defined hash.
+        UnfitRecord: an argument is of a type without an encoding.
 
     """
-    digest = hashlib.sha256()
-    parts = _function_name(task.function), task.version, task.python, task.arguments
-    judge = _function_name(task.judge), task.judge_arguments, _function_name(task.needs_answer)
-    for part in (environment_fingerprint(task.python), *parts, *judge):
-        _update_hash(digest, part)
-    return digest.hexdigest()
-
-
-def _function_name(function: Callable[..., Any] | None) -> str:
-    return f"{function.__module__}.{function.__qualname__}" if function else ""
-
-
-def _update_hash(digest: Any, value: Any) -> None:
-    """Add a value to a hash, unambiguously: every part is preceded by its kind and size."""
-    match value:
-        case None:
-            head, body = "none", b""
-        case bool() | int():
-            head, body = "int", str(int(value)).encode()
-        case float():
-            head, body = "float", struct.pack("<d", value)
-        case str():
-            head, body = "str", value.encode()
-        case bytes():
-            head, body = "bytes", value
-        case Pickled() | EncodedRecord():
-            head, body = "packed", value.digest
-        case np.ndarray():
-            head, body = f"array {value.dtype.str} {value.shape}", np.ascontiguousarray(value).tobytes()
-        case list() | tuple():
-            digest.update(f"list {len(value)}\n".encode())
-            for item in value:
-                _update_hash(digest, item)
-            return
-        case dict():
-            digest.update(f"dict {len(value)}\n".encode())
-            for item in value.items():
-                _update_hash(digest, item)
-            return
-        case _ if is_dataclass(value) and not isinstance(value, type):
-            digest.update(f"{type(value).__name__} {len(fields(value))}\n".encode())
-            for field in fields(value):
-                _update_hash(digest, (field.name, getattr(value, field.name)))
-            return
-        case _:
-            raise TypeError(f"no content hash of a {type(value).__name__}")
-    digest.update(f"{head} {len(body)}\n".encode())
-    digest.update(body)
+    arguments = [
+        [one.digest if isinstance(one, Packed) else one for one in some]
+        for some in (task.arguments, task.judge_arguments)
+    ]
+    functions = (task.function, task.judge, task.needs_answer)
+    names = [f"{one.__module__}.{one.__qualname__}" if one else "" for one in functions]
+    parts = environment_fingerprint(task.python), task.version, task.python, names, arguments
+    return hashlib.sha256(encode_record(parts)).hexdigest()
