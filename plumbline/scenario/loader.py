@@ -6,7 +6,7 @@ import hashlib
 import json
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from types import MappingProxyType
@@ -284,8 +284,7 @@ def build_scenario(source: YamlSource, path: Path) -> Scenario:
             f"has {len(bodies)} bodies", f"at most {MAX_BODIES}", source.value_positions[("bodies",)]
         )
     with np.errstate(all="ignore"):
-        tree = _build_model(document, bodies, far, springs)
-        model = _add_closing_joints(tree, document, closed)
+        model = _build_model(document, bodies, far, springs, closed)
         state = complete_state(model, _minimal_coordinates(bodies, turns, model.columns))
         state = _closed_state(source, model, state, bodies)
         distances = np.linalg.norm(spring_vectors(model, state.r, state.p), axis=-1)
@@ -494,25 +493,6 @@ def _body_named(name: str, bodies: list[Body], *, may_be_world: bool) -> tuple[i
     return -1, f"is {name!r}, no body's name{in_brackets(hint)}"
 
 
-def _add_closing_joints(tree: Model, document: Document, closed: NDArray[np.intp]) -> Model:
-    """The tree with its loops closed."""
-    if not len(closed):
-        return tree
-    joints = [end.joint for end in document.closes]
-    elements = _joint_elements(joints, tree.columns)
-    points = np.array([[end.anchor, end.proximal] for end in document.closes], dtype=float)
-    lengths = [_own_number(joint) for joint in joints]
-    return replace(
-        tree,
-        kind=(*tree.kind, *(joint.kind for joint in joints)),
-        body=np.concatenate([tree.body, closed]),
-        point=np.concatenate([tree.point, points]),
-        turn=np.concatenate([tree.turn, [_joint_turns(joint) for joint in joints]]),
-        length=np.concatenate([tree.length, lengths]),
-        **{name: np.concatenate([getattr(tree, name), values]) for name, values in elements.items()},
-    )
-
-
 def _closed_state(source: YamlSource, model: Model, state: State, bodies: list[Body]) -> State:
     """Close the loops to rounding; refuse gaps and rates that do not fit."""
     if not model.has_loops:
@@ -572,26 +552,33 @@ def _joint_turns(joint: Any) -> tuple[Array, Array]:
 
 
 def _build_model(
-    document: Document, bodies: list[Body], far: list[int], spring_body: NDArray[np.intp]
+    document: Document,
+    bodies: list[Body],
+    far: list[int],
+    springs: NDArray[np.intp],
+    closed: NDArray[np.intp],
 ) -> Model:
-    free = np.array([body.joint.kind == FREE for body in bodies])
-    joints = [*(body.joint for body in bodies), *(end.joint for end in document.closes)]
+    """The tree of the bodies, and after its joints those that close loops."""
+    ends = document.closes
+    joints = [*(body.joint for body in bodies), *(end.joint for end in ends)]
     points = [[_far_point(bodies, k, far[k]), body.proximal] for k, body in enumerate(bodies)]
+    points += [[end.anchor, end.proximal] for end in ends]
+    free = np.array([joint.kind == FREE for joint in joints])
     return Model(
-        kind=tuple(body.joint.kind for body in bodies),
-        body=np.stack([far, np.arange(len(bodies))], axis=1),
+        kind=tuple(joint.kind for joint in joints),
+        body=np.concatenate([np.stack([far, np.arange(len(bodies))], axis=1), closed]),
         point=np.where(free[:, None, None], 0.0, np.array(points, dtype=float)),
-        turn=np.array([_joint_turns(body.joint) for body in bodies]),
+        turn=np.array([_joint_turns(joint) for joint in joints]),
         mass=np.array([body.mass for body in bodies], dtype=float),
         inertia=np.array([inertia_matrix(body.inertia) for body in bodies]),
-        length=np.array([_own_number(body.joint) for body in bodies]),
+        length=np.array([_own_number(joint) for joint in joints]),
         gravity=np.array(document.gravity, dtype=float),
         force=np.array([body.load.force for body in bodies], dtype=float),
         moment=np.array([body.load.moment for body in bodies], dtype=float),
         drag_force=np.array([body.drag.force for body in bodies], dtype=float),
         drag_moment=np.array([body.drag.moment for body in bodies], dtype=float),
-        **_joint_elements([body.joint for body in bodies], column_count(joint.kind for joint in joints)),
-        spring_body=spring_body,
+        **_joint_elements(joints, column_count(joint.kind for joint in joints)),
+        spring_body=springs,
         spring_point=np.array([spring.points for spring in document.springs], dtype=float).reshape(-1, 2, 3),
         spring_stiffness=np.array([spring.stiffness for spring in document.springs], dtype=float),
         spring_damping=np.array([spring.damping for spring in document.springs], dtype=float),
