@@ -203,7 +203,7 @@ class Adapter(ABC):
         cannot do this; the message is the reason) pass through.
 
         """
-        self._check_mechanism(model, self.builds_elements)
+        self._check_mechanism(model)
         check_state(model, *states)
         with self._checked_refusals(model):
             answers = self._evaluate(model, states)
@@ -246,7 +246,7 @@ class Adapter(ABC):
             One record per state; none where the adapter offers nothing of the mechanism.
 
         """
-        self._check_mechanism(model, self.builds_elements)
+        self._check_mechanism(model)
         with self._checked_refusals(model):
             answers = self._surface(model, states)
         for answer in answers:
@@ -326,12 +326,12 @@ class Adapter(ABC):
         return model.has_loops
 
     def _check_motion(self, model: Model) -> None:
-        self._check_mechanism(model, self.builds_elements)
+        self._check_mechanism(model)
         if model.has_loops and not self.moves_loops:
             reason = f"the adapter of {self.title} covers no motions of mechanisms with loops"
             raise Unsupported(reason, "motions of loops")
 
-    def _check_mechanism(self, model: Model, has_elements: bool) -> None:
+    def _check_mechanism(self, model: Model) -> None:
         """Refuse what the adapter does not build, and elements unless it evaluates states with them."""
         if self.builds_trees and model.has_loops and self.loops_unsupported_reason:
             raise Unsupported(self.loops_unsupported_reason, "loops")
@@ -341,10 +341,9 @@ class Adapter(ABC):
         for gap, reason in self.gaps.items():
             if gap not in PARTIAL_GAPS and gap in MODEL_GAPS and MODEL_GAPS[gap](model):
                 raise Unsupported(reason, gap)
-        if model.has_elements and not has_elements:
-            what = "motions with" if self.builds_elements else "joints with"
-            reason = f"the adapter of {self.title} covers no {what} rotors, springs, dampers and efforts"
-            raise Unsupported(reason, "elements")
+        if model.has_elements and not self.builds_elements:
+            what = "joints with rotors, springs, dampers and efforts"
+            raise Unsupported(f"the adapter of {self.title} covers no {what}", "elements")
 
     @contextmanager
     def _checked_refusals(self, model: Model) -> Iterator[None]:
@@ -469,12 +468,11 @@ def _check_trajectory(model: Model, times: Array, run: Trajectory, label: str) -
         np.max(np.abs(run.pdot), axis=(1, 2)) > smallest
     )
     repeated = np.all(rows[1:] == rows[:-1], axis=1) & visible[1:]
-    if np.any(repeated):
-        at = times[1 + int(np.argmax(repeated))]
-        raise EngineFailure(f"{label}: the row at t = {at} s repeats the one before while moving")
     # A return to the exact initial row (which may be at rest) of a pendulum that moved is a reset, not a
     # period: no integrator closes an orbit to the last bit of every coordinate and rate.
     reset = np.all(rows[1:] == rows[0], axis=1) & np.logical_or.accumulate(moving)[1:]
-    if np.any(reset):
-        at = times[1 + int(np.argmax(reset))]
-        raise EngineFailure(f"{label}: the row at t = {at} s is the initial state again (a silent reset)")
+    faults = {"repeats the one before while moving": repeated,
+              "is the initial state again (a silent reset)": reset}  # fmt: skip
+    for what, wrong in faults.items():
+        if np.any(wrong):
+            raise EngineFailure(f"{label}: the row at t = {times[1 + int(np.argmax(wrong))]} s {what}")
