@@ -309,7 +309,7 @@ class LoadingImporter(Importer):
             model = self.layout(loaded, file).model
         except NotImplementedError as kind:
             return Reading(self.version(), refusal=f"this column does not describe {kind}")
-        return Reading(self.version(), model, warnings=tuple(printed))
+        return Reading(self.version(), model)
 
     def evaluate(self, file: ModelFile, states: Sequence[CanonicalState]) -> list[ModelQuantities]:
         """Compute the quantities with the engine's own routines, at states of what `read` returned."""

@@ -40,7 +40,6 @@ class Reading:
     version: str  # of the engine
     model: NeutralModel | None = None  # None: refused
     refusal: str = ""  # the importer's words
-    warnings: tuple[str, ...] = ()  # what it printed
 
 
 class Importer(ABC):
