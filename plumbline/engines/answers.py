@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import fields
 from functools import cache
 from typing import Any, ClassVar, get_args, get_origin, get_type_hints
@@ -32,7 +32,9 @@ def _fields(kind: type) -> Mapping[str, tuple[str, bool]]:
     return found
 
 
-def check_record(record: Any, kind: type, sizes: Mapping[str, int], label: str) -> None:
+def check_record(
+    record: Any, kind: type, sizes: Mapping[str, int], label: str, may_be_infinite: Container[str] = ()
+) -> None:
     """Check that a record is of its class and its fields of the types and shapes of their annotations.
 
     Of a trajectory another check names the first sample that is missing or not finite.
@@ -41,6 +43,7 @@ def check_record(record: Any, kind: type, sizes: Mapping[str, int], label: str) 
         kind: the class that it must be of.
         sizes: the sizes that the shapes name; others are any.
         label: adapter and method, for the message.
+        may_be_infinite: fields whose numbers need not be finite.
 
     Raises:
         EngineFailure: it is not; the message names the field, what came and what is valid.
@@ -51,13 +54,9 @@ def check_record(record: Any, kind: type, sizes: Mapping[str, int], label: str) 
     for name, (shape, is_optional) in _fields(kind).items():
         value = getattr(record, name)
         if value is not None or not is_optional:
+            is_finite = kind is not Trajectory and name not in may_be_infinite
             check_numbers(
-                value,
-                shape,
-                sizes,
-                f"{label}: {name}",
-                is_optional=is_optional,
-                must_be_finite=kind is not Trajectory,
+                value, shape, sizes, f"{label}: {name}", is_optional=is_optional, must_be_finite=is_finite
             )
 
 

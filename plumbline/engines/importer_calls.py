@@ -8,23 +8,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from plumbline.engines.adapter import EngineInfo
-from plumbline.engines.answers import check_numbers, check_version, describe_value
+from plumbline.engines.answers import check_numbers, check_record, check_version
 from plumbline.engines.engine_calls import attempt, describe_missing
 from plumbline.engines.registry import load_importer
 from plumbline.engines.variants import NoAnswer
 from plumbline.importers.importer import ModelFile, Reading
 from plumbline.importers.neutral_model import CanonicalState, ModelQuantities
 from plumbline.model.datatypes import EngineFailure
-
-_FIELDS = {  # shapes, as of `plumbline.engines.answers.FIELDS`; V velocities
-    "mass_matrix": "V V",
-    "bias_force": "V",
-    "gravity_force": "V",
-    "passive_force": "V",
-    "acceleration": "V",  # infinite where M is singular
-    "kinetic_energy": "",
-    "potential_energy": "",
-}
 
 
 def describe_importer(name: str) -> EngineInfo:
@@ -94,19 +84,8 @@ def evaluate_model_file(
     if len(answers) != len(states):
         raise EngineFailure(f"{name} answered {len(answers)} of {len(states)} states")
     for index, (state, answer) in enumerate(zip(states, answers, strict=True)):
-        _check(answer, len(state.velocities), f"{name}, state {index}")
+        label = f"{name}, state {index}"
+        check_record(answer, ModelQuantities, {"n": len(state.velocities)}, label, ("acceleration",))
+        for body, pose in answer.poses.items():
+            check_numbers(pose, "3 4", {}, f"{label}: pose of {body}", is_optional=True)
     return answers
-
-
-def _check(answer: ModelQuantities, count: int, label: str) -> None:
-    """Check the types, shapes and finiteness of an answer."""
-    if not isinstance(answer, ModelQuantities):
-        raise EngineFailure(f"{label} returned {describe_value(answer)}, must be a ModelQuantities")
-    fields = {name: (getattr(answer, name), shape) for name, shape in _FIELDS.items()}
-    fields |= {f"pose of {body}": (matrix, "3 4") for body, matrix in answer.poses.items()}
-    for name, (value, shape) in fields.items():
-        if value is not None:
-            is_finite = name != "acceleration"
-            check_numbers(
-                value, shape, {"V": count}, f"{label}: {name}", is_optional=True, must_be_finite=is_finite
-            )
