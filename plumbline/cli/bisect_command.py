@@ -124,11 +124,7 @@ def _search_result(
         with options.exit_on_damaged_results():
             document = read_model_results(folder)
         row = _row(key, {row["key"]: row for file in document["files"] for row in file["rows"]})
-        about = document["options"]
-        plan = ModelPlan(
-            (row["scenario"],), base=about["base"], root=about["root"] and Path(about["root"]),
-            strip_geometry=about["strip_geometry"], state_count=STATES, jobs=jobs, limits=limits,
-        )  # fmt: skip
+        plan = ModelPlan.of_row(row, document["options"], state_count=STATES, jobs=jobs, limits=limits)
         return search_versions(plan, row["engine"].partition("@")[0], good, bad, _report)
     with options.exit_on_damaged_results():
         document = read_results(folder)

@@ -107,6 +107,7 @@ def _history_lines(document: dict[str, Any]) -> list[str]:
 
 def _reproduce_model(folder: Path, keys: tuple[str, ...], form: str | None) -> None:
     """Write scripts of importers' differences, or list the differences."""
+    from plumbline.model_files.model_run import ModelPlan
     from plumbline.model_files.model_script import NoModelScript, stored_differences, write_model_script
     from plumbline.storage.results_store import read_model_results, write_atomically
     from plumbline.storage.script_index import script_name, scripts_folder
@@ -120,19 +121,15 @@ def _reproduce_model(folder: Path, keys: tuple[str, ...], form: str | None) -> N
             click.echo(f"{key}: {row['diagnosis'] or row['reason']}")
         log(count_noun(len(found), "difference") if found else "nothing differs")
         return
-    chosen, about = options.claim_folder(folder), document["options"]
-    changes = read_version_changes(folder)
-    root = None if about["root"] is None else Path(about["root"])
+    chosen, changes = options.claim_folder(folder), read_version_changes(folder)
     for key in keys:
         if key not in found:
             raise click.UsageError(f"no difference {key!r}; without KEY the command lists them")
         row = found[key]
-        engine = row["engine"].partition("@")[0]
+        engine, since = row["engine"].partition("@")[0], str(changes.get(key, {}).get("note", ""))
+        plan = ModelPlan.of_row(row, document["options"])
         try:
-            script = write_model_script(
-                row["scenario"], row["engine"], form or engine, about["base"], root, about["strip_geometry"],
-                since=str(changes.get(key, {}).get("note", "")),
-            )  # fmt: skip
+            script = write_model_script(plan, form or engine, since=since)
         except NoModelScript as error:
             raise click.ClickException(f"{key}: {error}") from None
         path = scripts_folder(chosen) / script_name(f"{Path(row['scenario']).stem}-{row['engine']}")

@@ -69,6 +69,11 @@ class Answer:
     failure: str = ""
     rewritten: Mapping[str, Reading] = field(default_factory=dict)  # of equivalent rewritings of the file
 
+    @property
+    def model(self) -> NeutralModel | None:
+        """The importer's reading of the file; None where it refused or failed."""
+        return self.reading and self.reading.model
+
 
 def moving_mass(model: NeutralModel) -> float:
     """Sum the masses of the bodies that can move.
@@ -106,12 +111,12 @@ def judge_answer(
         A row per quantity; only one where the importer refused or failed.
 
     """
-    if answer.reading is not None and answer.reading.model is None:
+    reading = answer.model
+    if answer.reading is not None and reading is None:
         reason = f"{REFUSED}{answer.reading.refusal}"
         return [replace(_row(context, "all", Verdict.UNSUPPORTED, reason), extra={IS_REFUSED: 1.0})]
-    if answer.failure or answer.reading is None or answer.reading.model is None:
+    if answer.failure or reading is None:
         return [_row(context, "all", Verdict.FAILED, answer.failure or "no answer")]
-    reading = answer.reading.model
     order = joint_permutation(model, reading)
     rows = [_joints_row(context, model, reading, order), _mass_row(context, model, reading)]
     if order is None:
@@ -276,6 +281,7 @@ def judge_importer(
         return model_states(one, state_count, state_seed(shown), at)
 
     name, info, answer = column
+    reading, title = answer.model, f"{info.title} {info.version}"
     context = RowContext(shown, MODEL_FAMILY, name, info.title, info.version)
     if answer.reading is None and not answer.failure:
         formats = declared_importer_attribute(name, "formats")
@@ -289,31 +295,22 @@ def judge_importer(
     judged = (model, truth.states) if applies else (without_passive_forces(model), truth.without_passive)
     found = judge_answer(context, *judged, answer, unsupported)
     explanation = None
-    if any(row.verdict == Verdict.DISAGREES for row in found):
-        explanation = _explain(context, judged[0], answer, states, applies)
+    if reading is not None and any(row.verdict == Verdict.DISAGREES for row in found):
+        read = reading if applies else without_passive_forces(reading)
+        explanation = explain_importer(title, judged[0], read, answer.quantities, states)
+        causes = tuple(cause.within(shown) for cause in explanation.causes)
+        explanation = replace(explanation, causes=causes)
         found = [_with_diagnosis(row, explanation) for row in found]
-    if not applies and answer.reading is not None and answer.reading.model is not None:
-        cause = damping_cause(f"{info.title} {info.version}", model, answer.reading.model)
+    if not applies and reading is not None:
+        cause = damping_cause(title, model, reading)
         cause = cause and cause.within(shown)
         found.append(_damping_row(context, cause))
         if cause is not None:
             known = explanation or Explanation(is_proved=True)
             explanation = replace(known, causes=(*known.causes, cause))
-    if answer.rewritten and answer.reading is not None and answer.reading.model is not None:
-        found.append(rewriting_row(context, answer.reading.model, answer.rewritten))
+    if answer.rewritten and reading is not None:
+        found.append(rewriting_row(context, reading, answer.rewritten))
     return found, explanation
-
-
-def _explain(
-    context: RowContext, model: NeutralModel, answer: Answer, states: Any, applies_passive_forces: bool
-) -> Explanation:
-    assert answer.reading is not None and answer.reading.model is not None
-    reading = answer.reading.model
-    if not applies_passive_forces:
-        reading = without_passive_forces(reading)
-    title = f"{context.title} {context.version}"
-    found = explain_importer(title, model, reading, answer.quantities, states)
-    return replace(found, causes=tuple(cause.within(context.scenario) for cause in found.causes))
 
 
 def _with_diagnosis(row: Row, explanation: Explanation) -> Row:

@@ -51,6 +51,19 @@ class ModelPlan:
     limits: Limits = field(default_factory=lambda: Limits(120.0))
     known_issues: tuple[KnownIssue, ...] = ()
 
+    @classmethod
+    def of_row(cls, row: Mapping[str, Any], options: Mapping[str, Any], **more: Any) -> ModelPlan:
+        """Plan to compare again what a row of model.json is about.
+
+        Args:
+            options: those of the run, as stored.
+            **more: other fields of the plan.
+
+        """
+        about = {name: options[name] for name in ("base", "strip_geometry")}
+        root = None if options["root"] is None else Path(options["root"])
+        return cls((row["scenario"],), (row["engine"],), root=root, **about, **more)
+
 
 @dataclass(frozen=True, eq=False)
 class ModelRunResult:
@@ -270,12 +283,13 @@ class FileRun:
         assert model is not None
         if name not in self.plan.importers:
             return []
-        if (reading := answer.reading) is not None and reading.model is None:
+        reading, read = answer.reading, answer.model
+        if reading is not None and read is None:
             words = self.prepared.in_users_words(reading.refusal)
             self.answers[name] = replace(answer, reading=replace(reading, refusal=words))
-        elif reading is not None and reading.model is not None:
-            if (extreme := next(extreme_numbers(reading.model), None)) is None:
-                named = with_names_of(model, reading.model)
+        elif reading is not None and read is not None:
+            if (extreme := next(extreme_numbers(read), None)) is None:
+                named = with_names_of(model, read)
                 states = model_states(named, self.plan.state_count, state_seed(self.shown), self.plan.at)
                 self.answers[name] = replace(answer, reading=replace(reading, model=named), states=states)
                 return [self._task("evaluate", name, evaluate_model_file, self.prepared.file, states)]

@@ -25,7 +25,6 @@ from plumbline.model_files.importer_cause import Explanation
 from plumbline.model_files.model_comparison import certify_states, joint_permutation, mismatches_as_read
 from plumbline.model_files.model_rows import FileResult
 from plumbline.model_files.model_run import FileRun, ModelPlan, describe_importers, run_files
-from plumbline.model_files.prepared_file import BaseChoice
 from plumbline.model_files.xml_shrink import shrink_tree
 from plumbline.processes.exceptions import PlumblineError
 from plumbline.processes.isolation import ScratchFolder
@@ -96,23 +95,13 @@ class Shown:
 
 
 def write_model_script(
-    shown: str,
-    importer: str,
-    form: str,
-    base: BaseChoice = "auto",
-    root: Path | None = None,
-    strip: bool = False,
-    seconds: float = SHRINKING_SECONDS,
-    since: str = "",
+    plan: ModelPlan, form: str, seconds: float = SHRINKING_SECONDS, since: str = ""
 ) -> ModelScript:
     """Shrink a model file and write the script of its difference.
 
     Args:
-        importer: the one that differs, with or without a version.
+        plan: of one file and the importer that differs, with or without a version.
         form: engine whose calls the script uses, one of `FORMS`.
-        base: as for the run.
-        root: as for the run.
-        strip: as for the run.
         seconds: time for the search for a smaller file.
         since: a sentence about the versions that show it.
 
@@ -123,16 +112,13 @@ def write_model_script(
         NoModelScript: nothing differs, or there is no script in that form.
 
     """
+    ((shown,), (importer,)) = plan.files, plan.importers
     if form not in FORMS:
         raise NoModelScript(f"there are scripts for {', '.join(FORMS)}, not for {form}")
     if split_version(importer)[0] != form:
         raise NoModelScript(f"{importer} differs; a script for {form} cannot show that")
-    limits = Limits(TASK_SECONDS)
-    plan = ModelPlan(
-        (shown,), (importer,), base=base, root=root, strip_geometry=strip, state_count=SHRINKING_STATES,
-        limits=limits,
-    )  # fmt: skip
-    with ScratchFolder("plumbline-script-") as scratch, WorkerPool(1, limits) as workers:
+    plan = replace(plan, state_count=SHRINKING_STATES, limits=Limits(TASK_SECONDS))
+    with ScratchFolder("plumbline-script-") as scratch, WorkerPool(1, plan.limits) as workers:
         bench = _Bench(plan, scratch, workers)
         original = bench.judged(Path(shown))
         if original is None or not _differs(original):
@@ -218,9 +204,9 @@ class _Bench:
     @property
     def reading(self) -> NeutralModel:
         """The importer's reading of the file that was judged last."""
-        reading = self.run.answers[self.importer].reading
-        assert reading is not None and reading.model is not None
-        return reading.model
+        model = self.run.answers[self.importer].model
+        assert model is not None
+        return model
 
     def shown(self, result: FileResult) -> Shown | None:
         """The first number that a script of the file that was judged last can print."""

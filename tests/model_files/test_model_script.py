@@ -16,6 +16,7 @@ from plumbline.importers.xml_tree import parse_xml, write_xml
 from plumbline.model_files import model_script
 from plumbline.model_files.certified_model import CertifiedModelQuantities
 from plumbline.model_files.model_comparison import mismatches_as_read
+from plumbline.model_files.model_run import ModelPlan
 from plumbline.model_files.model_script import MAX_LINES, NoModelScript, write_model_script
 from plumbline.model_files.xml_shrink import shrink_tree
 from tests.helpers.random_robots import random_urdf
@@ -35,10 +36,14 @@ MJCF = """<mujoco model="moon">
 """
 
 
+def plan_of(path, importer):
+    return ModelPlan((str(path),), (importer,))
+
+
 def test_a_script_shows_the_difference_of_the_smallest_file(tmp_path):
     path = tmp_path / "moon.xml"
     path.write_text(MJCF)
-    script = write_model_script(str(path), "pinocchio", "pinocchio", seconds=40)
+    script = write_model_script(plan_of(path, "pinocchio"), "pinocchio", seconds=40)
     assert len(script.text.splitlines()) <= MAX_LINES
     assert "reads the gravity of the model as (0, 0, -9.81)" in script.text.replace("\n", " ")
     assert script.file.count("<body") == 1
@@ -83,7 +88,7 @@ def test_a_script_of_exudyns_loader(tmp_path, axis, words):
         pytest.skip(str(error))
     path = tmp_path / "arm.urdf"
     path.write_text(ARM.replace("AXIS", axis))
-    script = write_model_script(str(path), "exudyn", "exudyn", seconds=30, since="Since version 1.9.0.")
+    script = write_model_script(plan_of(path, "exudyn"), "exudyn", seconds=30, since="Since version 1.9.0.")
     assert len(script.text.splitlines()) <= MAX_LINES
     head = " ".join(script.text.split('"""')[1].split())
     assert words in head and "Since version 1.9.0." in head
@@ -149,14 +154,14 @@ def test_a_script_that_prints_another_number_is_not_handed_out(tmp_path, monkeyp
     path.write_text(MJCF)
     monkeypatch.setattr(model_script, "EXPECTED", '"""\nprint(" 1.0 expected: 2.0")\nraise SystemExit\n"""')
     with pytest.raises(NoModelScript, match="does not show"):
-        write_model_script(str(path), "pinocchio", "pinocchio", seconds=0)
+        write_model_script(plan_of(path, "pinocchio"), "pinocchio", seconds=0)
 
 
 def test_an_importer_that_agrees_has_no_script(tmp_path):
     path = tmp_path / "moon.xml"
     path.write_text(MJCF)
     with pytest.raises(NoModelScript, match="does not differ"):
-        write_model_script(str(path), "mujoco", "mujoco", seconds=1)
+        write_model_script(plan_of(path, "mujoco"), "mujoco", seconds=1)
 
 
 def test_shrinking_keeps_what_is_looked_for_and_drops_the_rest():
