@@ -70,6 +70,9 @@ NO_REGULAR_POSE = (
     "unique values"
 )
 
+# a function and its arguments, after the engine; what judges its answer and the arguments before that
+_Calls = tuple[Callable[..., Any], tuple[Any, ...], Callable[..., JudgingResult] | None, tuple[Any, ...]]
+
 
 @dataclass(frozen=True)
 class TruthFailure:
@@ -435,9 +438,8 @@ class ScenarioRun:
         return next(i for i in self._engines[key.engine].integrators if i.name == key.integrator)
 
     def _cell_task(self, key: TaskKey) -> Task:
-        call, arguments = self._call(key)
+        call, arguments, judge, judge_arguments = self._calls(key)
         engine, version, python = self._task_engine(key)
-        judge, judge_arguments = self._judge(key)
         return Task(
             key, call, (engine, *arguments), self._plan.limits, version, python, key.engine, judge,
             judge_arguments, JudgingResult.has_disagreement,  # only a diagnosis needs the answer
@@ -449,49 +451,35 @@ class ScenarioRun:
         info = self._engines[key.engine]
         return engine, info.version + digest, info.python
 
-    def _call(self, key: TaskKey) -> tuple[Callable[..., Any], tuple[Any, ...]]:
-        """The function that computes a cell, and its arguments after the engine."""
-        s, plan = self.scenario, self._plan
+    def _calls(self, key: TaskKey) -> _Calls:
+        """What computes a cell, and what judges its answer in the worker."""
+        s, plan, context = self.scenario, self._plan, self._context(key.engine)
+        asked: tuple[Any, ...]
+        judging: tuple[Any, ...]
+        truth = self._packed_truths.get(key.needed_truth) if key.needed_truth else None
         if key.kind == TaskKind.STATE:
             by_failures: list[tuple[str, ...]] = [BESIDES, (*BESIDES, APART), ()]
-            asked = by_failures[len(self._failures_besides.get(key, ()))]
-            return engine_calls.evaluate_states, (s.model, self._states, asked)
-        if key.kind == TaskKind.RELATIONS:
-            bounds = self._packed_truths.get(TaskKind.RELATION_BOUNDS)  # without them the cell has failed
-            return check_relations, (s.model, self._states, bounds)
+            asked = s.model, self._states, by_failures[len(self._failures_besides.get(key, ()))]
+            return engine_calls.evaluate_states, asked, judge_states if truth else None, (context, truth)
+        if key.kind == TaskKind.RELATIONS:  # without bounds the cell has failed
+            asked = s.model, self._states, truth
+            return check_relations, asked, relation_rows.judge_relations, (context,)
         integrator = self._integrator(key)
         if key.kind == TaskKind.STEP:
-            return run_step_study, (integrator, s.model, self._step_states)
+            asked = integrator, s.model, self._step_states
+            return run_step_study, asked, judge_steps, (context, *asked)
         if key.kind == TaskKind.TRAJECTORY:
-            steps = self._resolutions(integrator)
-            truth = self.truths.get(TaskKind.MOTION_TRUTH)  # ends before a singular pose
-            times = truth.trajectory.t if isinstance(truth, MotionTruth) else s.times
-            return run_refinement_study, (integrator.name, s.model, s.state, times, steps)
+            finer = plan.extra_refinements
+            steps = refinement_resolutions(integrator, s.model.n, s.duration, finer, s.sample_interval)
+            motion = self.truths.get(TaskKind.MOTION_TRUTH)  # ends before a singular pose
+            times = motion.trajectory.t if isinstance(motion, MotionTruth) else s.times
+            judging = context, s.model, truth, integrator
+            asked = integrator.name, s.model, s.state, times, steps
+            return run_refinement_study, asked, judge_trajectory if truth else None, judging
         length = plan_long_run(integrator, s.model.n, plan.long_run_seconds, s.sample_interval, s.duration)
-        return run_long_run_study, (integrator.name, s.model, s.state, s.sample_interval, length)
-
-    def _resolutions(self, integrator: Integrator) -> list[float]:
-        """The steps or tolerances of a refinement study, coarse to fine."""
-        s, finer = self.scenario, self._plan.extra_refinements
-        return refinement_resolutions(integrator, s.model.n, s.duration, finer, s.sample_interval)
-
-    def _judge(self, key: TaskKey) -> tuple[Callable[..., JudgingResult] | None, tuple[Any, ...]]:
-        """The function that judges a cell's answer in the worker, and its arguments; None without a truth."""
-        s, context = self.scenario, self._context(key.engine)
-        if key.kind == TaskKind.RELATIONS:
-            return relation_rows.judge_relations, (context,)
-        if key.kind == TaskKind.STEP:
-            return judge_steps, (context, self._integrator(key), s.model, self._step_states)
-        if key.kind == TaskKind.LONG_RUN:
-            is_regular = s.closed_form is not None
-            return judge_long_runs, (context, s.model, self._integrator(key), is_regular)
-        assert key.needed_truth is not None
-        truth = self._packed_truths.get(key.needed_truth)
-        if truth is None:
-            return None, ()
-        if key.kind == TaskKind.STATE:
-            return judge_states, (context, truth)
-        return judge_trajectory, (context, s.model, truth, self._integrator(key))
+        asked = integrator.name, s.model, s.state, s.sample_interval, length
+        judging = context, s.model, integrator, s.closed_form is not None
+        return run_long_run_study, asked, judge_long_runs, judging
 
     def _judged(self, outcome: Outcome) -> JudgingResult:
         """What the judge of a cell found, or why there is none."""
