@@ -152,7 +152,7 @@ class SourceSlice:
         for path, numbers in lines.items():
             self._attributes |= set(_attributes(ast.parse(Path(path).read_bytes()), numbers))
         for place in wanted:
-            self._need(*place)
+            self.name_of(*place)
 
     @property
     def imports(self) -> list[str]:
@@ -185,17 +185,13 @@ class SourceSlice:
         for name in sorted(self._modules):
             yield from visit(name)
 
-    def name_of(self, module: str, name: str) -> str:
-        """The name in the script of something that is wanted."""
-        return self._need(module, name)
-
     def _module(self, name: str) -> _Module:
         if name not in self._modules:
             path = str(import_module(name).__file__)
             self._modules[name] = _Module(name, self._lines.get(path, set()))
         return self._modules[name]
 
-    def _need(self, module_name: str, name: str) -> str:
+    def name_of(self, module_name: str, name: str) -> str:
         """Keep what a name of a module stands for; return its name in the script."""
         place = module_name, name
         if place in self._names:
@@ -203,8 +199,7 @@ class SourceSlice:
         module = self._module(module_name)
         statement = module.bound[name]
         if isinstance(statement, ast.ImportFrom) and (home := str(statement.module)).startswith(PACKAGES):
-            alias = next(x for x in statement.names if (x.asname or x.name) == name)
-            self._names[place] = self._need(home, alias.name)
+            self._names[place] = self.name_of(home, _alias_of(statement, name).name)
             return self._names[place]
         if isinstance(statement, ast.Import | ast.ImportFrom):
             self._imports[_import_of(statement, name)] = None
@@ -233,9 +228,9 @@ class SourceSlice:
         for node in ast.walk(tree):
             if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
                 if other := self._submodule(module, node.value.id):
-                    edits.append((*places.span(node), self._need(other, node.attr)))
+                    edits.append((*places.span(node), self.name_of(other, node.attr)))
             elif isinstance(node, ast.Name) and node.id in here:
-                edits.append((*places.span(node), self._need(module.name, node.id)))
+                edits.append((*places.span(node), self.name_of(module.name, node.id)))
         text = _edited(places.source, edits)
         if flat != name:
             text = re.sub(rf"\b{name}\b", flat, text)
@@ -260,8 +255,7 @@ class SourceSlice:
         statement = module.bound.get(name)
         if not isinstance(statement, ast.ImportFrom) or not str(statement.module).startswith(PACKAGES):
             return ""
-        alias = next(x for x in statement.names if (x.asname or x.name) == name)
-        path = f"{statement.module}.{alias.name}"
+        path = f"{statement.module}.{_alias_of(statement, name).name}"
         return path if path in sys.modules else ""
 
 
@@ -293,9 +287,14 @@ def _is_generic(function: ast.expr) -> bool:
     return isinstance(owner, ast.Name) and owner.id in GENERIC
 
 
+def _alias_of(statement: ast.Import | ast.ImportFrom, name: str) -> ast.alias:
+    """What a statement imports under a name."""
+    return next(alias for alias in statement.names if name in _bound_names(alias))
+
+
 def _import_of(statement: ast.Import | ast.ImportFrom, name: str) -> str:
     """The line that imports one name."""
-    alias = next(x for x in statement.names if (x.asname or x.name.partition(".")[0]) == name)
+    alias = _alias_of(statement, name)
     origin = f"from {statement.module} " if isinstance(statement, ast.ImportFrom) else ""
     return f"{origin}import {alias.name}" + (f" as {alias.asname}" if alias.asname else "")
 
@@ -319,6 +318,11 @@ def _edited(source: bytes, edits: Iterable[tuple[int, int, str]]) -> str:
     return source.decode()
 
 
+def _first_line(statement: Any) -> int:
+    """Where a statement begins, its decorators included."""
+    return min([statement.lineno, *(x.lineno for x in getattr(statement, "decorator_list", ()))])
+
+
 class _Cut:
     """A statement of a module without what was not executed, and without types."""
 
@@ -326,8 +330,7 @@ class _Cut:
         self._module, self._attributes = module, attributes
         self._edits: list[tuple[int, int, str]] = []
         self._removed = set[int]()  # identities of statements
-        begin = min([statement.lineno, *(x.lineno for x in getattr(statement, "decorator_list", ()))])
-        first, last = module.starts[begin - 1], module.starts[statement.end_lineno]
+        first, last = module.starts[_first_line(statement) - 1], module.starts[statement.end_lineno]
         self._clean(statement)
         edits = [(a - first, b - first, text) for a, b, text in self._edits]
         self.text = _edited(module.source[first:last], edits)
@@ -403,14 +406,12 @@ class _Cut:
 
     def _remove(self, *statements: Any, after: Any = None) -> None:
         """Remove whole lines, with comments above them, and with "else" after a statement."""
-        first, last = statements[0], statements[-1]
-        begin = min([first.lineno, *(x.lineno for x in getattr(first, "decorator_list", ()))])
+        begin = _first_line(statements[0]) if after is None else after.end_lineno + 1
         lines = self._module.source.splitlines()
-        if after is not None:
-            begin = after.end_lineno + 1
         while lines[begin - 2].strip().startswith(b"#") or not lines[begin - 2].strip():
             begin -= 1
-        self._edits.append((self._module.starts[begin - 1], self._module.starts[last.end_lineno], ""))
+        starts = self._module.starts
+        self._edits.append((starts[begin - 1], starts[statements[-1].end_lineno], ""))
         self._removed.update(map(id, statements))
 
     def _drop_types(self, node: ast.FunctionDef | ast.Lambda) -> None:
