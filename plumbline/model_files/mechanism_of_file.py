@@ -275,15 +275,16 @@ class _Writer:
 
     def _physical(self, body: NeutralBody) -> Array:
         """The inertia; where no distribution of mass has it, the second moments that are negative are 0."""
+        place = body.fields.get("inertia", body.source)
         if 0 < np.max(np.abs(body.inertia)) < MIN_INERTIA:  # engines divide by it
             what = f"inertia below {MIN_INERTIA:g} kg m², taken as 0"
-            self.left_out.append(Feature(what, body.name, body.fields.get("inertia", body.source)))
+            self.left_out.append(Feature(what, body.name, place))
             return np.zeros((3, 3))
         values, axes = np.linalg.eigh(np.trace(body.inertia) / 2 * np.eye(3) - body.inertia)
         if values[0] >= -FRAME_ROUNDING * abs(values[2]):
             return body.inertia
         what = "inertia that no distribution of mass has, made physical"
-        self.left_out.append(Feature(what, body.name, body.fields.get("inertia", body.source)))
+        self.left_out.append(Feature(what, body.name, place))
         second: Array = axes @ np.diag(np.maximum(values, 0.0)) @ axes.T
         physical: Array = np.trace(second) * np.eye(3) - second
         return physical

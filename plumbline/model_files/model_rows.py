@@ -124,19 +124,18 @@ def judge_answer(
     worst = mismatches(model, truths, [permuted(one, order) for one in answer.quantities])
     is_singular = bool(model.joints) and any(truth.quantities.acceleration is None for truth in truths)
     for quantity, unit in MODEL_UNITS.items():
-        if quantity in unsupported:
-            reason = unsupported[quantity]
-            rows.append(_row(context, quantity, Verdict.INFORMATION, reason, unit))
-        elif quantity in worst:
+        if quantity in worst and quantity not in unsupported:
             rows.append(_quantity_row(context, quantity, unit, worst[quantity], len(truths)))
-        elif quantity == "acceleration" and is_singular:
+            continue
+        reason = unsupported.get(quantity, "")
+        if not reason and quantity == "acceleration" and is_singular:
             reason = (
                 "no acceleration is determined: the mass matrix is singular in double precision, as where a "
                 "joint moves no mass, or where masses or lengths differ by many orders of magnitude"
             )
-            rows.append(_row(context, quantity, Verdict.INFORMATION, reason, unit))
-        elif any(getattr(one, quantity, 0.0) is None for one in answer.quantities):
+        elif not reason and any(getattr(one, quantity, 0.0) is None for one in answer.quantities):
             reason = "the importer's engine computes it of other files, not of this one"
+        if reason:
             rows.append(_row(context, quantity, Verdict.INFORMATION, reason, unit))
     return rows
 
