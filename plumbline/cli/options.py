@@ -142,14 +142,11 @@ def limits_options(seconds: float) -> _Decorator:
         def with_limits(*, timeout: float, memory: float, **others: Any) -> Any:
             return command(limits=Limits(timeout, memory), **others)
 
-        return _timeout_option(seconds)(_memory_option(with_limits))
+        kind = FiniteNumber(MIN_TIMEOUT, MAX_TIMEOUT)
+        timeout_option = click.option("--timeout", type=kind, default=seconds, help="Seconds per task.")
+        return timeout_option(_memory_option(with_limits))
 
     return decorate
-
-
-def _timeout_option(seconds: float) -> _Decorator:
-    kind = FiniteNumber(MIN_TIMEOUT, MAX_TIMEOUT)
-    return click.option("--timeout", type=kind, default=seconds, help="Seconds per task.")
 
 
 def _choose_engines(context: click.Context, __: click.Parameter, names: Sequence[str]) -> list[str]:

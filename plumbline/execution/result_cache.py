@@ -77,7 +77,7 @@ class DiskResultCache(ResultCache):
             outcome = None if body is None else _decode_outcome(task, body)
         except (DamagedFile, UnfitRecord) as error:
             damage = (
-                error if isinstance(error, DamagedFile) else f"{self._files.path(name)}: damaged ({error})"
+                error if isinstance(error, DamagedFile) else f"{self._files.folder / name}: damaged ({error})"
             )
             self._log(f"{damage}; the cell runs again")
             return None

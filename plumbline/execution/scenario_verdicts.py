@@ -135,7 +135,8 @@ class ScenarioRun:
         count = plan.random_state_count
         has_few_states = is_random or scenario.level == "state"
         count = min(count, STATES_PER_RANDOM_SCENARIO) if has_few_states else count
-        self._states = self._compared_states(count)  # argument of many tasks
+        drawn = scenario.model, scenario.state, scenario.seed, count
+        self._states = self._kept("states", compared_states, *drawn)  # argument of many tasks
         if scenario.model.has_loops and not self._states.load():
             kinds = TaskKind.STATE_TRUTH, TaskKind.RELATION_BOUNDS, *_LEVELS
             self._left_out |= dict.fromkeys(kinds, NO_REGULAR_POSE)
@@ -150,11 +151,6 @@ class ScenarioRun:
         self._awaiting_states = dict[str, list[Outcome]]()  # steps, by engine
         self.left_to_the_night = 0  # number of tasks
         self._packed_truths: dict[TaskKind, Packed] = {}  # for judges and diagnoses in workers
-
-    def _compared_states(self, count: int) -> EncodedRecord:
-        """Draw the states that are compared."""
-        s = self.scenario
-        return self._kept("states", compared_states, s.model, s.state, s.seed, count)
 
     def _kept(self, what: str, function: Callable[..., Any], *arguments: Any) -> EncodedRecord:
         """Call a function that takes long for loops; named scenarios keep its value."""

@@ -41,21 +41,7 @@ class CheckedFiles:
             folder: made when the first file is written.
 
         """
-        self._folder = folder
-
-    @property
-    def folder(self) -> Path:
-        """The folder of the files."""
-        return self._folder
-
-    def path(self, name: str) -> Path:
-        """Locate a file.
-
-        Returns:
-            Its path; it need not exist.
-
-        """
-        return self._folder / name
+        self.folder = folder
 
     def read(self, name: str) -> bytes | None:
         """Read a file, and note that it was used.
@@ -68,10 +54,10 @@ class CheckedFiles:
             OSError: the file cannot be read.
 
         """
-        path = self.path(name)
+        path = self.folder / name
         try:
             with path.open("rb") as file:
-                check_ownership(self._folder)
+                check_ownership(self.folder)
                 _check_owner(path, os.fstat(file.fileno()))
                 data = file.read()
         except FileNotFoundError:
@@ -93,8 +79,8 @@ class CheckedFiles:
             OSError: the file cannot be written.
 
         """
-        make_private_folder(self._folder)
-        replace_file(self.path(name), _checksum(name, body) + body)
+        make_private_folder(self.folder)
+        replace_file(self.folder / name, _checksum(name, body) + body)
 
     def trim(self, max_bytes: int) -> None:
         """Remove the files that were not used for longest, until the others fit.
@@ -105,8 +91,8 @@ class CheckedFiles:
         """
         found = []
         with contextlib.suppress(OSError):
-            check_ownership(self._folder)
-            for entry in os.scandir(self._folder):
+            check_ownership(self.folder)
+            for entry in os.scandir(self.folder):
                 with contextlib.suppress(OSError):  # another run may have removed it
                     about = entry.stat()
                     found.append((about.st_mtime, about.st_size, entry.path))

@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, NamedTuple, Self
 
 from plumbline.processes import worker_process
@@ -269,7 +270,8 @@ class WorkerPool(Executor):
             start_warm_process()  # in this thread, with which it ends
             self._threads = ThreadPoolExecutor(self._jobs)
         call = _Call(task)
-        self._calls[self._threads.submit(self._run, call)] = call
+        make_call = partial(self._call_in_process, call)
+        self._calls[self._threads.submit(run_task, task, make_call)] = call
 
     def collect(self) -> list[tuple[Task, Outcome]]:
         """Wait for a task to finish, at most `_POLL_INTERVAL`, and kill what is over its time limit.
@@ -299,14 +301,6 @@ class WorkerPool(Executor):
                 elif self._clock - call.started > call.task.limits.seconds:
                     call.is_overdue = True
                     call.process.kill()
-
-    def _run(self, call: _Call) -> Outcome:
-        """Run a task, in a thread."""
-
-        def make_call(name: str, *arguments: Any) -> Reply:
-            return self._call_in_process(call, name, *arguments)
-
-        return run_task(call.task, make_call)
 
     def _call_in_process(
         self, call: _Call, name: str, function: Callable[..., Any], arguments: Sequence[Any], python: str

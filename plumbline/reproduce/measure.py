@@ -130,17 +130,12 @@ class Disagreement:
     seconds: float  # for shrinking [s]
     call: str = ""  # of a row of the surface, the names of what is wrong
 
-    def measure(self, case: ReproductionCase) -> Evidence | None:
-        """Measure by how much a case shows this disagreement.
-
-        Returns:
-            The evidence, or None where the engine or the truth refuses the case.
-
-        """
-        return self._measure(case)
-
     @cached_property
-    def _measure(self) -> Callable[[ReproductionCase], Evidence | None]:
+    def measure(self) -> Callable[[ReproductionCase], Evidence | None]:
+        """Return what measures by how much a case shows this disagreement.
+
+        It returns the evidence, or None where the engine or the truth refuses the case.
+        """
         if self.level == "state":
             return StateMeasure(self.engine, self.quantities)
         if self.level == "surface":
@@ -170,11 +165,8 @@ class Disagreement:
         cases = [self.case]
         if self.level == "step":  # one step shows most
             cases.insert(0, replace(self.case, until=self.case.steps[0]))
-        for case in cases:
-            found = smallest_case(case, self._measure, ratio, self.seconds, clock)
-            if found is not None:
-                break
-        return found
+        found = (smallest_case(case, self.measure, ratio, self.seconds, clock) for case in cases)
+        return next((evidence for evidence in found if evidence is not None), None)
 
 
 def _error_size(error: Array, quantity: str) -> Array:
