@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 from plumbline.importers.neutral_model import ElementaryJoint, Feature, NeutralBody, NeutralModel, Source
@@ -98,15 +99,14 @@ def resolve_inside(path: Path, folder: Path) -> Path | None:
     return target if target.is_relative_to(folder) else None
 
 
+def world_elements(root: Element) -> Iterator[Element]:
+    """Go through all elements <worldbody> and what is in them, in the order of the file."""
+    return chain.from_iterable(world.walk() for world in root.find_all("worldbody"))
+
+
 def body_elements(root: Element) -> Iterator[Element]:
-    """Go through the bodies of a file.
-
-    Yields:
-        Elements <body>, a parent before its children.
-
-    """
-    for world in root.find_all("worldbody"):
-        yield from (element for element in world.walk() if element.tag == "body")
+    """Go through the bodies of a file, a parent before its children."""
+    return (element for element in world_elements(root) if element.tag == "body")
 
 
 def joint_elements(body: Element) -> list[Element]:
@@ -247,8 +247,7 @@ def with_sources(model: NeutralModel, root: Element) -> NeutralModel:
     ]
     features += [
         Feature("flex", _name_of(element), element.source)
-        for world in root.find_all("worldbody")
-        for element in world.walk()
+        for element in world_elements(root)
         if element.tag == "flexcomp"
     ]
     features += _joint_features(root, defaults)

@@ -15,7 +15,13 @@ from dataclasses import replace
 import numpy as np
 
 from plumbline.importers.lumping import merge_bodies
-from plumbline.importers.mjcf import DefaultClasses, body_elements, joint_elements, strip_geometry
+from plumbline.importers.mjcf import (
+    DefaultClasses,
+    body_elements,
+    joint_elements,
+    strip_geometry,
+    world_elements,
+)
 from plumbline.importers.neutral_model import NeutralBody
 from plumbline.importers.xml_tree import Element
 from plumbline.model.datatypes import Array
@@ -72,24 +78,22 @@ def _moving_parts(root: Element) -> Element:
     copy = deepcopy(root)
     strip_geometry(copy)
     copy.children = [child for child in copy.children if child.tag in _KEPT_SECTIONS]
-    for world in copy.find_all("worldbody"):
-        for element in world.walk():
-            element.children = [c for c in element.children if c.tag not in ("site", "camera", "light")]
+    for element in world_elements(copy):
+        element.children = [c for c in element.children if c.tag not in ("site", "camera", "light")]
     return copy
 
 
 def _expand_defaults(root: Element) -> bool:
     """Write what joints and geoms inherit from default classes at each of them."""
     defaults, changed = DefaultClasses(root), False
-    for world in root.find_all("worldbody"):
-        for element in [e for e in world.walk() if e.tag in _EXPANDED]:
-            inherited: dict[str, str] = {}
-            for holder in reversed(defaults.chain(element)):
-                for default in holder.find_all(element.tag):
-                    _override(inherited, default.attributes)
-            changed |= bool(inherited)
-            _override(inherited, element.attributes)
-            element.attributes = inherited
+    for element in [e for e in world_elements(root) if e.tag in _EXPANDED]:
+        inherited: dict[str, str] = {}
+        for holder in reversed(defaults.chain(element)):
+            for default in holder.find_all(element.tag):
+                _override(inherited, default.attributes)
+        changed |= bool(inherited)
+        _override(inherited, element.attributes)
+        element.attributes = inherited
     for top in root.find_all("default"):
         for holder in [e for e in top.walk() if e.tag == "default"]:
             holder.children = [c for c in holder.children if c.tag not in _EXPANDED]
@@ -106,33 +110,31 @@ def _override(inherited: dict[str, str], own: dict[str, str]) -> None:
 def _introduce_frames(root: Element) -> bool:
     """Give the pose of each body to a frame around it."""
     changed = False
-    for world in root.find_all("worldbody"):
-        for holder in list(world.walk()):
-            for place, child in enumerate(holder.children):
-                if child.tag != "body" or holder.tag == "frame":
-                    continue
-                moved = {n: child.attributes.pop(n) for n in ("pos", *ORIENTATIONS) if n in child.attributes}
-                holder.children[place] = Element("frame", moved, child.source, [child])
-                changed |= bool(moved)
+    for holder in list(world_elements(root)):
+        for place, child in enumerate(holder.children):
+            if child.tag != "body" or holder.tag == "frame":
+                continue
+            moved = {n: child.attributes.pop(n) for n in ("pos", *ORIENTATIONS) if n in child.attributes}
+            holder.children[place] = Element("frame", moved, child.source, [child])
+            changed |= bool(moved)
     return changed
 
 
 def _flatten_frames(root: Element) -> bool:
     """Apply each frame's pose to what is in it."""
     compiler, changed = _Compiler(root), False
-    for world in root.find_all("worldbody"):
-        for holder in world.walk():  # a frame in a frame is met again in its holder's list
-            while (frame := holder.find("frame")) is not None:
-                changed = True
-                place = holder.children.index(frame)
-                for child in frame.children:
-                    if child.tag not in _POSED:
-                        raise _NoRewriting(child.tag)
-                    if "childclass" in frame.attributes:
-                        name = "class" if child.tag in _EXPANDED else "childclass"
-                        child.attributes.setdefault(name, frame.attributes["childclass"])
-                    compiler.move(child, *compiler.pose(frame))
-                holder.children[place : place + 1] = frame.children
+    for holder in world_elements(root):  # a frame in a frame is met again in its holder's list
+        while (frame := holder.find("frame")) is not None:
+            changed = True
+            place = holder.children.index(frame)
+            for child in frame.children:
+                if child.tag not in _POSED:
+                    raise _NoRewriting(child.tag)
+                if "childclass" in frame.attributes:
+                    name = "class" if child.tag in _EXPANDED else "childclass"
+                    child.attributes.setdefault(name, frame.attributes["childclass"])
+                compiler.move(child, *compiler.pose(frame))
+            holder.children[place : place + 1] = frame.children
     return changed
 
 
@@ -141,17 +143,16 @@ def _change_angles(root: Element) -> bool:
     _expand_defaults(root)
     compiler, changed = _Compiler(root), False
     factor = math.pi / 180 if compiler.is_degree else 180 / math.pi
-    for world in root.find_all("worldbody"):
-        for element in world.walk():
-            kind = element.attributes.get("type", "hinge") if element.tag == "joint" else ""
-            angles = {"hinge": ("ref", "springref", "springyield", "range"), "ball": ("range",)}.get(kind, ())
-            for name in ("euler", "axisangle", *angles):
-                if name in element.attributes:
-                    values = _numbers(element, name)
-                    first = 3 if name == "axisangle" else 0
-                    values[first:] *= factor
-                    element.attributes[name] = _text(values)
-                    changed = True
+    for element in world_elements(root):
+        kind = element.attributes.get("type", "hinge") if element.tag == "joint" else ""
+        angles = {"hinge": ("ref", "springref", "springyield", "range"), "ball": ("range",)}.get(kind, ())
+        for name in ("euler", "axisangle", *angles):
+            if name in element.attributes:
+                values = _numbers(element, name)
+                first = 3 if name == "axisangle" else 0
+                values[first:] *= factor
+                element.attributes[name] = _text(values)
+                changed = True
     for holder in root.find_all("compiler"):
         holder.attributes.pop("angle", None)
     unit = {"angle": "radian" if compiler.is_degree else "degree"}
@@ -264,12 +265,11 @@ def _rename_and_reorder(root: Element) -> bool:
     for body in list(body_elements(root)):
         for element in (body, *joint_elements(body)):
             element.attributes["name"] = RENAMED + element.attributes["name"]
-    for world in root.find_all("worldbody"):
-        for holder in world.walk():
-            bodies = iter(reversed([child for child in holder.children if child.tag in ("body", "frame")]))
-            holder.children = [
-                next(bodies) if child.tag in ("body", "frame") else child for child in holder.children
-            ]
+    for holder in world_elements(root):
+        bodies = iter(reversed([child for child in holder.children if child.tag in ("body", "frame")]))
+        holder.children = [
+            next(bodies) if child.tag in ("body", "frame") else child for child in holder.children
+        ]
     return True
 
 
