@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rich.console import Group
@@ -12,7 +12,7 @@ from rich.live import Live
 from plumbline.cli.terminal_output import ProgressDisplay, make_console
 from plumbline.cli.verdict_matrix import VerdictMatrix
 from plumbline.engines.adapter import EngineInfo
-from plumbline.execution.plan import RunObserver
+from plumbline.execution.plan import ProgressCallback, RunObserver
 from plumbline.judging.rows import Row
 
 REFRESH_INTERVAL = 0.25  # s between two pictures of the table on a terminal
@@ -35,7 +35,7 @@ class RunDisplay(ProgressDisplay, RunObserver):
             console=self.bar.console, transient=True, auto_refresh=False, get_renderable=self._picture
         )
 
-    def __enter__(self) -> Callable[[int, int, str], None]:
+    def __enter__(self) -> ProgressCallback:
         """Start the picture; the value is the function to call after each task."""
         if self.file.isatty():
             self._live.start()

@@ -6,7 +6,7 @@ import json
 import os
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import click
@@ -18,6 +18,7 @@ from rich.table import Table
 
 from plumbline.cli.findings_output import WIDTH, describe_run, legend, wrap
 from plumbline.cli.verdict_matrix import VerdictMatrix, matrix_of_rows
+from plumbline.execution.plan import ProgressCallback
 from plumbline.execution.runner import RunResult
 from plumbline.judging.findings import Finding
 from plumbline.judging.rows import SHOWN_STYLES, Row, Verdict
@@ -124,7 +125,7 @@ class ProgressDisplay:
         self.file = file
         self.last_tenth = 0
 
-    def __enter__(self) -> Callable[[int, int, str], None]:
+    def __enter__(self) -> ProgressCallback:
         """Start the bar; the value is the function to call after each task."""
         self.bar.start()
         self.task = self.bar.add_task("running", total=None)

@@ -7,7 +7,7 @@ in a local process, in another environment or on another machine.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -43,6 +43,8 @@ BESIDES = ("surface", "variants")  # what an engine is asked for after the state
 APART = "apart"  # the same, each part and variant in a process of its own
 SURFACE_STATES = 8  # of a scenario, at which what engines report besides the state quantities is compared
 
+VariantAnswers = dict[VariantKind, dict[Call, list[StateQuantities] | NoAnswer]]  # by kind and names
+
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
@@ -59,9 +61,7 @@ class Evaluation:
     surface_failure: str = ""  # what it did instead
     place: str = ""  # `place_of` what it raised, in one or the other
     # by kind and names of a variant the quantities at the first states, or what the engine did instead
-    variants: Mapping[VariantKind, Mapping[Call, list[StateQuantities] | NoAnswer]] = field(
-        default_factory=dict
-    )
+    variants: VariantAnswers = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +191,7 @@ def evaluate_states(
         return _no_evaluation(found, begin, declared)
     surplus = [name for name in adapter.unsupported for one in found if getattr(one, name, None) is not None]
     surface, surface_failure, place = dict[str, dict[Call, Array]](), "", ""
-    variants: dict[VariantKind, dict[Call, list[StateQuantities] | NoAnswer]] = {}
+    variants: VariantAnswers = {}
     IS_APART.set(APART in besides)
     if found and not surplus and "surface" in besides:
         stacked = attempt(lambda: stack_answers(adapter.surface(model, states[:SURFACE_STATES])))
@@ -216,16 +216,14 @@ def _no_evaluation(answer: NoAnswer, begin: float, declared: tuple[str, ...]) ->
     return Evaluation([], unsupported, failure, cpu_time, answer.gap, declared, place=answer.place)
 
 
-def evaluate_variants(
-    adapter: Adapter, model: Model, states: Sequence[State]
-) -> dict[VariantKind, dict[Call, list[StateQuantities] | NoAnswer]]:
+def evaluate_variants(adapter: Adapter, model: Model, states: Sequence[State]) -> VariantAnswers:
     """Evaluate the state quantities by all variants of an engine that suit the mechanism.
 
     Returns:
         By kind and names the quantities, or what the engine raised.
 
     """
-    found: dict[VariantKind, dict[Call, list[StateQuantities] | NoAnswer]] = {}
+    found: VariantAnswers = {}
     for variant in adapter.variants:
         if variant.suits(model):
             by_names = found.setdefault(variant.kind, {})

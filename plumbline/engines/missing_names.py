@@ -12,6 +12,7 @@ from plumbline.model.datatypes import Array, Call, Unsupported
 from plumbline.processes.exceptions import describe_exception, place_of
 from plumbline.processes.isolation import EndedEarly, call_in_fork
 
+FoundAnswer = dict[str, dict[Call, Array]]  # a `SurfaceAnswer` while it is made
 # Under these names an answer of the surface has the names of the engine that its version lacks, and what
 # parts failed by, each with the place of what was raised.
 MISSING_NAMES, FAILED_PARTS = "missing names", "failed parts"
@@ -44,7 +45,7 @@ def missing_name(error: Exception, adapter: str = "") -> str | None:
     return found if str(package).partition(".")[0] not in own else None
 
 
-def add_parts(found: dict[str, dict[Call, Array]], *parts: Callable[[], object]) -> None:
+def add_parts(found: FoundAnswer, *parts: Callable[[], object]) -> None:
     """Let each part add to an answer of the surface, up to its first failure or name that the version lacks.
 
     Raises:
@@ -66,9 +67,7 @@ def add_parts(found: dict[str, dict[Call, Array]], *parts: Callable[[], object])
             _note(found, FAILED_PARTS, f"{_label(part)}: {error}", "")
 
 
-def _add_part(
-    found: dict[str, dict[Call, Array]], part: Callable[[], object]
-) -> dict[str, dict[Call, Array]]:
+def _add_part(found: FoundAnswer, part: Callable[[], object]) -> FoundAnswer:
     try:
         part()
     except (MemoryError, Unsupported):
@@ -83,7 +82,7 @@ def _add_part(
     return found
 
 
-def _note(found: dict[str, dict[Call, Array]], kind: str, *words: str) -> None:
+def _note(found: FoundAnswer, kind: str, *words: str) -> None:
     found.setdefault(kind, {})[words] = np.zeros((1, 1))
 
 

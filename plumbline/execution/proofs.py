@@ -12,6 +12,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from plumbline.execution.plan import ProgressCallback
 from plumbline.processes.worker_pool import Limits, Task, WorkerPool
 from plumbline.scenario.line_and_column_errors import shorten
 from plumbline.scenario.loader import Scenario, catalogue, load_scenarios
@@ -61,7 +62,7 @@ def prove_changed_motions(
     limits: Limits,
     max_cpu_seconds: float,
     log: Callable[[str], None] = lambda _: None,
-    progress: Callable[[int, int, str], None] = lambda done, total, name: None,
+    progress: ProgressCallback = lambda done, total, name: None,
 ) -> ProofSummary:
     """Prove the motions that have no proof yet, short chains first, and judge the usual truth by them.
 
@@ -123,7 +124,7 @@ def verify_certificates(
     expected: Scenario | None,
     jobs: int,
     limits: Limits,
-    progress: Callable[[int, int, str], None],
+    progress: ProgressCallback,
 ) -> list[dict[str, Any]]:
     """Prove certificates again in workers, which hostile files cannot fill or hold up for ever.
 

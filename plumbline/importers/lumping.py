@@ -10,6 +10,8 @@ from plumbline.importers.neutral_model import NeutralBody, NeutralModel
 from plumbline.model.datatypes import Array, Float
 from plumbline.model.kinematics import quaternion_product, rotation_matrix
 
+Part = tuple[NeutralBody, Array, Array]  # a fixed body, its position and rotation matrix in its carrier
+
 
 def lump_fixed_bodies(model: NeutralModel) -> NeutralModel:
     """Give the mass of each body without joints to the body that carries it, and leave it out.
@@ -24,7 +26,7 @@ def lump_fixed_bodies(model: NeutralModel) -> NeutralModel:
     return _lumped(model)[0]
 
 
-def fixed_parts(model: NeutralModel) -> dict[str, list[tuple[NeutralBody, Array, Array]]]:
+def fixed_parts(model: NeutralModel) -> dict[str, list[Part]]:
     """List the bodies that `lump_fixed_bodies` lumps into each body, that body first.
 
     Args:
@@ -37,8 +39,8 @@ def fixed_parts(model: NeutralModel) -> dict[str, list[tuple[NeutralBody, Array,
     return _lumped(model)[1]
 
 
-def _lumped(model: NeutralModel) -> tuple[NeutralModel, dict[str, list[tuple[NeutralBody, Array, Array]]]]:
-    parts: dict[str, list[tuple[NeutralBody, Array, Array]]] = {}
+def _lumped(model: NeutralModel) -> tuple[NeutralModel, dict[str, list[Part]]]:
+    parts: dict[str, list[Part]] = {}
     carrier: list[int] = []  # index of the new body that carries the old one; −1: the world
     pose: list[tuple[Array, Array]] = []  # of the old body in its carrier: position, quaternion
     bodies: list[NeutralBody] = []

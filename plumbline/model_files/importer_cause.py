@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from plumbline.importers.lumping import fixed_parts, lump_fixed_bodies, merge_bodies
+from plumbline.importers.lumping import Part, fixed_parts, lump_fixed_bodies, merge_bodies
 from plumbline.importers.neutral_model import CanonicalState, ModelQuantities, NeutralBody, NeutralModel
 from plumbline.model.datatypes import Array
 from plumbline.model.grouping import grouped
@@ -60,7 +60,6 @@ MAX_SINGLE_TRIALS = 40  # changes of one field that are tried one by one
 PRUNING_STATES = 3
 OTHER_JOINTS = {"joints": Mismatch(np.inf, 0.0, np.inf, 0, "")}
 States = Callable[[NeutralModel], Sequence[CanonicalState]]
-Part = tuple[NeutralBody, Array, Array]  # a fixed body, its position and rotation matrix in its carrier
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,6 +12,7 @@ from plumbline.engines.environments import declared_importer_attribute, split_ve
 from plumbline.engines.importer_calls import evaluate_model_file, read_model_file, read_model_files
 from plumbline.engines.registry import IMPORTERS
 from plumbline.execution.exit_codes import ExitCode
+from plumbline.execution.plan import ProgressCallback
 from plumbline.execution.runner import describe_engines, exit_code_of_rows
 from plumbline.importers.neutral_model import NeutralModel, extreme_numbers
 from plumbline.importers.xml_tree import ModelFileError
@@ -31,8 +32,6 @@ from plumbline.model_files.prepared_file import MJCF_READER, BaseChoice, Prepare
 from plumbline.processes.isolation import ScratchFolder
 from plumbline.processes.worker_pool import Executor, Limits, Outcome, Packed, Scheduler, Task, WorkerPool
 from plumbline.scenario.line_and_column_errors import Problem, did_you_mean, shorten
-
-ProgressCallback = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True)
