@@ -21,7 +21,7 @@ from plumbline.processes.worker_pool import Limits
 from plumbline.scenario.generator import RANDOM_FAMILY, RandomScenarios, random_seed
 from plumbline.scenario.line_and_column_errors import did_you_mean, nearest_or_all, shorten
 from plumbline.scenario.loader import Scenario
-from plumbline.storage.results_store import read_model_results, read_results
+from plumbline.storage.results_store import Record, read_model_results, read_results
 from plumbline.storage.version_changes import add_version_change
 from plumbline.studies.version_search import NoSearch, VersionChange, search_versions
 
@@ -103,7 +103,7 @@ def _report(version: str, text: str) -> None:
     log(f"{version}: {text}")
 
 
-def _document(change: VersionChange) -> dict[str, Any]:
+def _document(change: VersionChange) -> Record:
     return {
         "engine": change.engine,
         "oldest": change.oldest,
@@ -134,7 +134,7 @@ def _search_result(
     return search_versions(run, row["engine"].partition("@")[0], good, bad, _report, row)
 
 
-def _row(key: str, rows: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
+def _row(key: str, rows: Mapping[str, Record]) -> Record:
     if key not in rows:
         hint = did_you_mean(key, list(rows)) or "`reproduce` lists the disagreements"
         raise click.UsageError(f"no row {shorten(repr(key))}; {hint}")

@@ -40,7 +40,7 @@ from plumbline.processes.user_cache import naming_file
 from plumbline.processes.worker_pool import Limits
 from plumbline.scenario.line_and_column_errors import MAX_LISTED_PROBLEMS, ScenarioError, shorten
 from plumbline.scenario.mechanism_document import scenario_text
-from plumbline.storage.results_store import row_record, to_json_value
+from plumbline.storage.results_store import Record, row_record, to_json_value
 
 COLUMN_HEADINGS = {
     "joints": "joints", "total_mass": "mass", "position": "position", "attitude": "attitude",
@@ -177,7 +177,7 @@ def _write_scenario(files: Sequence[str], base: Any, root: Path | None, to: Path
     click.echo(f"{to}: {count_noun(scenario.model.n, 'body', 'bodies')}. {scenario.purpose}")
 
 
-def _write_reports(document: dict[str, Any], folder: Path, as_json: bool) -> None:
+def _write_reports(document: Record, folder: Path, as_json: bool) -> None:
     from reports import model_page
 
     with options.exit_on_io_error():
@@ -185,7 +185,7 @@ def _write_reports(document: dict[str, Any], folder: Path, as_json: bool) -> Non
     click.echo(f"report: {page}", err=as_json)
 
 
-def model_document(result: ModelRunResult) -> dict[str, Any]:
+def model_document(result: ModelRunResult) -> Record:
     """Write a result as a document for other programs."""
     plan = result.plan
     document = {
@@ -229,11 +229,11 @@ def model_document(result: ModelRunResult) -> dict[str, Any]:
         ],
         "exit_code": int(result.exit_code),
     }
-    found: dict[str, Any] = to_json_value(document)
+    found: Record = to_json_value(document)
     return found
 
 
-def _cause_records(file: FileResult) -> Iterator[dict[str, Any]]:
+def _cause_records(file: FileResult) -> Iterator[Record]:
     for name, explanation in file.explanations.items():
         rows = [row for row in file.rows if row.engine == name and row.verdict == Verdict.DISAGREES]
         is_known = all(row.known_issue is not None for row in rows)
@@ -247,7 +247,7 @@ def _cause_records(file: FileResult) -> Iterator[dict[str, Any]]:
             }  # fmt: skip
 
 
-def _feature_record(feature: Feature) -> dict[str, Any]:
+def _feature_record(feature: Feature) -> Record:
     source = feature.source
     return {"what": feature.what, "name": feature.name, "file": source.file, "line": source.line}
 

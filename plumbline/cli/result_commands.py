@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Any
 
 import click
 
@@ -15,7 +14,7 @@ from plumbline.cli.help_texts import examples
 from plumbline.cli.terminal_output import count_noun, line_width, log, make_console, print_json, print_table
 from plumbline.judging.rows import Verdict
 from plumbline.scenario.line_and_column_errors import did_you_mean
-from plumbline.storage.results_store import read_results
+from plumbline.storage.results_store import Record, read_results
 
 MAKES_ONE = "`python -m plumbline nightly` makes one in the folder `nightly`"
 
@@ -71,7 +70,7 @@ def _place_of(name: str, names: list[str]) -> int:
     return places[0]
 
 
-def _print_history(folder: Path, document: dict[str, Any], pattern: str | None) -> None:
+def _print_history(folder: Path, document: Record, pattern: str | None) -> None:
     trend = document.get("trend", [])
     print_table(document["nights"], "nights")
     print_table(
@@ -99,7 +98,7 @@ def _check_history_folder(folder: Path) -> None:
         raise click.UsageError(f"no complete night in {folder}; {MAKES_ONE}")
 
 
-def _history_lines(document: dict[str, Any]) -> list[str]:
+def _history_lines(document: Record) -> list[str]:
     lines = [f"version: {sentence}" for sentence in document["versions"]]
     since = f"since the last green {document['last_green']}"
     return lines + [f"{since}: {c['key']} {c['was']} → {c['is']}" for c in document["since_green"]]

@@ -51,7 +51,7 @@ from plumbline.processes.worker_pool import (
 )
 from plumbline.storage import results_store
 
-RUN_SUMMARY: dict[str, Any] = {  # of the rows that are about the whole run
+RUN_SUMMARY: results_store.Record = {  # of the rows that are about the whole run
     "family": RUN_FAMILY,
     "title": "All scenarios of the run together",
     "purpose": "Shows two columns that are one computation under two names.",
@@ -74,11 +74,11 @@ class RunResult:
     rows: list[Row]
     stale_issues: list[known_issues.KnownIssue]  # known issues that no longer occur
     engines: dict[str, EngineInfo]
-    scenarios: dict[str, dict[str, Any]]
+    scenarios: dict[str, results_store.Record]
     random_batch: RandomBatch
     tables: results_store.ResultTables
     cpu_times: CpuTimes
-    metadata: dict[str, Any]  # the entry ``run`` of results.json
+    metadata: results_store.Record  # the entry ``run`` of results.json
     own_scenarios: frozenset[str] = frozenset()  # names of those of the user's own files
     wide_issues: tuple[str, ...] = ()  # what `KnownIssues.wide_issues` describes
 
@@ -221,7 +221,7 @@ class _Run:
         self.tables = results_store.ResultTables()
         self.random_batch = RandomBatch()
         self.rows: dict[str, list[Row]] = {s.name: [] for s in plan.scenarios}
-        self.summaries: dict[str, dict[str, Any]] = {s.name: {} for s in plan.scenarios}
+        self.summaries: dict[str, results_store.Record] = {s.name: {} for s in plan.scenarios}
         self.open: dict[str, ScenarioRun] = {}  # in the order of their making, which is that of the tables
 
     def execute(self, executor: Executor, progress: ProgressCallback) -> None:

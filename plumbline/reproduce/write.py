@@ -8,7 +8,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -28,7 +27,7 @@ from plumbline.reproduce.measure import Disagreement
 from plumbline.reproduce.render import no_script_reason, render_script
 from plumbline.reproduce.shrink import OutOfTime, ReproductionCase
 from plumbline.scenario.line_and_column_errors import did_you_mean
-from plumbline.storage.results_store import read_results, write_atomically
+from plumbline.storage.results_store import Record, read_results, write_atomically
 from plumbline.storage.script_index import read_script_index, script_name, scripts_folder, write_script_index
 from plumbline.storage.version_changes import read_version_changes
 from plumbline.truth.step_comparison import RUN_QUANTITIES
@@ -37,8 +36,6 @@ REQUESTED_SECONDS, UNREQUESTED_SECONDS = 60.0, 3.0  # of shrinking: a script by 
 MAX_TRIED = 3  # cells of a finding and level for which a script is tried at the end of a run
 MIN_CANDIDATES = 6  # shrinking needs at least so many; where they would take too long, it is not begun
 HINT = "request this row by its key"
-
-StoredRow = dict[str, Any]
 
 
 class NotReproducible(PlumblineError, ValueError):
@@ -73,7 +70,7 @@ def write_scripts(
     folder: Path,
     keys: Sequence[str] | None = None,
     results: ResultCache | None = None,
-    document: dict[str, Any] | None = None,
+    document: Record | None = None,
 ) -> WrittenScripts:
     """Write scripts of rows into the results folder, and list them in scripts/index.json.
 
@@ -102,7 +99,7 @@ def write_scripts(
             if key not in (known := [row["key"] for row in disagreeing]):
                 hint = f"; {near}" if (near := did_you_mean(key, known)) else ""
                 raise NotReproducible(f"no row {key!r} disagrees here{hint}")
-        cells: dict[tuple[str, ...], list[StoredRow]] = {}
+        cells: dict[tuple[str, ...], list[Record]] = {}
         for row in disagreeing:
             cells.setdefault(_cell(row), []).append(row)
         wanted = {cell: [r for r in rows if keys is None or r["key"] in keys] for cell, rows in cells.items()}
@@ -207,7 +204,7 @@ def _outcomes(tasks: Sequence[Task], results: ResultCache, jobs: int) -> Iterato
                 yield outcome
 
 
-def make_script(disagreement: Disagreement, row: StoredRow) -> tuple[str, str]:
+def make_script(disagreement: Disagreement, row: Record) -> tuple[str, str]:
     """Shrink a disagreement, render its script and run it once (to be called in a worker).
 
     Where the script of the smallest case does not show the disagreement, that of the whole case is tried: a
@@ -233,7 +230,7 @@ def make_script(disagreement: Disagreement, row: StoredRow) -> tuple[str, str]:
     return "", "called again, the engine agrees: nothing to show"
 
 
-def find_disagreement(document: dict[str, Any], rows: list[StoredRow], seconds: float) -> Disagreement:
+def find_disagreement(document: Record, rows: list[Record], seconds: float) -> Disagreement:
     """Find what to measure again for the rows of one cell.
 
     Args:
@@ -275,7 +272,7 @@ def find_disagreement(document: dict[str, Any], rows: list[StoredRow], seconds: 
     return Disagreement(engine, row["level"], quantities, row["integrator"], case, ratio, seconds, call)
 
 
-def _disagreements(document: dict[str, Any]) -> list[StoredRow]:
+def _disagreements(document: Record) -> list[Record]:
     return [row for row in document["rows"] if row["verdict"] == Verdict.DISAGREES]
 
 
@@ -300,7 +297,7 @@ def _recorded_scripts() -> dict[str, Path]:
     return {name: path for name, path in every.items() if path.is_file()}
 
 
-def _version_sentence(rows: list[StoredRow], changes: dict[str, dict[str, Any]]) -> str:
+def _version_sentence(rows: list[Record], changes: dict[str, Record]) -> str:
     """Since which version the rows are so, where `bisect` or a known issue says it; else empty."""
     for row in rows:
         if row["key"] in changes:
@@ -311,7 +308,7 @@ def _version_sentence(rows: list[StoredRow], changes: dict[str, dict[str, Any]])
 
 
 def _check_worthwhile(
-    cell: tuple[str, ...], rows: list[StoredRow], cells: dict[tuple[str, ...], list[StoredRow]]
+    cell: tuple[str, ...], rows: list[Record], cells: dict[tuple[str, ...], list[Record]]
 ) -> None:
     """Raise NotReproducible for a cell whose script can wait until somebody requests it."""
     scenario, engine, level, integrator, *_ = cell
@@ -326,7 +323,7 @@ def _largest_printed_ratio(printed: str) -> float:
     return max(map(float, re.findall(r"^  off by (\S+) times", printed, re.M)), default=0.0)
 
 
-def _cell(row: StoredRow) -> tuple[str, ...]:
+def _cell(row: Record) -> tuple[str, ...]:
     """Return what rows share a script: scenario, engine, level and integrator, or one relation or call."""
     relation = (row["quantity"],) if row["level"] in ("relations", "surface") else ()
     if row["quantity"] in LONG_RUN_QUANTITIES:
@@ -334,9 +331,7 @@ def _cell(row: StoredRow) -> tuple[str, ...]:
     return row["scenario"], row["engine"], row["level"], row["integrator"], *relation
 
 
-def _refinement_study(
-    document: dict[str, Any], rows: list[StoredRow], model: Model, state: State
-) -> ReproductionCase:
+def _refinement_study(document: Record, rows: list[Record], model: Model, state: State) -> ReproductionCase:
     """The study behind rows: up to the latest time they compared, with the steps of the run."""
     cell = _cell(rows[0])[:2], rows[0]["integrator"]
     every = [
@@ -360,7 +355,7 @@ def _refinement_study(
     return ReproductionCase(model, state, float(span), steps)
 
 
-def _ratio(row: StoredRow) -> float:
+def _ratio(row: Record) -> float:
     """Error over tolerance of a stored row."""
     return float(row["ratio"] or 0.0)
 

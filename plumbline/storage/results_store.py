@@ -23,9 +23,9 @@ from plumbline.judging.rows import Columns, Row
 from plumbline.processes.user_cache import replace_file
 from plumbline.scenario.line_and_column_errors import shorten
 from plumbline.storage.results_schema import DamagedResults, check_results
+from plumbline.storage.schema_upgrade import Record as Record
 from plumbline.storage.schema_upgrade import upgrade_document, upgrade_summary
 
-Record = dict[str, Any]
 SCHEMA_VERSION = 6
 READABLE_VERSIONS = (1, 2, 3, 4, 5, 6)
 _PLAIN_TYPES = (str, type(None), int, bool)
@@ -141,7 +141,7 @@ def to_json_value(value: Any) -> Any:
     return value
 
 
-def row_record(row: Row) -> dict[str, Any]:
+def row_record(row: Row) -> Record:
     """Convert a row to its entry in results.json.
 
     Args:
@@ -286,9 +286,9 @@ def read_table(folder: Path, name: str) -> pa.Table:
 
 def write_results(
     folder: Path,
-    run: dict[str, Any],
-    scenarios: dict[str, Any],
-    engines: dict[str, Any],
+    run: Record,
+    scenarios: Record,
+    engines: Record,
     rows: Sequence[Row],
     tables: ResultTables,
 ) -> None:
@@ -324,7 +324,7 @@ def write_results(
     write_atomically(folder / "results.json", text.encode())
 
 
-def read_model_results(folder: Path) -> dict[str, Any]:
+def read_model_results(folder: Path) -> Record:
     """Read what `plumbline model --out` wrote.
 
     Returns:
@@ -372,7 +372,7 @@ def _check_is_regular(path: Path) -> None:
         raise ValueError("it is not a regular file")
 
 
-def read_results(folder: Path) -> dict[str, Any]:
+def read_results(folder: Path) -> Record:
     """Read results.json, of any readable schema version.
 
     Returns:

@@ -15,7 +15,7 @@ from plumbline.judging.rows import Row, Verdict, error_ratio
 from plumbline.model.datatypes import Model, State
 from plumbline.model.kinematics import complete_state
 
-Record = dict[str, Any]
+Record = dict[str, Any]  # plain data, as JSON holds them
 
 # Names of schema version 1 and their present names.
 _ROW_NAMES = {

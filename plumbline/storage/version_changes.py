@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
-from plumbline.storage.results_store import load_json, write_atomically
+from plumbline.storage.results_store import Record, load_json, write_atomically
 
 FILE = "version_changes.json"
 
 
-def read_version_changes(folder: Path) -> dict[str, dict[str, Any]]:
+def read_version_changes(folder: Path) -> dict[str, Record]:
     """Read what was found of the rows of a results folder.
 
     Returns:
@@ -19,13 +18,13 @@ def read_version_changes(folder: Path) -> dict[str, dict[str, Any]]:
 
     """
     try:
-        found: dict[str, dict[str, Any]] = load_json(folder / FILE)
+        found: dict[str, Record] = load_json(folder / FILE)
     except (OSError, ValueError):
         return {}
     return found
 
 
-def add_version_change(folder: Path, key: str, change: dict[str, Any]) -> None:
+def add_version_change(folder: Path, key: str, change: Record) -> None:
     """Keep what was found of a row.
 
     Args:
