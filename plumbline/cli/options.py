@@ -304,6 +304,9 @@ json_option = click.option("--json", "as_json", is_flag=True, help="JSON on stdo
 _memory_option = click.option(
     "--memory", type=FiniteNumber(MIN_MEMORY, MAX_MEMORY), default=8.0, help="GB of address space per worker."
 )
+files_argument = click.argument(
+    "files", nargs=-1, required=True, metavar="FILE...", type=click.Path(path_type=Path)
+)
 names_argument = click.argument("names", nargs=-1, metavar="[SCENARIO]...")
 
 

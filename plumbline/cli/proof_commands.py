@@ -77,7 +77,7 @@ def prove(names: tuple[str, ...], duration: float | None, precision: Any, out: P
     "verify tumbling-ball.json.gz --scenario tumbling-ball",
     "verify certificates/*.json.gz --json",
 )
-@click.argument("files", nargs=-1, required=True, metavar="FILE...", type=click.Path(path_type=Path))
+@options.files_argument
 @click.option(
     "--scenario",
     "expected",

@@ -248,7 +248,7 @@ def explain(name: str | None, folder: Path, known_files: tuple[Path, ...]) -> No
 
 
 @click.command(epilog=examples("known mine.yaml > mine-by-finding.yaml"))
-@click.argument("files", nargs=-1, required=True, metavar="FILE...", type=click.Path(path_type=Path))
+@options.files_argument
 def known(files: tuple[Path, ...]) -> None:
     """Print entries of files of known issues by finding: those of one engine and one reason as one.
 

@@ -86,7 +86,7 @@ def _surface_records() -> list[dict[str, Any]]:
 
 
 @click.command()
-@click.argument("files", nargs=-1, required=True, metavar="FILE...", type=click.Path(path_type=Path))
+@options.files_argument
 def check(files: tuple[Path, ...]) -> None:
     """Check scenario files and print every problem of every file, as file:line:column."""
     for s in options.read_scenarios(files):

@@ -38,6 +38,7 @@ START_BITS, MAX_BITS = 192, 2048  # 128 are too few for a robot of 30 joints, an
 MAX_RELATIVE_RADIUS = 1e-22  # of the magnitudes of the terms
 FLOOR = 2.0**-30  # of the largest entry, where the terms vanish exactly but not in an engine's frames
 MAX_LOSS = 0.1  # of M v̇ by rounding: beyond it doubles do not determine v̇
+FORCES = ("gravity_force", "bias_force", "passive_force")  # one number per velocity
 MIN_MAGNITUDE = 1e-300  # so that terms that are all zero have a radius to compare with
 
 
@@ -396,13 +397,10 @@ def _with_tolerances(
     M, a = middle["mass_matrix"].reshape(n, n), middle.get("acceleration")
     tolerance: dict[str, Any] = {
         "poses": _pose_tolerances(model, size),
-        "mass_matrix": unit * size.mass_matrix,
-        "bias_force": unit * size.bias_force,
-        "gravity_force": unit * size.gravity_force,
-        "passive_force": unit * size.passive_force,
         "kinetic_energy": unit * float(speed @ size.mass_matrix @ speed),
         "potential_energy": 2 * unit * size.potential,
     }
+    tolerance |= {name: unit * getattr(size, name) for name in ("mass_matrix", *FORCES)}
     if a is not None:
         work = size.mass_matrix @ np.abs(a) + size.bias_force + size.passive_force
         scale = np.sqrt(np.maximum(np.diag(M), MIN_MAGNITUDE))  # slides and turns, long and short arms
@@ -411,10 +409,7 @@ def _with_tolerances(
         tolerance["acceleration"] = unit * (inverse / scales @ work)
         loss = unit * np.max(inverse @ (size.mass_matrix / scales) @ np.ones(n), initial=0.0)
         a = a if loss <= MAX_LOSS else None
-    quantities = ModelQuantities(
-        poses=poses, mass_matrix=M, bias_force=middle["bias_force"], gravity_force=middle["gravity_force"],
-        passive_force=middle["passive_force"], acceleration=a,
-        kinetic_energy=float(middle["kinetic_energy"][0]),
-        potential_energy=float(middle["potential_energy"][0]),
-    )  # fmt: skip
+    forces = {name: middle[name] for name in FORCES}
+    energies = {name: float(middle[name][0]) for name in ("kinetic_energy", "potential_energy")}
+    quantities = ModelQuantities(poses, M, acceleration=a, **forces, **energies)
     return CertifiedModelQuantities(quantities, tolerance)

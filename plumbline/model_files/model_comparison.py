@@ -11,11 +11,11 @@ import numpy as np
 
 from plumbline.importers.neutral_model import CanonicalState, ModelQuantities, NeutralModel
 from plumbline.model.datatypes import Array
-from plumbline.model_files.certified_model import CertifiedModelQuantities, certify_model
+from plumbline.model_files.certified_model import FORCES, CertifiedModelQuantities, certify_model
 
 TINY = float(np.finfo(float).tiny)  # replaces a tolerance of zero, so that an error of zero has the ratio 0
 _SPREAD = 0.5  # m: random displacements are up to this
-VECTORS = ("gravity_force", "bias_force", "passive_force", "acceleration")  # one number per velocity
+VECTORS = (*FORCES, "acceleration")
 MAX_JOINTS = 1000  # whose values are kept
 
 
