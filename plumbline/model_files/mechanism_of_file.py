@@ -12,7 +12,6 @@ from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -29,6 +28,7 @@ from plumbline.processes.isolation import ScratchFolder
 from plumbline.processes.worker_pool import Limits, Scheduler, Task, WorkerPool
 from plumbline.scenario.line_and_column_errors import shorten
 from plumbline.scenario.loader import Scenario, build_scenario
+from plumbline.scenario.mechanism_document import Content
 from plumbline.scenario.schema import MIN_INERTIA
 from plumbline.scenario.yaml_source import YamlSource
 
@@ -43,7 +43,7 @@ CONTACTS = "contacts, limits of motion, friction and actuators"
 
 def load_model_file(
     path: Path, base: BaseChoice = "auto", root: Path | None = None
-) -> tuple[Scenario, dict[str, Any]]:
+) -> tuple[Scenario, Content]:
     """Read a URDF or MJCF file as a scenario.
 
     Args:
@@ -148,7 +148,7 @@ def feature_words(features: Sequence[Feature], shown: str) -> str:
     return ", ".join(words)
 
 
-def mechanism_of_model(model: NeutralModel, connections: Sequence[Connection], shown: str) -> dict[str, Any]:
+def mechanism_of_model(model: NeutralModel, connections: Sequence[Connection], shown: str) -> Content:
     """Describe a model as a scenario file does, moving from its reference pose; with loops, from rest there.
 
     Args:
@@ -197,7 +197,7 @@ def mechanism_of_model(model: NeutralModel, connections: Sequence[Connection], s
 
 def _closing_joints(
     model: NeutralModel, connections: Sequence[Connection], writer: _Writer
-) -> tuple[list[dict[str, Any]], set[Source]]:
+) -> tuple[list[Content], set[Source]]:
     """The joints that close loops, and the places of their equalities in the file; then nothing moves."""
     world: _Place = (np.eye(3), np.zeros(3), ("world", np.zeros(3)))
     places = dict.fromkeys(["", *(body.name for body in model.bodies)], world)
@@ -231,7 +231,7 @@ class _Writer:
 
     def __init__(self, model: NeutralModel, rng: np.random.Generator) -> None:
         self.rng = rng
-        self.bodies: list[dict[str, Any]] = []
+        self.bodies: list[Content] = []
         self.left_out: list[Feature] = []  # what a mechanism does not have
         self.places: dict[str, _Place] = {}  # by body
         poses: list[tuple[Array, Array]] = []  # rotation matrix and origin at the reference pose
@@ -289,7 +289,7 @@ class _Writer:
         physical: Array = np.trace(second) * np.eye(3) - second
         return physical
 
-    def _elements(self, kind: Kind, joints: Sequence[ElementaryJoint]) -> dict[str, Any]:
+    def _elements(self, kind: Kind, joints: Sequence[ElementaryJoint]) -> Content:
         """Rotors, dampers and springs."""
         found = {name: [getattr(j, name) for j in joints] for name in ("armature", "damping", "stiffness")}
         if kind == FREE:
@@ -302,7 +302,7 @@ class _Writer:
         return {name: values for name, values in found.items() if any(values)}
 
     def _set_motion(
-        self, written: dict[str, Any], kind: Kind, joints: Sequence[ElementaryJoint], point: Array
+        self, written: Content, kind: Kind, joints: Sequence[ElementaryJoint], point: Array
     ) -> None:
         """Write the joint's axes, and pose and rates at t = 0."""
         joint = written["joint"]

@@ -12,7 +12,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, overload
+from typing import overload
 
 import numpy as np
 
@@ -27,7 +27,7 @@ from plumbline.model.random_mechanisms import (
 )
 from plumbline.model.sampling import derive_seed, random_states
 from plumbline.scenario.loader import Scenario, scenario_from_dict
-from plumbline.scenario.mechanism_document import mechanism_document
+from plumbline.scenario.mechanism_document import Content, mechanism_document
 
 RANDOM_FAMILY = "random"
 MAX_RANDOM_BODIES = 10
@@ -190,7 +190,7 @@ def random_mechanism(seed: int, index: int) -> Scenario:
     return scenario_from_dict(content, f"{content['name']}.yaml")
 
 
-def random_document(seed: int, index: int) -> dict[str, Any]:
+def random_document(seed: int, index: int) -> Content:
     """Make the content of the file of one random scenario.
 
     Args:
@@ -214,7 +214,7 @@ def random_document(seed: int, index: int) -> dict[str, Any]:
     return content
 
 
-def _document(prefix: str, seed: int, index: int, n: int, more: str, duration: float) -> dict[str, Any]:
+def _document(prefix: str, seed: int, index: int, n: int, more: str, duration: float) -> Content:
     """The texts and the duration [s] of a scenario of n bodies; its title ends with ``more``."""
     what = prefix.replace("-", " ").capitalize() + f"{index} of seed {seed}"
     return {
@@ -229,11 +229,11 @@ def _document(prefix: str, seed: int, index: int, n: int, more: str, duration: f
 
 def _random_body(
     rng: np.random.Generator, decades: float, rate: float, has_load: bool, has_drag: bool, is_last: bool
-) -> dict[str, Any]:
+) -> Content:
     """Make one body of a chain; its inertia is that of a turned ellipsoid, so always physical."""
     mass = 10 ** rng.uniform(-decades, decades)
     squares = rng.uniform(0.05, 0.5, 3) ** 2  # m², semi-axes
-    found: dict[str, Any] = {
+    found: Content = {
         "mass": mass,
         "inertia": {
             "principal": (mass / 5 * (squares.sum() - squares)).tolist(),
@@ -266,7 +266,7 @@ def _random_body(
 # --- special values -------------------------------------------------------------------------------
 
 
-def _specialize(content: dict[str, Any], kind: str, seed: int, index: int, moment: float) -> None:
+def _specialize(content: Content, kind: str, seed: int, index: int, moment: float) -> None:
     """Give a scenario special values, where its turn has come; ``moment`` is a factor on moments of loads.
 
     They come from random numbers of their own: all other scenarios are what they would be without.
@@ -274,7 +274,7 @@ def _specialize(content: dict[str, Any], kind: str, seed: int, index: int, momen
     if index % 5 not in SPECIAL_INDICES:
         return
     rng = np.random.default_rng(derive_seed(f"special values of a {kind}", str(seed), str(index)))
-    changes: dict[str, Callable[[np.random.Generator, dict[str, Any]], None]] = {
+    changes: dict[str, Callable[[np.random.Generator, Content], None]] = {
         "an attitude": _set_attitude,
         "zeros": _set_zeros,
         "an inertia": _set_inertia,
@@ -301,7 +301,7 @@ def _specialize(content: dict[str, Any], kind: str, seed: int, index: int, momen
     content["title"] += f"; special: {', '.join(made)}"
 
 
-def _set_attitude(rng: np.random.Generator, body: dict[str, Any]) -> None:
+def _set_attitude(rng: np.random.Generator, body: Content) -> None:
     """Make the attitude the identity, a turn about one axis, or one with a negative scalar or none."""
     axis = np.eye(3)[rng.integers(3)] * rng.normal()
     turn = np.array([[1.0, 0, 0, 0], [-1.0, 0, 0, 0], [rng.normal(), *axis], [0, *axis],
@@ -309,7 +309,7 @@ def _set_attitude(rng: np.random.Generator, body: dict[str, Any]) -> None:
     body["attitude"] = {"quaternion": turn[rng.choice(5, p=[0.5, 0.1, 0.2, 0.1, 0.1])].tolist()}
 
 
-def _set_zeros(rng: np.random.Generator, body: dict[str, Any]) -> None:
+def _set_zeros(rng: np.random.Generator, body: Content) -> None:
     """Set components of offsets and rates to zero; a rod along a coordinate axis, a body at rest."""
     for name in ("proximal", "distal", "angular_velocity"):
         if name in body:
@@ -324,7 +324,7 @@ def _set_zeros(rng: np.random.Generator, body: dict[str, Any]) -> None:
             body["joint"] |= {"angular_velocity": [0.0, 0.0, 0.0]}
 
 
-def _set_inertia(rng: np.random.Generator, body: dict[str, Any]) -> None:
+def _set_inertia(rng: np.random.Generator, body: Content) -> None:
     """Make the inertia that of a ball, of a body of revolution, or diagonal."""
     first, second, third = body["inertia"]["principal"]
     values = [[first] * 3, [first, first, min(third, 1.9 * first)], [first, second, third]]
@@ -332,7 +332,7 @@ def _set_inertia(rng: np.random.Generator, body: dict[str, Any]) -> None:
     body["inertia"] = {"principal": values[rng.integers(3)], "axes": turned}
 
 
-def _set_loads(rng: np.random.Generator, body: dict[str, Any], moment: float) -> None:
+def _set_loads(rng: np.random.Generator, body: Content, moment: float) -> None:
     """Give the body loads and drag of its own, of forces or moments or both."""
     mass, zero = body["mass"], [0.0, 0.0, 0.0]
     force, torque = mass * rng.normal(size=(2, 3)) * [[1.0], [moment]]
@@ -345,7 +345,7 @@ def _set_loads(rng: np.random.Generator, body: dict[str, Any], moment: float) ->
         body["drag"] = {"force": float(drag[0]), "moment": float(drag[1])}
 
 
-def _scale_mass(body: dict[str, Any], factor: float) -> None:
+def _scale_mass(body: Content, factor: float) -> None:
     """Multiply the mass and what is in proportion to it."""
     body["mass"] *= factor
     body["inertia"]["principal"] = [factor * x for x in body["inertia"]["principal"]]

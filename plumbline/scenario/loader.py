@@ -53,7 +53,7 @@ from plumbline.scenario.schema import (
 )
 from plumbline.scenario.validation_messages import problems_from_validation
 from plumbline.scenario.yaml_reader import is_file, read_yaml
-from plumbline.scenario.yaml_source import PathKey, YamlSource
+from plumbline.scenario.yaml_source import FieldPath, YamlSource
 
 CATALOGUE_FOLDER = ROOT / "scenarios"
 LOOP_TOLERANCE = 1e-9  # of a loop's gap at t = 0 [m, rad], and of its rate over the largest speed
@@ -348,7 +348,7 @@ def _missing_distal_problems(source: YamlSource) -> Iterator[Problem]:
     items = source.data.get("bodies") if isinstance(source.data, dict) else None
     items = items if isinstance(items, list) else []
     for index, item in enumerate(items):
-        written: list[tuple[tuple[PathKey, ...], Any]] = [(("bodies", index), item)]
+        written: list[tuple[FieldPath, Any]] = [(("bodies", index), item)]
         count = 1
         if isinstance(item, dict) and isinstance(item.get("cycle"), list):
             written = [(("bodies", index, "cycle", k), body) for k, body in enumerate(item["cycle"])]
@@ -366,7 +366,7 @@ def _missing_distal_problems(source: YamlSource) -> Iterator[Problem]:
             yield source.problem((*path, "distal"), "is missing: a body follows", valid)
 
 
-def _expand_repeats(document: Document) -> Iterator[tuple[tuple[PathKey, ...], Body, Array]]:
+def _expand_repeats(document: Document) -> Iterator[tuple[FieldPath, Body, Array]]:
     """Every body of the chain: where the file has it, and the quaternion (4,) that it is turned by."""
     for index, item in enumerate(document.bodies):
         if isinstance(item, Body):
@@ -383,7 +383,7 @@ def _is_free(item: dict[str, Any]) -> bool:
     return isinstance(joint, dict) and joint.get("kind") == FREE
 
 
-def _refuse_repeated_names(source: YamlSource, paths: list[tuple[PathKey, ...]], bodies: list[Body]) -> None:
+def _refuse_repeated_names(source: YamlSource, paths: list[FieldPath], bodies: list[Body]) -> None:
     """Refuse a name that the file gives to two bodies; copies by ``repeat`` share theirs."""
     owners: dict[str | None, str] = {"world": "the world"}
     problems = []
@@ -398,7 +398,7 @@ def _refuse_repeated_names(source: YamlSource, paths: list[tuple[PathKey, ...]],
         raise ScenarioError(problems)
 
 
-def _resolve_parents(source: YamlSource, paths: list[tuple[PathKey, ...]], bodies: list[Body]) -> list[int]:
+def _resolve_parents(source: YamlSource, paths: list[FieldPath], bodies: list[Body]) -> list[int]:
     """The far body of each body, −1 the world; refuses parents that do not exist or come too late."""
     far: list[int] = []
     problems: list[Problem] = []

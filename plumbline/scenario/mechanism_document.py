@@ -10,8 +10,10 @@ import numpy as np
 
 from plumbline.model.datatypes import JOINT_ELEMENTS, Model, State
 
+Content = dict[str, Any]  # of a scenario file or of a part of it: plain data
 
-def scenario_text(document: dict[str, Any]) -> str:
+
+def scenario_text(document: Content) -> str:
     """Write the content of a scenario file.
 
     Args:
@@ -40,7 +42,7 @@ def _lines(value: Any, indent: str) -> Iterator[str]:
             yield f"{indent}{key}: {json.dumps(item, ensure_ascii=False)}"
 
 
-def mechanism_document(model: Model, state: State) -> dict[str, Any]:
+def mechanism_document(model: Model, state: State) -> Content:
     """Describe a mechanism at a state as a scenario file does.
 
     The axes of ball joints are not part of a file; their springs are unloaded where both bodies' axes agree.
@@ -52,7 +54,7 @@ def mechanism_document(model: Model, state: State) -> dict[str, Any]:
         The fields ``gravity``, ``bodies``, ``springs`` and ``closes``: plain data.
 
     """
-    found: dict[str, Any] = {
+    found: Content = {
         "gravity": model.gravity.tolist(),
         "bodies": [_body(model, state, k) for k in range(model.n)],
     }
@@ -85,9 +87,9 @@ def _name(body: int) -> str:
     return "world" if body < 0 else f"body {body + 1}"
 
 
-def _body(model: Model, state: State, k: int) -> dict[str, Any]:
+def _body(model: Model, state: State, k: int) -> Content:
     kind, joint = model.kinds[k], _joint(model, k)
-    found: dict[str, Any] = {
+    found: Content = {
         "name": _name(k),
         "mass": float(model.mass[k]),
         "inertia": {"matrix": model.inertia[k].tolist()},
@@ -114,10 +116,10 @@ def _body(model: Model, state: State, k: int) -> dict[str, Any]:
     return found
 
 
-def _joint(model: Model, k: int) -> dict[str, Any]:
+def _joint(model: Model, k: int) -> Content:
     """The joint without what depends on the state."""
     kind = model.kinds[k]
-    found: dict[str, Any] = {"kind": model.kind[k]}
+    found: Content = {"kind": model.kind[k]}
     if kind.own_number:
         found[kind.own_number] = float(model.length[k])
     if not kind.has_attitude:

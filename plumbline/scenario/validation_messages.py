@@ -22,7 +22,7 @@ from plumbline.scenario.line_and_column_errors import (
     shorten,
 )
 from plumbline.scenario.schema import SCHEMA_VERSION, Body, BodySequence, Document
-from plumbline.scenario.yaml_source import PathKey, YamlSource, dotted_path
+from plumbline.scenario.yaml_source import FieldPath, YamlSource, dotted_path
 
 KINDS = "one of kind: " + ", ".join(JOINT_KINDS)
 MAX_NUMBER_LENGTH = 100  # characters; a longer text is not taken for a mistyped number
@@ -37,7 +37,7 @@ _Places = dict[str, list[tuple[tuple[str, ...], type[BaseModel]]]]
 class _Location:
     """Where an error is, in the file and in the schema."""
 
-    path: tuple[PathKey, ...]  # in the file, which has no union tags
+    path: FieldPath  # in the file, which has no union tags
     fields: tuple[str, ...]  # those of the schema on the path, without indices and keys of mappings
     model: type[BaseModel]  # the innermost one
     info: FieldInfo | None  # of the last field
@@ -95,8 +95,8 @@ def _tags(model: type[BaseModel]) -> tuple[str, ...]:
     return {Body: ("body",), BodySequence: ("sequence",)}.get(model) or _kinds(model)
 
 
-def _locate(loc: tuple[PathKey, ...], root: type[BaseModel]) -> _Location:
-    path: tuple[PathKey, ...] = ()
+def _locate(loc: FieldPath, root: type[BaseModel]) -> _Location:
+    path: FieldPath = ()
     fields: tuple[str, ...] = ()
     choices, info, is_mapping = [root], None, False
     for key in loc:

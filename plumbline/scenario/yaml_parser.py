@@ -17,7 +17,7 @@ from ruamel.yaml.reader import ReaderError
 from ruamel.yaml.scanner import Scanner
 
 from plumbline.scenario.line_and_column_errors import shorten
-from plumbline.scenario.yaml_source import PathKey, Position, YamlSource
+from plumbline.scenario.yaml_source import FieldPath, Position, YamlSource
 
 MAX_NODES = 50_000  # about 1,000 bodies in full, 6 s of reading; longer chains repeat
 MAX_DEPTH = 20
@@ -124,7 +124,7 @@ def parse_yaml(source: YamlSource, content: str) -> YamlSource:
     return source
 
 
-def _plain_data(source: YamlSource, node: Node, path: tuple[PathKey, ...], budget: list[int]) -> Any:
+def _plain_data(source: YamlSource, node: Node, path: FieldPath, budget: list[int]) -> Any:
     at = node.start_mark.line + 1, node.start_mark.column + 1
     budget[0] -= 1
     if budget[0] < 0:
@@ -153,7 +153,7 @@ def _plain_data(source: YamlSource, node: Node, path: tuple[PathKey, ...], budge
     return _scalar_value(source, node, path, at)
 
 
-def _scalar_value(source: YamlSource, node: Node, path: tuple[PathKey, ...], at: Position) -> Any:
+def _scalar_value(source: YamlSource, node: Node, path: FieldPath, at: Position) -> Any:
     written, kind = str(node.value), str(node.tag).rpartition(":")[2]
     if not str(node.tag).startswith("tag:yaml.org,2002:"):
         kind = "tag"

@@ -8,6 +8,7 @@ from typing import Any
 from plumbline.scenario.line_and_column_errors import Problem, ScenarioError, shorten
 
 PathKey = str | int
+FieldPath = tuple[PathKey, ...]  # keys and indices from the file's top to a field
 Position = tuple[int, int]
 
 
@@ -17,8 +18,8 @@ class YamlSource:
 
     file: str  # the name that problems show
     data: Any = None  # dicts, lists, texts, numbers, booleans, None
-    value_positions: dict[tuple[PathKey, ...], Position] = field(default_factory=dict)
-    key_positions: dict[tuple[PathKey, ...], Position] = field(default_factory=dict)
+    value_positions: dict[FieldPath, Position] = field(default_factory=dict)
+    key_positions: dict[FieldPath, Position] = field(default_factory=dict)
     problems: list[Problem] = field(default_factory=list)  # duplicate keys and tags
 
     def fatal_error(
@@ -37,7 +38,7 @@ class YamlSource:
         """
         return ScenarioError([Problem(self.file, *at, "", message, valid, hint)])
 
-    def position(self, path: tuple[PathKey, ...]) -> Position:
+    def position(self, path: FieldPath) -> Position:
         """Find the value of a field.
 
         Args:
@@ -50,7 +51,7 @@ class YamlSource:
         above = (path[:size] for size in range(len(path), -1, -1))
         return next((self.value_positions[p] for p in above if p in self.value_positions), (1, 1))
 
-    def problem(self, path: tuple[PathKey, ...], message: str, valid: str) -> Problem:
+    def problem(self, path: FieldPath, message: str, valid: str) -> Problem:
         """Describe what is wrong with a field.
 
         Args:
@@ -63,7 +64,7 @@ class YamlSource:
         """
         return Problem(self.file, *self.position(path), dotted_path(path), message, valid)
 
-    def add_problem(self, at: Position, path: tuple[PathKey, ...], message: str, valid: str) -> None:
+    def add_problem(self, at: Position, path: FieldPath, message: str, valid: str) -> None:
         """Note a problem that does not stop the parsing.
 
         Args:
@@ -75,7 +76,7 @@ class YamlSource:
         self.problems.append(Problem(self.file, *at, dotted_path(path), message, valid))
 
 
-def dotted_path(path: tuple[PathKey, ...]) -> str:
+def dotted_path(path: FieldPath) -> str:
     """Write the path of a field as ``bodies[0].mass``.
 
     Args:
