@@ -312,10 +312,8 @@ class _Trial:
         self.has_structure = has_structure  # whether the own model has been given other joints already
         # of the model before it was lumped: what is fixed to the world and cancels there counts too
         self.placed = [pose_tolerances(whole, state) for state in states(whole)]
-        # what was certified, by the changes' identities, which stay theirs while they are kept here
-        self.tried: dict[
-            tuple[int, ...], tuple[NeutralModel, list[CertifiedModelQuantities], Sequence[Change]]
-        ] = {}
+        # what was certified, by the changes themselves: two with the same content are two
+        self.tried: dict[tuple[Change, ...], tuple[NeutralModel, list[CertifiedModelQuantities]]] = {}
         self.tolerance: Mapping[str, Any] = {}  # at the first state, of the first changes that were certified
         self.few = min(PRUNING_STATES, len(answers))
 
@@ -323,10 +321,10 @@ class _Trial:
         self, changes: Sequence[Change], count: int
     ) -> tuple[NeutralModel, list[CertifiedModelQuantities]]:
         """Make changes and certify states, each once; poses within the bounds before bodies were lumped."""
-        key = tuple(map(id, changes))
+        key = tuple(changes)
         if key not in self.tried:
-            self.tried[key] = apply_changes(self.own, self.theirs, changes), [], changes
-        changed, truths, _ = self.tried[key]
+            self.tried[key] = apply_changes(self.own, self.theirs, changes), []
+        changed, truths = self.tried[key]
         if joint_permutation(changed, self.reading) is not None:
             new = slice(len(truths), count)
             pairs = zip(certify_states(changed, self.states(changed)[new]), self.placed[new], strict=True)
@@ -360,7 +358,7 @@ class _Trial:
         if not self.tolerance:
             self.certified((), 1)
         changed, _ = self.certified(changes, 0)
-        if not self.tolerance or self.tried[tuple(map(id, changes))][1]:
+        if not self.tolerance or self.tried[tuple(changes)][1]:
             return False
         order = joint_permutation(changed, self.reading)
         if order is None or len(order) != len(self.tolerance["mass_matrix"]):
