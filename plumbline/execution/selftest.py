@@ -83,20 +83,8 @@ def run_self_test(
     """
     first = str(ROOT / tests)
     further = {path for pattern in lists for path in glob(str(ROOT / pattern))} - {first}
-    arguments = [
-        str(os.getpid()),
-        str(night),
-        first,
-        "-q",
-        "-m",
-        "",
-        "-p",
-        "no:cacheprovider",
-        f"--rootdir={ROOT}",
-        f"--junitxml={report}",
-        first,
-        *sorted(further),
-    ]
+    pytest_options = ["-q", "-m", "", "-p", "no:cacheprovider", f"--rootdir={ROOT}", f"--junitxml={report}"]
+    arguments = [str(os.getpid()), str(night), first, *pytest_options, first, *sorted(further)]
     command = [sys.executable, "-c", _CHILD_SCRIPT, *arguments]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     try:
