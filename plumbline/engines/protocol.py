@@ -41,7 +41,7 @@ from plumbline.model.datatypes import (
 from plumbline.model.kinematics import quaternion_rate
 from plumbline.model.lift import BallRates, lift_acceleration
 from plumbline.processes.exceptions import one_line
-from plumbline.processes.line_process import LineFault, LineProcess
+from plumbline.processes.line_process import LineFault, LineProcess, Message
 
 VERSIONS = (1,)  # of the protocol that this side speaks, the best first; a new one keeps the one before
 QUANTITIES = tuple(f.name for f in fields(StateQuantities) if f.name != "limit_error")
@@ -133,7 +133,7 @@ def to_json(value: Any) -> Any:
     return {name: to_json(one) for name, one in value.items()} if isinstance(value, Mapping) else value
 
 
-def read_answer(kind: type, answer: Mapping[str, Any], label: str) -> Any:
+def read_answer(kind: type, answer: Message, label: str) -> Any:
     """Check the fields of an answer against its record.
 
     Args:
@@ -231,7 +231,7 @@ class ServedEngine(Adapter):
             )
         return Trajectory(t, r, p, v, quaternion_rate(p, omega), run.steps)
 
-    def _ask(self, model: Model, question: Mapping[str, Any]) -> dict[str, Any]:
+    def _ask(self, model: Model, question: Message) -> Message:
         """Ask about a mechanism, which the program gets first where it has another."""
         for kind in sorted({*model.kind} - {*self.hello.joints}):
             raise Unsupported(f"{self.title} builds no {kind} joints", "joints")
@@ -279,7 +279,7 @@ class _Program:
             )
         return hello
 
-    def ask(self, question: Mapping[str, Any]) -> dict[str, Any]:
+    def ask(self, question: Message) -> Message:
         try:
             answer = self._lines.ask(question)
         except LineFault as fault:

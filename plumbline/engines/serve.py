@@ -6,8 +6,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Mapping
-from typing import IO, Any
+from typing import IO
 
 import numpy as np
 
@@ -16,6 +15,7 @@ from plumbline.engines.protocol import QUANTITIES, VERSIONS, IntegratorAnswer, t
 from plumbline.model.datatypes import BALL, KINDS, ROD, Model, State, Unsupported
 from plumbline.model.kinematics import angular_velocity
 from plumbline.processes.exceptions import describe_exception
+from plumbline.processes.line_process import Message
 
 
 class _Server:
@@ -25,7 +25,7 @@ class _Server:
         self.adapter = adapter
         self.model: Model | None = None
 
-    def hello(self, question: Mapping[str, Any]) -> dict[str, Any]:
+    def hello(self, question: Message) -> Message:
         adapter = self.adapter
         gaps = {**adapter.unsupported, **adapter.gaps}
         loops = adapter.builds_trees and not adapter.loops_unsupported_reason
@@ -49,21 +49,21 @@ class _Server:
             "gaps": {k: why for k, why in gaps.items() if k in MODEL_GAPS or k in UNSUPPORTED_KINDS},
         }
 
-    def echo(self, question: Mapping[str, Any]) -> dict[str, Any]:
+    def echo(self, question: Message) -> Message:
         return {"values": question["values"]}
 
-    def mechanism(self, question: Mapping[str, Any]) -> dict[str, Any]:
+    def mechanism(self, question: Message) -> Message:
         fields = {name: value for name, value in question["model"].items() if value != []}
         self.model = Model.from_fields(fields)
         return {}
 
-    def evaluate(self, question: Mapping[str, Any]) -> dict[str, Any]:
+    def evaluate(self, question: Message) -> Message:
         assert self.model is not None
         states = [_state(one) for one in question["states"]]
         found = self.adapter.evaluate(self.model, states)
         return {"answers": [{k: v for k, v in to_json(one).items() if v is not None} for one in found]}
 
-    def simulate(self, question: Mapping[str, Any]) -> dict[str, Any]:
+    def simulate(self, question: Message) -> Message:
         assert self.model is not None
         times, resolution = np.array(question["times"], float), float(question["resolution"])
         state = _state(question["state"])
@@ -74,7 +74,7 @@ class _Server:
                 "steps": int(run.steps)}  # fmt: skip
 
 
-def _state(fields: Mapping[str, Any]) -> State:
+def _state(fields: Message) -> State:
     return State(**{name: np.array(value, float) for name, value in fields.items()})
 
 

@@ -23,6 +23,7 @@ from plumbline.processes.remote_python import describe_exit
 from plumbline.processes.worker_environment import KERNELS, SINGLE_THREAD, TEMPORARY_FOLDER
 
 COMMAND_PREFIX = "cmd:"
+Message = dict[str, Any]  # the fields of a question or an answer, as JSON has them
 _VARIABLE = re.compile(r"[A-Za-z_]\w*=.*", re.DOTALL)
 MAX_LINE = 2**26  # bytes of an answer
 MAX_SHOWN = 200  # characters of a line or of the last words, in messages
@@ -91,7 +92,7 @@ class LineProcess:
         while block := self._process.stderr.read1(2**16):  # type: ignore[attr-defined]
             self._words = (self._words + block)[-4 * MAX_SHOWN :]
 
-    def ask(self, question: Mapping[str, Any]) -> dict[str, Any]:
+    def ask(self, question: Message) -> Message:
         """Send a question and wait for its answer; the worker's time limit ends the waiting.
 
         Args:
