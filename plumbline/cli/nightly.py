@@ -152,15 +152,13 @@ def run_nightly(
     folder = unfinished / "night"
     shutil.rmtree(folder, ignore_errors=True)
     if proofs is not None:
-        result.metadata["proofs"] = asdict(proofs)
-        result.metadata["sentence"] += f"; {proofs.sentence}"
+        result.note(proofs.sentence, proofs=asdict(proofs))
         if proofs.exceeded:
             result.metadata["exit_code"] = ExitCode.HARNESS_FAILED
     if self_test is not None:
         folder.mkdir()
         answer = self_test(folder / "self_test.xml", result.metadata["night"])
-        result.metadata["self_test"] = answer.counts
-        result.metadata["sentence"] += f"; {answer.summary}"
+        result.note(answer.summary, self_test=answer.counts)
         if answer.failure:
             result.metadata["exit_code"] = result.metadata["exit_code"] or 1
     for name, about in result.scenarios.items():
@@ -175,13 +173,11 @@ def run_nightly(
             *map(_stored_features, [run.folder for run in stored_runs(history)][1 - WEEK :])
         )
         found, new = count_triples(drawn, earlier)
-        result.metadata["feature_triples"] = {"found": found, "new": new}
-        result.metadata["sentence"] += (
-            f"; random mechanisms: {found:,} triples of features, {new:,} of them new in {WEEK} nights"
-        )
+        words = f"random mechanisms: {found:,} triples of features, {new:,} of them new in {WEEK} nights"
+        result.note(words, feature_triples={"found": found, "new": new})
     with WorkerPool(1, plan.limits) as executor:
         for changes in compare_surfaces(executor):
-            result.metadata["sentence"] += f"; {changes.sentence}" if changes.sentence else ""
+            result.note(changes.sentence)
     save(result, folder, command)
     write_atomically(folder / FEATURES_FILE, json.dumps(drawn).encode())
     if coverage is not None:
@@ -218,8 +214,7 @@ def night_coverage(result: RunResult, plan: Plan, progress: ProgressCallback) ->
                 cpu_times=result.cpu_times,
             )  # fmt: skip
     except CoverageFailure as error:
-        result.metadata["sentence"] += f"; {error}"
-        result.metadata["exit_code"] = ExitCode.HARNESS_FAILED
+        result.note(str(error), exit_code=ExitCode.HARNESS_FAILED)
         return None
     return coverage_table(found)
 

@@ -87,6 +87,11 @@ class RunResult:
         """The rows that do not agree, by cause."""
         return find_findings(self.rows, {name: about["bodies"] for name, about in self.scenarios.items()})
 
+    def note(self, sentence: str, **facts: Any) -> None:
+        """Add facts to what is stored of the run, and a sentence, which may be empty, to its own."""
+        self.metadata |= facts
+        self.metadata["sentence"] += f"; {sentence}" if sentence else ""
+
 
 def describe_engines(
     executor: Executor,
