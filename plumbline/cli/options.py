@@ -28,7 +28,7 @@ from plumbline.processes.user_cache import content_key, recall, remember
 from plumbline.processes.worker_pool import ExecutorLost, ExecutorUnavailable, Limits
 from plumbline.scenario import loader as scenarios
 from plumbline.scenario.line_and_column_errors import Problem, ScenarioError, nearest_or_all, shorten
-from plumbline.scenario.yaml_reader import is_file, read_bytes, read_yaml
+from plumbline.scenario.yaml_reader import read_bytes, read_yaml
 from plumbline.truth.closed_form import ClosedFormMismatch, closed_form_motion
 
 if TYPE_CHECKING:
@@ -374,7 +374,7 @@ def are_scenarios_found(names: Iterable[str]) -> bool:
 
     """
     try:
-        return all(is_file(scenarios.find_scenario_file(name)) for name in names)
+        return all(os.path.isfile(scenarios.find_scenario_file(name)) for name in names)
     except ScenarioError:
         return False
 

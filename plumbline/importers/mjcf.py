@@ -8,12 +8,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from itertools import chain
+from os.path import isfile
 from pathlib import Path
 
 from plumbline.importers.neutral_model import ElementaryJoint, Feature, NeutralBody, NeutralModel, Source
 from plumbline.importers.xml_tree import Element, ModelFileError, read_xml
 from plumbline.scenario.line_and_column_errors import shorten
-from plumbline.scenario.yaml_reader import is_file
 
 MAX_INCLUDES = 200
 _JOINT_FIELDS = {
@@ -76,7 +76,7 @@ def _include_target(element: Element, folder: Path, root_folder: Path) -> Path:
         message = f"{shorten(repr(name))} is outside {root_folder}"
         hint = "name a folder that holds both with --root"
         raise ModelFileError([element.problem(message, "file", hint=hint)])
-    if not is_file(target):
+    if not isfile(target):
         raise ModelFileError([element.problem(f"there is no file {shorten(repr(name))}", "file")])
     return target
 

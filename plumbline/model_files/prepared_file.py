@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
+from os.path import isfile
 from pathlib import Path
 from typing import Literal
 from urllib.parse import unquote
@@ -18,7 +19,6 @@ from plumbline.importers.urdf import read_urdf
 from plumbline.importers.xml_tree import Element, ModelFileError, read_xml, write_xml, write_xml_in_place
 from plumbline.processes.user_cache import naming_file
 from plumbline.scenario.line_and_column_errors import shorten
-from plumbline.scenario.yaml_reader import is_file
 
 BaseChoice = Literal["fixed", "free", "auto"]
 STRIP_HINT = "--strip-geometry leaves meshes out"
@@ -186,7 +186,7 @@ def package_folder(path: Path) -> Path:
 
     """
     folder = path.resolve().parent
-    return next((p for p in (folder, *folder.parents) if is_file(p / "package.xml")), folder)
+    return next((p for p in (folder, *folder.parents) if isfile(p / "package.xml")), folder)
 
 
 def _format_of(tree: Element, shown: str) -> Format:
@@ -234,7 +234,7 @@ def _check_references(tree: Element, kind: Format, folder: Path, root: Path, hin
         inside = [target for c in candidates if (target := mjcf.resolve_inside(c, root)) is not None]
         if not inside:
             problems.append(element.problem(f"{shorten(repr(name))} is outside {root}", attribute, hint=hint))
-        elif not any(is_file(target) for target in inside):
+        elif not any(isfile(target) for target in inside):
             message = f"there is no file {shorten(repr(name))} in {root}"
             problems.append(element.problem(message, attribute, hint=hint))
     if problems:

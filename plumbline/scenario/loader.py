@@ -8,6 +8,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
+from os.path import isfile
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
@@ -52,7 +53,7 @@ from plumbline.scenario.schema import (
     unit_vector,
 )
 from plumbline.scenario.validation_messages import problems_from_validation
-from plumbline.scenario.yaml_reader import is_file, read_yaml
+from plumbline.scenario.yaml_reader import read_yaml
 from plumbline.scenario.yaml_source import FieldPath, YamlSource
 
 CATALOGUE_FOLDER = ROOT / "scenarios"
@@ -224,7 +225,7 @@ def find_scenario_file(name: str | Path) -> Path:
     if str(name) in known:
         return known[str(name)]
     path = Path(name)
-    if path.suffix in (".yaml", ".yml", *MODEL_FILE_SUFFIXES) or len(path.parts) > 1 or is_file(path):
+    if path.suffix in (".yaml", ".yml", *MODEL_FILE_SUFFIXES) or len(path.parts) > 1 or isfile(path):
         return path
     valid = "a path of a YAML, URDF or MJCF file, or a name that `plumbline list scenarios` shows"
     near = closest_match(str(name), [*known, *FAMILIES], cutoff=0.6)

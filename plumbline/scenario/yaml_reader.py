@@ -13,22 +13,6 @@ from plumbline.scenario.yaml_source import YamlSource
 MAX_BYTES = 1_000_000
 
 
-def is_file(path: Path) -> bool:
-    """Find out whether a path is that of a file; a text that cannot be a path is none.
-
-    Args:
-        path: any path, of any length.
-
-    Returns:
-        True where there is a regular file that can be looked at.
-
-    """
-    try:
-        return path.is_file()
-    except (OSError, ValueError):  # too long, without permission, or with a null character
-        return False
-
-
 def read_bytes(path: Path) -> bytes:
     """Read the content of a YAML file.
 

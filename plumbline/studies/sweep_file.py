@@ -26,6 +26,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from os.path import isfile
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -41,7 +42,7 @@ from plumbline.scenario.line_and_column_errors import Problem, ScenarioError, sh
 from plumbline.scenario.loader import Scenario
 from plumbline.scenario.schema import SchemaModel
 from plumbline.scenario.validation_messages import problems_from_validation
-from plumbline.scenario.yaml_reader import is_file, read_yaml
+from plumbline.scenario.yaml_reader import read_yaml
 from plumbline.scenario.yaml_source import PathKey, YamlSource
 
 MAX_CELLS = 100_000
@@ -174,8 +175,8 @@ def load(path: Path, progress: ProgressCallback = no_progress) -> tuple[Sweep, l
         report(("engines", engine), f"engines.{engine}", "is no engine", ", ".join(ENGINES))
     try:
         beside = path.parent / sweep.scenario
-        file = beside if is_file(beside) else scenarios.find_scenario_file(sweep.scenario)
-        found = "" if is_file(file) else f"is {shorten(repr(sweep.scenario))}, and there is no such file"
+        file = beside if isfile(beside) else scenarios.find_scenario_file(sweep.scenario)
+        found = "" if isfile(file) else f"is {shorten(repr(sweep.scenario))}, and there is no such file"
         valid = "a name of the catalogue, or the path of a scenario file beside this one"
     except ScenarioError as error:
         found, valid = error.problems[0].message, error.problems[0].valid
