@@ -23,6 +23,7 @@ from typing import Any
 
 from plumbline.layout import ROOT
 from plumbline.model.datatypes import EngineFailure
+from plumbline.scenario.line_and_column_errors import first_words
 from plumbline.scenario.yaml_reader import read_yaml
 
 # Beside the files of engines: by engine and name the rows that a change turns red.
@@ -140,7 +141,7 @@ class SurfaceChanges:
     def sentence(self) -> str:
         """The changes in words; empty where there are none."""
         parts = [
-            f"{len(names)} {what} ({', '.join(names[:5])}{', …' if len(names) > 5 else ''})"
+            f"{len(names)} {what} ({first_words(names, 5, ', …')})"
             for names, what in ((self.new, "new names about motion"), (self.vanished, "names fewer"))
             if names
         ]

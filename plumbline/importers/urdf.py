@@ -27,7 +27,7 @@ from plumbline.importers.neutral_model import (
 from plumbline.importers.xml_tree import Element, ModelFileError, parse_numbers
 from plumbline.model.datatypes import Array, Float
 from plumbline.model.kinematics import quaternion_product, rotation_matrix
-from plumbline.scenario.line_and_column_errors import Problem, did_you_mean, shorten
+from plumbline.scenario.line_and_column_errors import Problem, did_you_mean, first_words, shorten
 
 GRAVITY = (0.0, 0.0, -9.81)  # m/s²; a URDF does not say it
 _TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
@@ -158,7 +158,7 @@ class _UrdfReader:
             stack += children
         circle = [name for name in self.links if name not in reached]
         if circle and not any(problem.field.startswith("<joint") for problem in self.problems):
-            names = ", ".join(map(repr, circle[:5])) + (" …" if len(circle) > 5 else "")
+            names = first_words([*map(repr, circle)], 5)
             message = f"is in a circle of joints, with the links {names}"
             self.problems.append(self.links[circle[0]].problem(message, valid="a tree"))
 

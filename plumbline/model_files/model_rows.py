@@ -38,7 +38,7 @@ from plumbline.model_files.model_comparison import (
     permuted,
 )
 from plumbline.model_files.parameter_changes import describe_difference
-from plumbline.scenario.line_and_column_errors import shorten
+from plumbline.scenario.line_and_column_errors import first_words, shorten
 
 MODEL_FAMILY = "model file"  # of the rows, in place of a scenario's family
 REFUSED = "refused: "  # before an importer's words
@@ -149,8 +149,7 @@ def _joints_row(
         return _row(context, "joints", Verdict.AGREES, reason, value=0.0, tolerance=0.0)
     own, theirs = (set(joint_keys(m)) for m in (model, reading))
     parts = [
-        f"{what} {', '.join(f'{name} ({kind})' for name, kind in sorted(joints)[:6])}"
-        + (" …" if len(joints) > 6 else "")
+        f"{what} {first_words([f'{name} ({kind})' for name, kind in sorted(joints)], 6)}"
         for what, joints in (("it lacks", own - theirs), ("it adds", theirs - own))
         if joints
     ]

@@ -12,6 +12,7 @@ from plumbline.importers.neutral_model import ElementaryJoint, NeutralBody, Neut
 from plumbline.model.datatypes import Array
 from plumbline.model.grouping import grouped
 from plumbline.model.kinematics import rotation_matrix
+from plumbline.scenario.line_and_column_errors import first_words
 
 RELATIVE_CHANGE = 1e-11  # differences of descriptions below this are rounding
 JOINT_FIELDS = ("axis", "anchor", "reference", "armature", "damping", "stiffness", "spring_reference")
@@ -322,7 +323,7 @@ def describe_difference(own: NeutralModel, theirs: NeutralModel) -> str:
 def describe_changes(members: Sequence[Change]) -> str:
     """Say what an importer does to one field, as a verb phrase."""
     first, count = members[0], len(members)
-    names = _listed([change.joint or change.body for change in members], SHOWN_NAMES, " …")
+    names = first_words([change.joint or change.body for change in members], SHOWN_NAMES)
     places = [f"{change.body} ({change.source})" for change in members]
     kind = "joints" if first.joint else "bodies"
     owners = first.owner if count == 1 else f"{count} {kind} ({names})"
@@ -343,23 +344,23 @@ def describe_changes(members: Sequence[Change]) -> str:
             f"that of {first.joint} by {first.read} ({first.source}), but not in its equations"
         )
     if first.field == DEFAULT_INERTIAL:
-        bodies = _listed(places, SHOWN_PLACES, separator="; ")
+        bodies = first_words(places, SHOWN_PLACES, "", "; ")
         return f"gives 1 kg and an inertia of 1 kg m² to bodies without mass: {bodies}"
     if first.field == ASSUMED_INERTIAL:
         mass = sum(change.theirs for change in members)
-        bodies = _listed(places, SHOWN_PLACES, separator="; ")
+        bodies = first_words(places, SHOWN_PLACES, "", "; ")
         return f"gives {mass:.6g} kg in all to bodies without <inertial>: {bodies}"
     if first.field == MISSING:
         what = "the body" if count == 1 else f"{count} bodies with their joints and masses:"
-        return f"leaves out {what} {_listed(places, SHOWN_PLACES, ' …')}"
+        return f"leaves out {what} {first_words(places, SHOWN_PLACES)}"
     if first.field == ADDITIONAL:
-        bodies = _listed([change.body for change in members], SHOWN_PLACES)
+        bodies = first_words([change.body for change in members], SHOWN_PLACES, "")
         return f"adds {'body' if count == 1 else 'bodies'} {bodies}"
     if first.field == "inertial":
         parts = [f"{change.body} ({change.own:.4g} kg, {change.source})" for change in members]
         what = "mass and inertia" if first.own else "inertia"
         where = "" if first.body == first.carrier else f", fixed to body {first.carrier}"
-        return f"leaves out the {what} of {_listed(parts, SHOWN_PLACES)}{where}"
+        return f"leaves out the {what} of {first_words(parts, SHOWN_PLACES, '')}{where}"
     if first.field == "joints":
         return "; ".join(
             f"reads the joints of body {c.body} as {_joint_words(c.theirs)}; "
@@ -382,10 +383,6 @@ def describe_changes(members: Sequence[Change]) -> str:
         f"reads the {first.word} of {count} {kind} {as_} ({names}); "
         f"of {first.owner} the file says {first.said} ({first.source}), it reads {first.read}"
     )
-
-
-def _listed(words: Sequence[str], most: int, more: str = "", separator: str = ", ") -> str:
-    return separator.join(words[:most]) + (more if len(words) > most else "")
 
 
 def _joint_words(joints: Sequence[ElementaryJoint]) -> str:

@@ -86,6 +86,11 @@ def nearest_or_all(word: str, known: Iterable[str]) -> str:
     return did_you_mean(word, names) or f"there are: {', '.join(names)}"
 
 
+def first_words(words: Sequence[str], most: int, more: str = " …", separator: str = ", ") -> str:
+    """List words side by side; where there are more than the most that are shown, ``more`` follows."""
+    return separator.join(words[:most]) + (more if len(words) > most else "")
+
+
 def shorten(text: str, limit: int = 60) -> str:
     """Cut a text that a file gives, so that a message stays readable.
 
