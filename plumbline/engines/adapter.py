@@ -203,9 +203,7 @@ class Adapter(ABC):
         cannot do this; the message is the reason) pass through.
 
         """
-        self._check_mechanism(model)
-        check_state(model, *states)
-        with self._checked_refusals(model):
+        with self._checked_call(model, *states):
             answers = self._evaluate(model, states)
         check_evaluation(answers, model, len(states), f"{self.name}._evaluate")
         if model.has_loops:
@@ -246,8 +244,7 @@ class Adapter(ABC):
             One record per state; none where the adapter offers nothing of the mechanism.
 
         """
-        self._check_mechanism(model)
-        with self._checked_refusals(model):
+        with self._checked_call(model):
             answers = self._surface(model, states)
         for answer in answers:
             for quantity, by_call in answer.items():
@@ -271,12 +268,10 @@ class Adapter(ABC):
             The trajectory at ``times``, not normalised and not projected.
 
         """
-        self._check_motion(model)
-        check_state(model, state)
-        method = self.integrator(integrator)
-        if method.kind == "step":
-            check_times(times, resolution)
-        with self._checked_refusals(model):
+        with self._checked_call(model, state, moves=True):
+            method = self.integrator(integrator)
+            if method.kind == "step":
+                check_times(times, resolution)
             trajectory = self._simulate(model, state, times, method, resolution)
         _check_trajectory(model, times, trajectory, f"{self.name}._simulate, {integrator}")
         if method.kind == "step" and trajectory.steps != (count := round(float(times[-1] / resolution))):
@@ -311,10 +306,8 @@ class Adapter(ABC):
             Unsupported: also where single steps of the mechanism have no formula.
 
         """
-        self._check_motion(model)
-        check_state(model, state)
         times = np.asarray(step * np.arange(count + 1), float)
-        with self._checked_refusals(model):
+        with self._checked_call(model, state, moves=True):
             run = self._step(model, state, times, self.integrator(integrator), step)
         label = f"{self.name}._step, {integrator}"
         check_record(run, StepRun, {"bodies": model.n, "samples": len(times)}, label)
@@ -346,8 +339,13 @@ class Adapter(ABC):
             raise Unsupported(f"the adapter of {self.title} covers no {what}", "elements")
 
     @contextmanager
-    def _checked_refusals(self, model: Model) -> Iterator[None]:
-        """Hold the adapter's own refusals to what it declares: others count, false ones are failures."""
+    def _checked_call(self, model: Model, *states: State, moves: bool = False) -> Iterator[None]:
+        """Check what the engine is to receive, and hold the adapter's own refusals to what it declares.
+
+        Refusals that it does not declare count, false ones are failures.
+        """
+        (self._check_motion if moves else self._check_mechanism)(model)
+        check_state(model, *states)
         try:
             yield
         except Unsupported as refusal:
