@@ -95,6 +95,10 @@ def _row(context: RowContext, quantity: str, *arguments: Any, **more: Any) -> Ro
     return context.make_row("model", "-", quantity, *arguments, **more)
 
 
+def _compared(context: RowContext, quantity: str, agrees: bool, *arguments: Any, **more: Any) -> Row:
+    return _row(context, quantity, Verdict.AGREES if agrees else Verdict.DISAGREES, *arguments, **more)
+
+
 def judge_answer(
     context: RowContext,
     model: NeutralModel,
@@ -143,19 +147,17 @@ def judge_answer(
 def _joints_row(
     context: RowContext, model: NeutralModel, reading: NeutralModel, order: list[int] | None
 ) -> Row:
-    count = len(model.joints)
-    if order is not None:
-        reason = f"the same {count} joints with {model.velocity_count} degrees of freedom"
-        return _row(context, "joints", Verdict.AGREES, reason, value=0.0, tolerance=0.0)
+    reason = f"the same {len(model.joints)} joints with {model.velocity_count} degrees of freedom"
     own, theirs = (set(joint_keys(m)) for m in (model, reading))
     parts = [
         f"{what} {first_words([f'{name} ({kind})' for name, kind in sorted(joints)], 6)}"
         for what, joints in (("it lacks", own - theirs), ("it adds", theirs - own))
         if joints
     ]
-    reason = f"other joints than the file: {'; '.join(parts)}; the other quantities are not comparable"
+    if order is None:
+        reason = f"other joints than the file: {'; '.join(parts)}; the other quantities are not comparable"
     number = float(len(own ^ theirs))
-    return _row(context, "joints", Verdict.DISAGREES, reason, value=number, tolerance=0.0)
+    return _compared(context, "joints", order is not None, reason, value=number, tolerance=0.0)
 
 
 def _mass_row(context: RowContext, model: NeutralModel, reading: NeutralModel) -> Row:
@@ -167,8 +169,7 @@ def _mass_row(context: RowContext, model: NeutralModel, reading: NeutralModel) -
         if agrees
         else f"the moving bodies have {theirs:.9g} kg, in the file {own:.9g} kg"
     )
-    verdict = Verdict.AGREES if agrees else Verdict.DISAGREES
-    return _row(context, "total_mass", verdict, reason, "kg", value=error, tolerance=tolerance)
+    return _compared(context, "total_mass", agrees, reason, "kg", value=error, tolerance=tolerance)
 
 
 def _damping_row(context: RowContext, cause: Cause | None) -> Row:
@@ -177,11 +178,10 @@ def _damping_row(context: RowContext, cause: Cause | None) -> Row:
         reason, error = "the damping of every joint is read as the file says", 0.0
     else:
         reason, error = cause.sentence, max(abs(change.theirs - change.own) for change in cause.changes)
-    verdict = Verdict.DISAGREES if cause else Verdict.AGREES
-    return _row(
-        context, "damping", verdict, reason, "SI", value=error, tolerance=0.0,
-        diagnosis=reason if cause else None,
-    )  # fmt: skip
+    diagnosis = reason if cause else None
+    return _compared(
+        context, "damping", cause is None, reason, "SI", value=error, tolerance=0.0, diagnosis=diagnosis
+    )
 
 
 def rewriting_row(context: RowContext, model: NeutralModel, rewritten: Mapping[str, Reading]) -> Row:
@@ -224,8 +224,8 @@ def _quantity_row(context: RowContext, quantity: str, unit: str, worst: Mismatch
         else f"{name} off by {worst.error:.3g}{where}, state {worst.state}; "
         f"rounding explains {worst.tolerance:.1g}"
     )
-    return _row(
-        context, quantity, Verdict.AGREES if agrees else Verdict.DISAGREES, reason, unit,
+    return _compared(
+        context, quantity, agrees, reason, unit,
         value=worst.error, tolerance=worst.tolerance, ratio=worst.ratio,
         derivation="magnitudes of the terms × rounding (plumbline/model_files/certified_model.py)",
     )  # fmt: skip
