@@ -409,7 +409,6 @@ def _with_tolerances(
         tolerance["acceleration"] = unit * (inverse / scales @ work)
         loss = unit * np.max(inverse @ (size.mass_matrix / scales) @ np.ones(n), initial=0.0)
         a = a if loss <= MAX_LOSS else None
-    forces = {name: middle[name] for name in FORCES}
-    energies = {name: float(middle[name][0]) for name in ("kinetic_energy", "potential_energy")}
-    quantities = ModelQuantities(poses, M, acceleration=a, **forces, **energies)
-    return CertifiedModelQuantities(quantities, tolerance)
+    found: dict[str, Any] = {name: middle[name] for name in FORCES}
+    found |= {name: float(middle[name][0]) for name in ("kinetic_energy", "potential_energy")}
+    return CertifiedModelQuantities(ModelQuantities(poses, M, acceleration=a, **found), tolerance)

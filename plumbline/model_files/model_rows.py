@@ -72,7 +72,7 @@ class Answer:
     @property
     def model(self) -> NeutralModel | None:
         """The importer's reading of the file; None where it refused or failed."""
-        return self.reading and self.reading.model
+        return None if self.reading is None else self.reading.model
 
 
 def moving_mass(model: NeutralModel) -> float:

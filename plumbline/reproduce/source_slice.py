@@ -320,7 +320,8 @@ def _edited(source: bytes, edits: Iterable[tuple[int, int, str]]) -> str:
 
 def _first_line(statement: Any) -> int:
     """Where a statement begins, its decorators included."""
-    return min([statement.lineno, *(x.lineno for x in getattr(statement, "decorator_list", ()))])
+    lines: list[int] = [x.lineno for x in (statement, *getattr(statement, "decorator_list", ()))]
+    return min(lines)
 
 
 class _Cut:
