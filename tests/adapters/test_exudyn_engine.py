@@ -17,10 +17,10 @@ from plumbline.reproduce.engine_client import EngineClient
 from plumbline.reproduce.measure import StepMeasure
 from plumbline.reproduce.shrink import ReproductionCase
 from plumbline.scenario.generator import random_mechanism
-from plumbline.scenario.loader import find_scenario_file, load_scenario
 from plumbline.truth import rounding_bound
 from plumbline.truth.certified_state import certify_state
 from tests.helpers import pendulums
+from tests.helpers.catalogue import catalogue_scenario
 from tests.helpers.true_answers import true_trajectory
 
 TIMES = np.linspace(0.0, 2.0, 9)
@@ -96,7 +96,7 @@ def test_the_tree_reports_singular_angles():
 
 def test_the_tree_reports_singular_angles_of_a_free_body():
     """Three revolutes carry a free body as well: its refusal is one that the column declares."""
-    s = load_scenario(find_scenario_file("spring-pendulum"))
+    s = catalogue_scenario("spring-pendulum")
     with pytest.raises(Unsupported, match=r"body 1 come near their singularity") as reported:
         ExudynTree().simulate(s.model, s.state, s.times, "RK44", 2.0**-11)
     assert reported.value.gap == "angles"

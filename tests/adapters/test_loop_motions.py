@@ -7,7 +7,7 @@ from plumbline.engines.registry import load_adapter
 from plumbline.model.datatypes import Unsupported
 from plumbline.model.invariants import compute_invariants, motion_errors, position_error
 from plumbline.truth.trajectory_truth import simulate_notes_form
-from tests.helpers.catalogue import catalogue_scenarios
+from tests.helpers.catalogue import catalogue_scenario
 from tests.helpers.nightly_tests import SLOW
 from tests.helpers.shared_answers import sharing
 from tests.helpers.true_answers import converging_runs
@@ -32,7 +32,7 @@ def shared_truths():
 @pytest.mark.parametrize("name", ["four-bar", "slider-crank", "bricard"])
 @pytest.mark.parametrize("engine", ENGINES)
 def test_motions_of_loops_converge_to_the_truth(engine, name):
-    s, adapter = catalogue_scenarios()[name], load_adapter(engine)
+    s, adapter = catalogue_scenario(name), load_adapter(engine)
     true = simulate_notes_form(s.model, s.state, TIMES, 1e-13)
     assert adapter.integrators
     for method in adapter.integrators:
@@ -52,7 +52,7 @@ def test_motions_of_loops_converge_to_the_truth(engine, name):
 
 
 def test_mujoco_states_how_far_its_soft_loops_are_from_rigid_ones():
-    s, adapter = catalogue_scenarios()["four-bar"], load_adapter("mujoco")
+    s, adapter = catalogue_scenario("four-bar"), load_adapter("mujoco")
     true = simulate_notes_form(s.model, s.state, TIMES, 1e-13)
     run = adapter.simulate(s.model, s.state, TIMES, "RK4", 2.0**-10)
     assert run.softer is not None
@@ -64,7 +64,7 @@ def test_mujoco_states_how_far_its_soft_loops_are_from_rigid_ones():
 
 @pytest.mark.parametrize("engine", ["pinocchio-maximal", "exudyn-tree"])
 def test_other_columns_refuse_motions_of_loops(engine):
-    s, adapter = catalogue_scenarios()["four-bar"], load_adapter(engine)
+    s, adapter = catalogue_scenario("four-bar"), load_adapter(engine)
     for method in adapter.integrators:
         with pytest.raises(Unsupported, match=r"loops|closes"):
             adapter.simulate(s.model, s.state, TIMES, method.name, 2.0**-8)
@@ -73,7 +73,7 @@ def test_other_columns_refuse_motions_of_loops(engine):
 @pytest.mark.parametrize(("name", "steps"), [("bricard", 60), pytest.param("slider-crank", 400, marks=SLOW)])
 def test_a_run_keeps_its_independent_rows(name, steps):
     """Chosen anew in every stage, off the constraints, the rows differ: runs stall or end as singular."""
-    case = catalogue_scenarios()[name]
+    case = catalogue_scenario(name)
     run = load_adapter("reference").simulate(
         case.model, case.state, np.array([0.0, 1.0, 2.0]), "dop853", 1e-13
     )

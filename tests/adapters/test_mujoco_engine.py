@@ -20,7 +20,7 @@ from plumbline.truth.certified_state import certify_state
 from plumbline.truth.rounding_bound import state_rounding_bound
 from tests.helpers import engine_process as worker
 from tests.helpers import pendulums
-from tests.helpers.catalogue import catalogue_scenarios
+from tests.helpers.catalogue import catalogue_scenario
 
 pytest.importorskip("mujoco")
 
@@ -65,7 +65,7 @@ def evaluate_by(name, model, state):
 
 def test_an_iteration_that_has_not_converged_is_refused():
     """Turned, the planar four-bar's redundant rows agree to rounding only, by which PGS converges slowly."""
-    scenario = catalogue_scenarios()["four-bar"]
+    scenario = catalogue_scenario("four-bar")
     asked = "mujoco", evaluate_by, "mjtSolver.mjSOL_PGS"
     (found,) = worker.run_in_engine_process(*asked, scenario.model, scenario.state)
     assert found.limit_error["acceleration"] < MAX_LEFT * np.max(np.abs(found.acceleration))
@@ -110,7 +110,7 @@ def test_equalities_in_place_of_joints_give_the_same_answers(option, seed):
 
 
 def test_bodies_that_come_in_another_order_without_rods_keep_their_masses():
-    scenario = catalogue_scenarios()["tree-of-seven"]
+    scenario = catalogue_scenario("tree-of-seven")
     assert worst_ratio(scenario.model, at_rest(scenario.model, scenario.state), "tendon equalities") <= 1
 
 

@@ -11,10 +11,10 @@ from plumbline.model import kinematics
 from plumbline.model.datatypes import Unsupported
 from plumbline.model.random_mechanisms import random_tree
 from plumbline.model.sampling import random_states
-from plumbline.scenario.loader import find_scenario_file, load_scenario
 from plumbline.truth.certified_state import certify_state
 from tests.helpers import engine_process as worker
 from tests.helpers import pendulums
+from tests.helpers.catalogue import catalogue_scenario
 
 pin = pytest.importorskip("pinocchio")
 pinocchio_engine = pytest.importorskip("adapters.pinocchio_engine")
@@ -49,7 +49,7 @@ def test_aba_loses_the_symmetry_of_articulated_inertias():
     """A finding about pin: if this fails, its aba got better; then crba can leave the adapter's docstring."""
     error, asymmetry = {}, {}
     for bodies in (10, 30, 50):
-        scenario = load_scenario(find_scenario_file(f"chain-{bodies}-balls"))
+        scenario = catalogue_scenario(f"chain-{bodies}-balls")
         truth = certify_state(scenario.model, scenario.state).quantities.acceleration
         for algorithm in ("aba", "crba"):
             (got,) = by(algorithm).evaluate(scenario.model, [scenario.state])
@@ -111,7 +111,7 @@ def _rod_spins(model, state, h):
 
 @in_engine_process
 def test_maximal_coordinates_know_their_limits():
-    scenario = load_scenario(find_scenario_file("chain-50-balls"))
+    scenario = catalogue_scenario("chain-50-balls")
     with pytest.raises(Unsupported, match="workspace for 50 free bodies"):
         PinocchioMaximal().evaluate(scenario.model, [scenario.state])
     with pytest.raises(KeyError, match="no integrator"):

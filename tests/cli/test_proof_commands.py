@@ -10,9 +10,10 @@ import pytest
 
 from plumbline.execution.plan import Plan, TaskKey, TaskKind
 from plumbline.execution.scenario_verdicts import ScenarioRun
-from plumbline.scenario.loader import find_scenario_file, load_scenario
+from plumbline.scenario.loader import find_scenario_file
 from plumbline.truth import certificate_proof
 from plumbline.truth.trajectory_truth import trajectory_truth
+from tests.helpers.catalogue import catalogue_scenario
 from tests.helpers.commands import invoke
 
 pytestmark = pytest.mark.skipif(
@@ -43,7 +44,7 @@ def test_prove_writes_a_certificate_and_prints_radii(certificate):
     path, printed = certificate
     assert "proved" in printed and "position_radius" in printed
     document = json.loads(gzip.decompress(path.read_bytes()))
-    scenario = load_scenario(find_scenario_file("tumbling-ball"))
+    scenario = catalogue_scenario("tumbling-ball")
     assert document["scenario"] == scenario.digest
     assert float.fromhex(document["mass"][0]) == scenario.model.mass[0]
     assert len(document["times"]) == round(0.25 / scenario.sample_interval) + 1
@@ -122,7 +123,7 @@ def test_a_named_scenario_has_to_have_the_numbers(certificate, lighter, is_own, 
 
 
 def test_a_claim_that_the_numbers_contradict_is_a_warning(certificate, tmp_path):
-    rod, ball = (load_scenario(find_scenario_file(f"tumbling-{name}")) for name in ("rod", "ball"))
+    rod, ball = (catalogue_scenario(f"tumbling-{name}") for name in ("rod", "ball"))
     named = "its field scenario claims tumbling-rod, whose numbers are others"
     other = "which is not tumbling-ball"
     claims = {
@@ -189,7 +190,7 @@ def test_a_malformed_file_exits_with_2_and_names_what_is_wrong(certificate, tmp_
 
 
 def test_a_run_uses_the_proof_of_its_own_numbers_only():
-    scenario = load_scenario(find_scenario_file("tumbling-ball"))
+    scenario = catalogue_scenario("tumbling-ball")
     times = scenario.times
     found = certificate_proof.find_proof(scenario.model, scenario.state, times)
     assert found is None
@@ -216,7 +217,7 @@ def test_a_run_uses_the_proof_of_its_own_numbers_only():
 
 def test_the_rounded_motion_is_within_its_radius():
     """Against the balls, at every sample."""
-    scenario = load_scenario(find_scenario_file("lagrange-top"))
+    scenario = catalogue_scenario("lagrange-top")
     times = np.arange(5) * 0.02
     _, balls = certificate_proof.prove_motion(scenario.model, scenario.state, times)
     proof = certificate_proof.round_enclosure(balls)

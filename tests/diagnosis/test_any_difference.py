@@ -12,10 +12,9 @@ from plumbline.engines.registry import load_adapter
 from plumbline.judging.rows import Verdict
 from plumbline.judging.state_level import STATE_UNITS
 from plumbline.judging.step_level import judge_steps
-from plumbline.model.sampling import compared_states
 from plumbline.truth import step_formulas
 from plumbline.truth.ground_truth import state_truth
-from tests.helpers.catalogue import catalogue_scenarios
+from tests.helpers.catalogue import catalogue_scenario, catalogue_scenarios, states_of
 from tests.judging.test_step_level import CONTEXT, methods, stepped
 
 STATES = 3  # besides the initial one
@@ -25,8 +24,8 @@ SUBJECTS = sorted(name for name, s in catalogue_scenarios().items() if s.model.n
 
 @cache
 def right(name):
-    scenario = catalogue_scenarios()[name]
-    states = compared_states(scenario.model, scenario.state, scenario.seed, STATES)
+    scenario = catalogue_scenario(name)
+    states = states_of(scenario, STATES)
     return scenario.model, state_truth(scenario.model, states)
 
 
@@ -76,9 +75,9 @@ def steppers():
 @pytest.mark.parametrize(("name", "engine"), list(steppers()))
 def test_random_errors_of_steps_are_diagnosed_without_an_exception(name, engine):
     pytest.importorskip(engine)
-    scenario = catalogue_scenarios()[name]
+    scenario = catalogue_scenario(name)
     model, adapter = scenario.model, load_adapter(engine)
-    states = compared_states(model, scenario.state, scenario.seed, 1)
+    states = states_of(scenario, 1)
     integrator = methods(engine)[0]
     answer = stepped(adapter, integrator, model, states)
     runs = [one.run.trajectory for one in answer.attempts if one.run is not None]

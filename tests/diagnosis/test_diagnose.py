@@ -17,10 +17,10 @@ from plumbline.model.kinematics import (
     spring_vectors,
 )
 from plumbline.model.loops import determinate_part
-from plumbline.model.sampling import compared_states, random_states
-from plumbline.scenario.loader import load_scenarios
+from plumbline.model.sampling import random_states
 from plumbline.truth.ground_truth import state_truth
 from tests.helpers import pendulums
+from tests.helpers.catalogue import catalogue_scenario, states_of
 from tests.helpers.nightly_tests import SLOW
 
 pytest.importorskip("flint")
@@ -32,8 +32,8 @@ def known(name=CHAIN, count=8):
     if name == CHAIN or set(name) <= set("rb"):
         model = pendulums.make_model("bb" if name == CHAIN else name)
         return model, state_truth(model, random_states(model, count, seed=4))
-    (scenario,) = load_scenarios([name])
-    states = compared_states(scenario.model, scenario.state, scenario.seed, count - 1)
+    scenario = catalogue_scenario(name)
+    states = states_of(scenario, count - 1)
     return scenario.model, state_truth(scenario.model, states)
 
 

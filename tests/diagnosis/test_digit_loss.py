@@ -14,10 +14,10 @@ from plumbline.engines.registry import load_adapter
 from plumbline.model.equivalent import WORLD_VECTORS, bodies_between, rotate_world, unrotate
 from plumbline.model.kinematics import complete_state
 from plumbline.model.sampling import random_states
-from plumbline.scenario import loader
 from plumbline.truth.certified_state import certify_state
 from plumbline.truth.ground_truth import state_truth
 from tests.helpers import pendulums
+from tests.helpers.catalogue import catalogue_scenario
 
 pytest.importorskip("flint")
 
@@ -69,7 +69,7 @@ def test_a_turned_world_turns_the_answers():
     ("name", "joints", "springs"), [("chain-3-rods", 2, 0), ("crowded-loops-1", 2, 0), ("four-bar", 2, 0)]
 )
 def test_the_first_bodies_of_a_mechanism_are_where_they_were(name, joints, springs):
-    s = loader.load_scenario(loader.find_scenario_file(name))
+    s = catalogue_scenario(name)
     short, state = bodies_between(s.model, s.state, 0, 2)
     assert short.n == 2 and len(short.kind) == joints and len(short.spring_body) == springs
     assert np.array_equal(short.gravity, s.model.gravity) and np.array_equal(short.mass, s.model.mass[:2])
@@ -140,7 +140,7 @@ def test_an_engine_that_fails_on_turned_problems_is_not_accused_of_losing_digits
 @pytest.mark.parametrize("name", ["chain-30-balls", "chain-50-balls"])
 def test_what_aba_loses_on_long_chains_has_its_name(name):
     pytest.importorskip("pinocchio")
-    model = loader.load_scenario(loader.find_scenario_file(name)).model
+    model = catalogue_scenario(name).model
     truth = state_truth(model, random_states(model, 2, seed=1))
     evaluate = load_adapter("pinocchio-aba").evaluate
     (cause,) = diagnose(model, evaluate(model, truth.states), truth, evaluate).causes

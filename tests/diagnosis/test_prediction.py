@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from plumbline.diagnosis.prediction import Case, Predictor, View
-from plumbline.model.sampling import compared_states, random_states
-from plumbline.scenario.loader import load_scenarios
+from plumbline.model.sampling import random_states
 from plumbline.truth.ground_truth import state_truth
 from tests.helpers import pendulums
+from tests.helpers.catalogue import catalogue_scenario, states_of
 
 pytest.importorskip("flint")
 
@@ -18,8 +18,8 @@ def subject(name):
     if name in ("rb", "brbbrbrrbbrb"):
         model = pendulums.make_model(name, loads=True, drag=True)
         return model, random_states(model, 3, 5)
-    (scenario,) = load_scenarios([name])
-    return scenario.model, compared_states(scenario.model, scenario.state, scenario.seed, 2)
+    scenario = catalogue_scenario(name)
+    return scenario.model, states_of(scenario, 2)
 
 
 @pytest.mark.parametrize(

@@ -13,9 +13,9 @@ from plumbline.judging.rows import RowContext
 from plumbline.judging.state_level import judge_states
 from plumbline.model.datatypes import EngineFailure, Unsupported
 from plumbline.model.sampling import random_states
-from plumbline.scenario.loader import catalogue, load_scenario
 from plumbline.truth.ground_truth import state_truth
 from tests.helpers import pendulums
+from tests.helpers.catalogue import catalogue_scenario
 
 CONTEXT = RowContext("s", "f", "reference", "Reference", "1")
 
@@ -117,7 +117,7 @@ def test_every_refusal_in_the_catalogue_is_declared(engine):
         "furuta",
     )
     for name in names:
-        s = load_scenario(catalogue()[name])
+        s = catalogue_scenario(name)
         found = engine_calls.evaluate_states(engine, s.model, [s.state], [])
         assert found.failure is None
         if found.unsupported is not None:

@@ -27,6 +27,7 @@ from plumbline.processes.remote_python import call_remote
 from plumbline.processes.worker_pool import Limits, Task, WorkerPool
 from plumbline.scenario import loader
 from plumbline.truth.certified_state import certify_state
+from tests.helpers.catalogue import catalogue_scenario
 from tests.helpers.exudyn_initial_accelerations import initial_accelerations
 
 PYTHON = (
@@ -123,7 +124,7 @@ def test_losses_in_another_environment_are_reported_like_local_ones():
 
 
 def test_an_engine_gives_the_same_answer_in_another_environment():
-    s = loader.load_scenarios(["double-tumbling-balls"])[0]
+    s = catalogue_scenario("double-tumbling-balls")
     with WorkerPool(1) as workers:
         here, away = (
             o.value.quantities[0]
@@ -277,7 +278,7 @@ def test_each_cause_in_loops_of_older_versions_is_one_finding_with_its_versions(
 @pytest.mark.parametrize(("version", "sound"), [("1.9.0", False), ("1.10.0", False), ("1.11.0", True)])
 def test_exudyn_started_from_wrong_accelerations_with_its_sparse_solver(version, sound):
     """The relation says that two solvers of one engine differ; this shows which is wrong, and where."""
-    chosen = loader.load_scenarios(["double-tumbling-balls"])[0]
+    chosen = catalogue_scenario("double-tumbling-balls")
     true = certify_state(chosen.model, chosen.state).quantities.acceleration
     python = environments.ensure_interpreter(f"exudyn@{version}")
     off = {

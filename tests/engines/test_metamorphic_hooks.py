@@ -6,8 +6,8 @@ from plumbline.engines.adapter import Adapter
 from plumbline.engines.metamorphic_hooks import MetamorphicHooks, metamorphic_hooks
 from plumbline.engines.registry import load_adapter
 from plumbline.model.datatypes import Unsupported
-from plumbline.scenario.loader import find_scenario_file, load_scenario
 from tests.helpers import pendulums
+from tests.helpers.catalogue import catalogue_scenario
 
 
 class Plain(Adapter):
@@ -40,12 +40,12 @@ def test_an_adapter_with_hooks_stays_itself():
 def test_ways_to_the_accelerations_are_those_of_the_mechanisms_joints():
     mujoco = metamorphic_hooks(load_adapter("mujoco"))
     found = {
-        name: mujoco.options_for(load_scenario(find_scenario_file(name)).model)
+        name: mujoco.options_for(catalogue_scenario(name).model)
         for name in ("tumbling-ball", "tumbling-rod", "flyball-governor", "point-mass-arm")
     }
     dense, tendons, held = mujoco.options + tuple(mujoco.joint_options)
     assert found["tumbling-ball"] == (dense,) and found["tumbling-rod"] == (dense, tendons)
     assert found["flyball-governor"] == (dense, tendons, held)
     assert found["point-mass-arm"] == (dense,), "a cylindrical joint would let a point mass spin"
-    slider_crank = load_scenario(find_scenario_file("slider-crank")).model
+    slider_crank = catalogue_scenario("slider-crank").model
     assert metamorphic_hooks(load_adapter("pinocchio")).options_for(slider_crank) == ()

@@ -15,7 +15,7 @@ from plumbline.model.loops import cut_open, independent_rows
 from plumbline.model.random_mechanisms import ELEMENTS, random_tree
 from plumbline.model.sampling import random_states
 from plumbline.truth.parameters import derivative, list_parameters
-from tests.helpers.catalogue import catalogue_scenarios
+from tests.helpers.catalogue import catalogue_scenario
 
 BITS, STEP = 400, 1e-30
 PRECISION = 2e-10  # of a quantity's derivatives by a number
@@ -101,20 +101,20 @@ def test_derivatives_of_trees_with_every_element(kinds, seed):
 
 @pytest.mark.parametrize("name", ["chain-5-mixed", "loaded-tree", "point-mass-arm", "sprung-ball-on-slide"])
 def test_derivatives_of_catalogue_mechanisms(name):
-    scenario = catalogue_scenarios()[name]
+    scenario = catalogue_scenario(name)
     check_jets(scenario.model, scenario.state, 1, (), ())
 
 
 @pytest.mark.parametrize("name", ["squeezer", "crowded-loops-bare"])
 def test_derivatives_where_loops_are_cut(name):
-    scenario = catalogue_scenarios()[name]
+    scenario = catalogue_scenario(name)
     cut = cut_open(scenario.model)
     state = cut.state(scenario.state)
     check_jets(cut.model, state, 1, cut.ends, [*independent_rows(cut.jacobian(state), cut.row_scale)])
 
 
 def test_a_batch_of_states_is_its_states():
-    scenario = catalogue_scenarios()["tree-of-seven-sprung"]
+    scenario = catalogue_scenario("tree-of-seven-sprung")
     model, states = scenario.model, random_states(scenario.model, 3, 1)
     some = [one for one in list_parameters(model, states[0])[::9] if one.kind in vars(model)]
     directions = [derivative(model, states[0], one) for one in some]
@@ -129,7 +129,7 @@ def test_a_batch_of_states_is_its_states():
 
 def test_the_spring_of_an_untwisted_ball_has_the_slope_of_its_stiffness():
     """Where the angle is 0 its norm has no derivative, but the moment has."""
-    scenario = catalogue_scenarios()["sprung-ball"]
+    scenario = catalogue_scenario("sprung-ball")
     model, state = scenario.model, scenario.state
     k = int(np.argmax(model.stiffness[:, 0]))
     model = model.changed(turn=np.tile([1.0, 0.0, 0.0, 0.0], (model.n, 2, 1)), damping=0 * model.damping)

@@ -20,7 +20,7 @@ from plumbline.model.random_mechanisms import random_tree
 from plumbline.model.sampling import compared_states, random_states
 from plumbline.truth.certified_state import certify_state
 from plumbline.truth.rounding_bound import EPS, ROUNDING_FACTOR, state_rounding_bound
-from tests.helpers.catalogue import catalogue_scenarios
+from tests.helpers.catalogue import catalogue_scenario, states_of
 
 NAMES = (
     "chain-5-mixed", "tree-of-seven-sprung", "free-body-with-rotors", "point-mass-arm", "flyball-governor",
@@ -30,8 +30,8 @@ NAMES = (
 
 def cut(name, count=2):
     """A scenario's mechanism, cut open, with its states and the arguments of its ends."""
-    scenario = catalogue_scenarios()[name]
-    model, states = scenario.model, compared_states(scenario.model, scenario.state, scenario.seed, count)
+    scenario = catalogue_scenario(name)
+    model, states = scenario.model, states_of(scenario, count)
     if not model.has_loops:
         return model, states, ()
     opened = cut_open(model)
@@ -40,8 +40,8 @@ def cut(name, count=2):
 
 @pytest.mark.parametrize("name", (*NAMES, "bricard", "squeezer", "four-bars-2-flat"))
 def test_solutions_are_true(name):
-    scenario = catalogue_scenarios()[name]
-    states = compared_states(scenario.model, scenario.state, scenario.seed, 3)
+    scenario = catalogue_scenario(name)
+    states = states_of(scenario, 3)
     model, opened, ends = cut(name, 3)
     place = cut_open(scenario.model).place[: scenario.model.n] if ends else np.arange(model.n)
     found = Responses(model, opened, *ends).solution
@@ -111,7 +111,7 @@ def forces_of_ends(model, found):
 @pytest.mark.parametrize("name", ["flyball-governor", "crowded-loops-1", "bricard"])
 def test_ends_that_are_apart_keep_their_twists_and_push_each_other_at_one_point(name):
     """V̇_b − V̇_c + (V_b − V_c) × V_c = 0 with spatial twists at r_b; in these states the loops are open."""
-    scenario = catalogue_scenarios()[name]
+    scenario = catalogue_scenario(name)
     opened = cut_open(scenario.model)
     model, start = opened.model, opened.state(scenario.state)
     states = compared_states(model, start, "open", 4)[1:]

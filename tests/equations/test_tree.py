@@ -18,7 +18,7 @@ from plumbline.scenario.generator import random_mechanism, random_scenario
 from plumbline.truth.certified_state import certify_state, enclose_quantities
 from plumbline.truth.parameter_effects import evaluate_models
 from plumbline.truth.rounding_bound import EPS, state_rounding_bound
-from tests.helpers.catalogue import catalogue_scenarios
+from tests.helpers.catalogue import catalogue_scenario, catalogue_scenarios, states_of
 from tests.helpers.nightly_tests import SLOW
 
 BITS = 400
@@ -28,10 +28,6 @@ SAMPLE = (
     "tree-of-seven-sprung", "sprung-without-rotors", "free-body-with-rotors", "point-mass-arm",
 )  # fmt: skip
 TREES = [name for name, scenario in catalogue_scenarios().items() if not scenario.model.has_loops]
-
-
-def states_of(scenario, count=2):
-    return compared_states(scenario.model, scenario.state, scenario.seed, count)
 
 
 @pytest.mark.parametrize("kinds", [("ball",), ("hinge", "ball"), tuple(KINDS)], ids=len)
@@ -119,7 +115,8 @@ def evaluated(num, model, state):
 @pytest.mark.parametrize("name", [pytest.param(x, marks=[] if x in SAMPLE else SLOW) for x in TREES])
 def test_doubles_in_a_batch_are_within_a_tenth_of_the_rounding_bound(name):
     """The errors of doubles over the rounding bounds that engines are judged by."""
-    model, states = catalogue_scenarios()[name].model, states_of(catalogue_scenarios()[name], 4)
+    scenario = catalogue_scenario(name)
+    model, states = scenario.model, states_of(scenario, 4)
     found = evaluated(floats(), model, batch(states))
     for i, state in enumerate(states):
         truth = certify_state(model, state, mass_matrix=True).quantities
@@ -137,7 +134,8 @@ def test_doubles_in_a_batch_are_within_a_tenth_of_the_rounding_bound(name):
 @pytest.mark.parametrize("name", ["double-loaded-rods", "tree-of-seven-sprung", "free-body-with-rotors"])
 def test_long_doubles_have_their_digits(name):
     """Against balls, which have more digits: the errors are below the rounding of doubles."""
-    model, state = catalogue_scenarios()[name].model, states_of(catalogue_scenarios()[name])[1]
+    scenario = catalogue_scenario(name)
+    model, state = scenario.model, states_of(scenario, 2)[1]
     found = evaluated(floats(np.longdouble), model, state)
     with flint.ctx.workprec(BITS):
         balls = enclose_quantities(model, state, BITS, mass_matrix=True)
@@ -203,7 +201,7 @@ def test_the_mass_matrix_gives_the_kinetic_energy_of_bodies_and_rotors(seed):
 
 
 def test_wrenches_of_ends_balance_each_other_about_every_point():
-    scenario = catalogue_scenarios()["chain-3-balls"]
+    scenario = catalogue_scenario("chain-3-balls")
     rng = np.random.default_rng(1)
     tree = Tree(floats(), scenario.model, compared_states(scenario.model, scenario.state, "ends", 0)[0])
     axis, of_c, lever = rng.normal(size=(3, 3, 1))
@@ -221,7 +219,7 @@ def test_wrenches_of_ends_balance_each_other_about_every_point():
 
 
 def test_a_batch_is_its_states():
-    scenario = catalogue_scenarios()["tree-of-seven-sprung"]
+    scenario = catalogue_scenario("tree-of-seven-sprung")
     states = states_of(scenario, 3)
     together = evaluated(floats(), scenario.model, batch(states))
     for i, state in enumerate(states):
@@ -232,7 +230,7 @@ def test_a_batch_is_its_states():
 
 def test_balls_that_cannot_be_inverted_raise():
     """Nothing resists the spin of a point mass on a ball joint."""
-    scenario = catalogue_scenarios()["double-loaded-balls"]
+    scenario = catalogue_scenario("double-loaded-balls")
     model = scenario.model.changed(inertia=np.zeros((2, 3, 3)))
     with pytest.raises(ZeroDivisionError):
         Tree(ball_arithmetic(flint), model, scenario.state).solve()

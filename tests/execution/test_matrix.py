@@ -16,7 +16,7 @@ from plumbline.execution.scenario_verdicts import ScenarioRun
 from plumbline.judging import known_issues
 from plumbline.model.invariants import inertia_ratio
 from plumbline.processes.worker_pool import Limits, WorkerPool
-from tests.helpers.catalogue import catalogue_scenarios
+from tests.helpers.catalogue import catalogue_scenario, catalogue_scenarios
 from tests.helpers.fast_matrix import features, is_fast, levels
 
 
@@ -37,11 +37,11 @@ def test_the_fast_form_has_everything_on_every_engine(level):
     found = {engine: (set(), set()) for engine in ENGINES}  # features of the fast cells, and of all
     for cell in matrix_cells():
         name, engine, of_cell = cell.values
-        model = catalogue_scenarios()[name].model
+        model = catalogue_scenario(name).model
         if of_cell == level and not (engine == "reference-printed" and (model.n > 2 or not model.rods.all())):
             fast, every = found[engine]
-            every |= features(catalogue_scenarios()[name])
-            fast |= set() if cell.marks else features(catalogue_scenarios()[name])
+            every |= features(catalogue_scenario(name))
+            fast |= set() if cell.marks else features(catalogue_scenario(name))
     for engine, (fast, every) in found.items():
         if engine != "reference-printed" or level == "state":
             assert every - fast <= left_out, engine
@@ -66,7 +66,7 @@ def truths():
 @pytest.mark.parametrize(("name", "engine", "level"), list(matrix_cells()))
 @pytest.mark.timeout(900)
 def test_cell(name, engine, level, workers, engines, truths):
-    found = catalogue_scenarios()[name]
+    found = catalogue_scenario(name)
     info = engines[engine]
     if info.missing:
         pytest.skip(info.missing)

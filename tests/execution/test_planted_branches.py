@@ -16,11 +16,11 @@ from plumbline.judging.rows import RowContext
 from plumbline.judging.state_level import judge_states
 from plumbline.measurements.single_steps import STEP_STATES
 from plumbline.model.datatypes import Unsupported
-from plumbline.model.sampling import RANDOM_STATES, compared_states
+from plumbline.model.sampling import RANDOM_STATES
 from plumbline.scenario.generator import RandomScenarios
 from plumbline.truth import step_formulas
 from plumbline.truth.ground_truth import state_truth
-from tests.helpers.catalogue import catalogue_scenarios
+from tests.helpers.catalogue import catalogue_scenarios, states_of
 from tests.helpers.nightly_tests import some_fast
 from tests.helpers.planted_branches import BRANCH_DEFECTS, BRANCH_STEPS
 from tests.helpers.planting import plant, planted
@@ -57,7 +57,7 @@ def problem(index):
         s, count = chains[index], RANDOM_STATES
     else:
         s, count = RandomScenarios(SEED, RANDOM_COUNT)[index - len(chains)], STATES_PER_RANDOM_SCENARIO
-    return s, compared_states(s.model, s.state, s.seed, count)
+    return s, states_of(s, count)
 
 
 def problems():

@@ -9,8 +9,8 @@ from plumbline.diagnosis.diagnose import diagnose
 from plumbline.engines.registry import load_adapter
 from plumbline.model.kinematics import rotation_matrix
 from plumbline.model.sampling import random_states
-from plumbline.scenario.loader import catalogue, load_scenario
 from plumbline.truth.ground_truth import state_truth
+from tests.helpers.catalogue import catalogue_scenario
 from tests.helpers.nightly_tests import SLOW, slow, some_fast
 from tests.helpers.planted_defects import STATE_DEFECTS
 from tests.helpers.planted_joints import ELEMENT_DEFECTS, JOINT_DEFECTS, LOOP_DEFECTS
@@ -69,7 +69,7 @@ def test_the_engines_without_defect_are_not_reported(clean):
 
 
 def test_a_misread_velocity_that_only_energies_show_is_named_without_gravity():
-    scenario = load_scenario(catalogue()["free-body-with-rotors"])
+    scenario = catalogue_scenario("free-body-with-rotors")
     model, states = scenario.model, random_states(scenario.model, 3, seed=2)
     truth = state_truth(model, states)
     assert not np.any(model.gravity) and truth.bounds[0].tolerance("potential_energy") == 0

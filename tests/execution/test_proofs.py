@@ -9,10 +9,10 @@ import pytest
 from plumbline.execution import proofs
 from plumbline.execution.proofs import ProofSummary, prove_changed_motions
 from plumbline.processes.worker_pool import Limits
-from plumbline.scenario.loader import find_scenario_file, load_scenario
 from plumbline.truth import trajectory_truth
 from plumbline.truth.certificate_proof import find_proof
 from plumbline.truth.closed_form import exact_samples
+from tests.helpers.catalogue import catalogue_scenario
 
 pytestmark = pytest.mark.skipif(
     not all(map(find_spec, proofs.TRUTH_TOOLS)), reason="the truth tools are not installed"
@@ -21,7 +21,7 @@ LIMITS = Limits(120.0)
 
 
 def short(name):
-    return replace(load_scenario(find_scenario_file(name)), duration=0.25)
+    return replace(catalogue_scenario(name), duration=0.25)
 
 
 def test_only_motions_without_a_proof_are_proved_and_short_chains_first():

@@ -23,6 +23,7 @@ from plumbline.execution.result_cache import DiskResultCache, task_hash
 from plumbline.execution.runner import run_plan
 from plumbline.processes.worker_pool import Outcome, Pickled, Task
 from plumbline.scenario import loader
+from tests.helpers.catalogue import catalogue_scenario
 from tests.helpers.commands import invoke
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -204,7 +205,7 @@ def test_a_lost_cell_is_tried_again(tmp_path):
 
 
 def test_the_key_is_the_content():
-    s = loader.load_scenarios(["double-tumbling-balls"])[0]
+    s = catalogue_scenario("double-tumbling-balls")
     turned = replace(s.state, omega=-s.state.omega)
     other = replace(s.model, mass=np.nextafter(s.model.mass, 9.0))
     base = Task(

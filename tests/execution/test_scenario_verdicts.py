@@ -10,7 +10,7 @@ from plumbline.execution.runner import describe_engines, run_plan
 from plumbline.execution.scenario_verdicts import ScenarioRun
 from plumbline.processes.worker_pool import Limits, Outcome, WorkerPool, run_task
 from plumbline.scenario import loader
-from tests.helpers.catalogue import catalogue_scenarios
+from tests.helpers.catalogue import catalogue_scenario
 from tests.helpers.shared_answers import by_content
 
 pytest.importorskip("mujoco")
@@ -26,7 +26,7 @@ outcome_of = by_content(run_task)  # many tests begin with the same truth and th
 
 
 def make_scenario_run(engines, level, name="rest", states=2, **more):
-    chosen = catalogue_scenarios()[name]
+    chosen = catalogue_scenario(name)
     plan = Plan([chosen], list(engines), level, random_state_count=states)
     return ScenarioRun(plan, chosen, engines, **more)
 
@@ -139,7 +139,7 @@ def test_in_a_run_the_second_truth_is_handed_over(monkeypatch):
         return requested[-1] if uncompiled else replace(requested[-1], function=exit_process)
 
     monkeypatch.setattr(ScenarioRun, "truth_task", first_crashes)
-    plan = Plan([catalogue_scenarios()["rest"]], ["mujoco"], "trajectory", limits=Limits(120))
+    plan = Plan([catalogue_scenario("rest")], ["mujoco"], "trajectory", limits=Limits(120))
     result = run_plan(plan, lambda *_: None)
     assert len(requested) == 2
     assert result.metadata["exit_code"] == 0, result.metadata["sentence"]
@@ -210,7 +210,7 @@ def test_steps_are_not_searched_where_the_accelerations_they_are_made_of_disagre
 
 
 def plan_of(name, has_all_studies=False):
-    (chosen,) = loader.load_scenarios([name])
+    chosen = catalogue_scenario(name)
     return Plan([chosen], ["mujoco"], random_state_count=1, has_all_studies=has_all_studies), chosen
 
 

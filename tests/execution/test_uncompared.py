@@ -11,7 +11,7 @@ from plumbline.execution.runner import run_plan
 from plumbline.execution.scenario_verdicts import ScenarioRun
 from plumbline.judging.rows import Verdict
 from plumbline.judging.state_level import SINGULAR_POSE
-from tests.helpers.catalogue import catalogue_scenarios
+from tests.helpers.catalogue import catalogue_scenario
 
 
 @pytest.mark.parametrize(
@@ -27,7 +27,7 @@ from tests.helpers.catalogue import catalogue_scenarios
     ],
 )
 def test_levels_that_are_left_out_are_reported(name, level, expected):
-    scenario = catalogue_scenarios()[name]
+    scenario = catalogue_scenario(name)
     info: EngineInfo = load_adapter("mujoco").describe()
     run = ScenarioRun(Plan([scenario], ["mujoco"], level, long_run_seconds=1.0), scenario, {"mujoco": info})
     rows = run.findings().rows
@@ -37,7 +37,7 @@ def test_levels_that_are_left_out_are_reported(name, level, expected):
 
 
 def test_a_singular_initial_pose_is_unresolved_and_the_others_are_compared():
-    scenario = catalogue_scenarios()["four-bars-2-flat"]
+    scenario = catalogue_scenario("four-bars-2-flat")
     engines = ["reference", "mujoco", "pinocchio-aba"]
     result = run_plan(Plan([scenario], engines, "state", random_state_count=3), lambda *_: None)
     singular = {row.engine: row for row in result.rows if row.quantity == SINGULAR_POSE}
@@ -52,15 +52,15 @@ def test_a_singular_initial_pose_is_unresolved_and_the_others_are_compared():
 
 
 def test_a_regular_pose_beside_a_singular_one_is_compared():
-    scenario = catalogue_scenarios()["slider-crank"]  # its dead centres are regular: the crank turns there
+    scenario = catalogue_scenario("slider-crank")  # its dead centres are regular: the crank turns there
     result = run_plan(Plan([scenario], ["reference"], "state", random_state_count=1), lambda *_: None)
     assert {row.extra["states"] for row in result.rows} == {2.0}
 
 
 @pytest.mark.parametrize("level", ["all", "trajectory", "state"])
 def test_a_scenario_that_asks_for_states_is_compared_at_ten_only(level):
-    assert catalogue_scenarios()["crowded-tree"].level == "state"
-    scenario = replace(catalogue_scenarios()["damped-hinge"], level="state")
+    assert catalogue_scenario("crowded-tree").level == "state"
+    scenario = replace(catalogue_scenario("damped-hinge"), level="state")
     result = run_plan(Plan([scenario], ["reference"], level), lambda *_: None)
     assert {(row.level, row.verdict, row.extra["states"]) for row in result.rows} == {
         ("state", Verdict.AGREES, 10.0)

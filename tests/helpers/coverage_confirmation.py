@@ -24,11 +24,10 @@ from plumbline.measurements.order_and_limit import refinement_resolutions
 from plumbline.measurements.refinement_study import run_refinement_study
 from plumbline.measurements.single_steps import STEP_STATES, run_step_study
 from plumbline.model.datatypes import Array, Integrator, Model, State, StateQuantities, StepRun, Trajectory
-from plumbline.model.sampling import compared_states
-from plumbline.scenario.loader import Scenario, load_scenarios
 from plumbline.truth.closed_form import closed_form_motion
 from plumbline.truth.ground_truth import MotionTruth, StateTruth, motion_truth, state_truth
 from plumbline.truth.parameters import STATE_KINDS, Parameter, list_parameters, perturb
+from tests.helpers.catalogue import catalogue_scenario, states_of
 
 STATES = 50
 STATE_ENGINE, STEP_ENGINE, STEP_INTEGRATOR = "reference", "pinocchio", "rkmk4"
@@ -37,28 +36,22 @@ Change = Callable[[Model, State], tuple[Model, State]]
 
 
 @cache
-def scenario(name: str) -> Scenario:
-    """A scenario of the catalogue."""
-    return load_scenarios([name])[0]
-
-
-@cache
 def states(name: str) -> list[State]:
     """The states at which it is compared."""
-    s = scenario(name)
-    return compared_states(s.model, s.state, s.seed, STATES)
+    s = catalogue_scenario(name)
+    return states_of(s, STATES)
 
 
 @cache
 def true_states(name: str) -> StateTruth:
     """The certified truth at those states."""
-    return state_truth(scenario(name).model, states(name))
+    return state_truth(catalogue_scenario(name).model, states(name))
 
 
 @cache
 def true_motion(name: str) -> MotionTruth:
     """The true motion, as a run computes it."""
-    s = scenario(name)
+    s = catalogue_scenario(name)
     closed = closed_form_motion(s)
     exact = (*closed(s.times), closed.source) if closed and closed.amplitude == 0 else None
     return motion_truth(s.model, s.state, s.times, exact)
@@ -88,7 +81,7 @@ def with_change(engine: str, change: Change) -> Adapter:
 
 def judged_rows(name: str, level: Level, change: Change) -> list[Row]:
     """The rows of one level of a scenario, of the level's engine with a change."""
-    s, context = scenario(name), RowContext(name, "", MOTION_ENGINE, MOTION_ENGINE, "0")
+    s, context = catalogue_scenario(name), RowContext(name, "", MOTION_ENGINE, MOTION_ENGINE, "0")
     if level == "state":
         answers = with_change(STATE_ENGINE, change).evaluate(s.model, states(name))
         return judge_states(context, true_states(name), Evaluation(answers, None, None, 0.0)).rows
@@ -108,14 +101,14 @@ def judged_rows(name: str, level: Level, change: Change) -> list[Row]:
 @cache
 def coverage(name: str, level: Level) -> tuple[CoverageEntry, ...]:
     """The coverage table of one level, by the tolerances of the level's engine."""
-    s = scenario(name)
+    s = catalogue_scenario(name)
     rows = judged_rows(name, level, lambda m, x: (m, x)) if level in ("trajectory", "invariants") else []
     return tuple(scenario_coverage(name, s.model, s.state, s.times, states(name), rows, (level,)))
 
 
 def is_reported(entry: CoverageEntry, factor: float) -> bool:
     """Whether a mistake of so many times the table's smallest one is reported at the entry's level."""
-    s = scenario(entry.scenario)
+    s = catalogue_scenario(entry.scenario)
     parameter = next(
         one
         for one in list_parameters(s.model, s.state)

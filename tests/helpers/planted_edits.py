@@ -18,7 +18,7 @@ from plumbline.judging.known_issues import KnownIssues, project_known_issues
 from plumbline.judging.rows import Row
 from plumbline.processes.worker_pool import run_task
 from plumbline.scenario.generator import RandomScenarios
-from plumbline.scenario.loader import load_scenarios
+from tests.helpers.catalogue import catalogue_scenario
 from tests.helpers.tables import table
 
 ROOT = Path(__file__).parents[2]
@@ -78,7 +78,7 @@ def rows_of_run(edit: Edit, scenario_name: str, level: str, states: int) -> list
     is_random = scenario_name.startswith("random-")
     seed = int(scenario_name.split("-")[-2]) if is_random else 0
     night = RandomScenarios(seed, 0)
-    scenario = night.named(scenario_name) if is_random else load_scenarios([scenario_name])[0]
+    scenario = night.named(scenario_name) if is_random else catalogue_scenario(scenario_name)
     plan = Plan([scenario], [edit.engine], level, random_state_count=states)  # type: ignore[arg-type]
     run = ScenarioRun(plan, scenario, {edit.engine: load_adapter(edit.engine).describe()})
     with edited(edit):

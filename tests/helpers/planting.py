@@ -47,9 +47,9 @@ from plumbline.model.kinematics import (
 )
 from plumbline.model.random_mechanisms import random_loop_mechanism, random_tree
 from plumbline.model.sampling import compared_states, random_states
-from plumbline.scenario.loader import load_scenarios
 from plumbline.truth.ground_truth import MotionTruth, StateTruth, motion_truth, state_truth
 from tests.helpers import pendulums
+from tests.helpers.catalogue import catalogue_scenario, states_of
 from tests.helpers.pendulums import JOINT_PATTERNS
 
 Inputs = Callable[[Model, State], tuple[Model, State]]
@@ -143,9 +143,9 @@ def subject(mechanism: str, loaded: bool = False) -> tuple[Model, StateTruth]:
         model, state = random_loop_mechanism(3, 6, ("universal",), elements=ELEMENTS)
         states = compared_states(model, state, mechanism, 3)
     else:
-        (scenario,) = load_scenarios([mechanism])
+        scenario = catalogue_scenario(mechanism)
         model = scenario.model
-        states = compared_states(model, scenario.state, scenario.seed, 4)
+        states = states_of(scenario, 4)
     return model, state_truth(model, states)
 
 
@@ -215,7 +215,7 @@ def motion_subject(mechanism: str, loaded: bool = False) -> tuple[Model, State, 
         model = pendulums.make_model(JOINT_PATTERNS[mechanism], loads=loaded, drag=loaded)
         state, times = pendulums.state_from_seed(model, seed=2, rate=0.5), np.linspace(0, 2, 17)
     else:  # a quarter as many samples do not resolve the work of a damper
-        (scenario,) = load_scenarios([mechanism])
+        scenario = catalogue_scenario(mechanism)
         model, state, times = scenario.model, scenario.state, np.arange(65) / 64
     return model, state, motion_truth(model, state, times, None)
 

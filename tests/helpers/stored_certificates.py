@@ -19,9 +19,9 @@ import numpy as np
 from plumbline.model.datatypes import Model, State
 from plumbline.model.random_mechanisms import ELEMENTS, random_tree
 from plumbline.model.sampling import random_states
-from plumbline.scenario.loader import find_scenario_file, load_scenario
 from plumbline.truth import certificate_proof
 from plumbline.truth.certificate_file import JOINTS, SHAPES, parse_certificate
+from tests.helpers.catalogue import catalogue_scenario
 from tests.helpers.random_chains import random_chain
 
 FOLDER = Path(__file__).parents[1] / "truth" / "certificates"
@@ -44,7 +44,7 @@ def stored_mechanism(name: str) -> tuple[Model, State]:
     if name in CHAINS:
         return random_chain(np.random.default_rng(1), CHAINS[name], loads=True, drag=True)
     if name in SCENARIOS:
-        scenario = load_scenario(find_scenario_file(name))
+        scenario = catalogue_scenario(name)
         return scenario.model, scenario.state
     seed, kinds = TREES[name]
     model = random_tree(np.random.default_rng(seed), 3, kinds, elements=ELEMENTS)

@@ -22,14 +22,13 @@ from plumbline.model.kinematics import (
     rotate_vectors,
     rotation_matrix,
 )
-from plumbline.model.sampling import compared_states
 from plumbline.scenario.generator import random_mechanism, random_scenario
 from plumbline.studies.random_steps import mechanism_of
 from plumbline.truth import step_comparison, step_formulas
 from plumbline.truth.rounding_bound import EPS
 from plumbline.truth.step_charts import StepCharts
 from plumbline.truth.step_comparison import RUN_QUANTITIES, StepsFromSamples
-from tests.helpers.catalogue import catalogue_scenarios
+from tests.helpers.catalogue import catalogue_scenario, states_of
 from tests.helpers.nightly_tests import SLOW, slow, some_fast
 from tests.helpers.pinocchio_by_crba import steps_by_crba
 from tests.helpers.planted_runs import RUN_MISTAKES
@@ -51,8 +50,8 @@ def rows_of(adapter, integrator, model, states):
 
 @cache
 def subject(name):
-    scenario = catalogue_scenarios()[name]
-    return scenario.model, compared_states(scenario.model, scenario.state, scenario.seed, 1)[:2]
+    scenario = catalogue_scenario(name)
+    return scenario.model, states_of(scenario, 1)[:2]
 
 
 @pytest.mark.parametrize(

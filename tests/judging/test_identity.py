@@ -21,8 +21,8 @@ from plumbline.judging.identity import (
 )
 from plumbline.model.datatypes import Integrator
 from plumbline.processes.worker_pool import Limits
-from plumbline.scenario import loader
 from tests.helpers import pendulums
+from tests.helpers.catalogue import catalogue_scenario
 
 pytest.importorskip("mujoco")
 
@@ -149,7 +149,7 @@ def test_a_run_reports_an_alias_that_is_not_declared(monkeypatch, tmp_path):
         }
 
     names = ("rest", "planar-small", "tumbling-ball", "tumbling-rod", "on-axis-rod")
-    chosen = [loader.load_scenario(loader.find_scenario_file(name)) for name in names]
+    chosen = [catalogue_scenario(name) for name in names]
     cells = DiskResultCache(tmp_path / "cells")
     plan = Plan(chosen, ["mujoco"], "trajectory", limits=Limits(120), result_cache=cells)
     declared = runner.run_plan(plan, lambda *_: None)

@@ -21,9 +21,10 @@ from plumbline.measurements.long_run_study import (
 )
 from plumbline.model.datatypes import Integrator
 from plumbline.processes.worker_pool import Limits
-from plumbline.scenario import loader
 from plumbline.scenario.generator import random_motion
+from plumbline.scenario.loader import load_scenario
 from tests.helpers import engine_process as worker
+from tests.helpers.catalogue import catalogue_scenario
 from tests.helpers.nightly_tests import slow
 from tests.helpers.planted_defects import MOTION_DEFECTS
 from tests.helpers.planting import Defect, number_change, plant, rows_reordered, sample_change
@@ -31,13 +32,9 @@ from tests.helpers.planting import Defect, number_change, plant, rows_reordered,
 DEFECTS = {d.name: d for d in MOTION_DEFECTS}
 
 
-def load(name):
-    return loader.load_scenarios([name])[0]
-
-
 def run_long(name, engine, integrator, seconds=100.0):
     """Rows by quantity of one integrator's long runs of a scenario."""
-    s, chosen = load(name), load_adapter(engine) if isinstance(engine, str) else engine
+    s, chosen = catalogue_scenario(name), load_adapter(engine) if isinstance(engine, str) else engine
     method = chosen.integrator(integrator)
     plan = plan_long_run(method, s.model.n, seconds, s.sample_interval, s.duration)
     study = run_long_run_study(chosen.name, integrator, s.model, s.state, s.sample_interval, plan)
@@ -176,7 +173,7 @@ def test_runs_end_before_a_singular_pose():
 
 def test_the_steps_of_an_implicit_method_were_why_its_run_stopped():
     """Newton's iteration in Exudyn converges to about 21 s with steps of 2⁻⁸ s, to 44 s with half of that."""
-    s, method = load("furuta"), load_adapter("exudyn").integrator("generalized-alpha")
+    s, method = catalogue_scenario("furuta"), load_adapter("exudyn").integrator("generalized-alpha")
     plan = LongRunPlan(24.0, (2.0**-7, 2.0**-8), 24.0)
     study = run_long_run_study("exudyn", method.name, s.model, s.state, s.sample_interval, plan)
     assert [run.failure is None for run in study.runs] == [False, False, True]
@@ -212,10 +209,10 @@ def test_long_runs_end_where_the_motion_is_too_fast_for_every_step():
 
 
 def test_a_body_that_is_kilometres_away_is_solved_as_its_rounding_allows(tmp_path):
-    text = load("slider-on-arm").path.read_text()
+    text = catalogue_scenario("slider-on-arm").path.read_text()
     file = tmp_path / "far.yaml"
     file.write_text(text.replace("rates: [1.4]", "rates: [1000.0]"))
-    s, method = load(file), load_adapter("exudyn").integrator("generalized-alpha")
+    s, method = load_scenario(file), load_adapter("exudyn").integrator("generalized-alpha")
     plan = LongRunPlan(16.0, (2.0**-9,), 16.0)
     study = run_long_run_study("exudyn", method.name, s.model, s.state, s.sample_interval, plan)
     (run,) = study.runs
@@ -316,7 +313,9 @@ def test_the_jackknife_knows_a_common_motion_from_two():
 
 
 def test_a_run_has_long_cells_beside_the_others():
-    plan = Plan([load("conical")], ["mujoco"], "trajectory", limits=Limits(120), long_run_seconds=6.25)
+    plan = Plan(
+        [catalogue_scenario("conical")], ["mujoco"], "trajectory", limits=Limits(120), long_run_seconds=6.25
+    )
     seen = []
     result = run_plan(plan, lambda done, total, what: seen.append((done, total)))
     assert seen[-1] == (9, 9)  # the truth, four refinement studies, four long runs

@@ -21,26 +21,25 @@ from plumbline.model.datatypes import KINDS
 from plumbline.model.invariants import kinetic_energy
 from plumbline.model.kinematics import complete_state, kinetic_energy_of_rotors, stack_states
 from plumbline.model.sampling import compared_states
-from plumbline.scenario import loader as scenarios
 from plumbline.studies.coverage_study import blind_spots, summarize_coverage
 from plumbline.truth.certified_state import certify_state
 from plumbline.truth.parameter_effects import effects_at_states, evaluate_models
 from plumbline.truth.parameters import STATE_KINDS, list_parameters, perturb, perturb_model
 from plumbline.truth.rounding_bound import EPS, state_rounding_bound
 from plumbline.truth.trajectory_truth import accurate_runs, perturbed_motions, resolved_motions
-from tests.helpers.coverage_confirmation import coverage, is_reported, scenario, states
+from tests.helpers.catalogue import catalogue_scenario, catalogue_scenarios
+from tests.helpers.coverage_confirmation import coverage, is_reported, states
 from tests.helpers.nightly_tests import SLOW
 
 QUICK = ("drag-rod", "double-aligned")
 
 
 def catalogue(most_bodies):
-    models = {name: scenario(name).model for name in scenarios.catalogue()}
-    return [name for name, model in models.items() if model.n <= most_bodies]
+    return [name for name, s in catalogue_scenarios().items() if s.model.n <= most_bodies]
 
 
 def levels_of(name):
-    return ("state",) if scenario(name).model.has_loops else COVERED_LEVELS
+    return ("state",) if catalogue_scenario(name).model.has_loops else COVERED_LEVELS
 
 
 def confirmed_entries(names, count, seed):
@@ -83,7 +82,7 @@ def test_figures_of_a_free_body_are_those_of_the_wider_bound():
 @pytest.mark.parametrize(("name", "is_covered"), [("four-bar", False), ("hinge-pendulum", True)])
 def test_loops_have_no_entries_of_steps_and_motions(name, is_covered):
     """With a wrong number an overconstrained loop locks: rows of its runs are left out."""
-    s, context = scenario(name), RowContext(name, "", "reference", "reference", "0")
+    s, context = catalogue_scenario(name), RowContext(name, "", "reference", "reference", "0")
     levels = ("trajectory", "invariants")
     rows = [
         context.make_row(level, "dop853", "position_limit", Verdict.AGREES, "", compared_until=s.duration)
@@ -159,7 +158,7 @@ def test_the_order_of_an_effect_is_found(effect, figure):
 
 @pytest.mark.parametrize("name", ["double-tumbling-rods", "drag-rod", "acrobot", "sprung-hinge"])
 def test_deviations_are_differences_of_accurate_motions(name):
-    s = scenario(name)
+    s = catalogue_scenario(name)
     times, parameters, mistake = s.times[:9:2], list_parameters(s.model, s.state)[3::11], 1e-3
     cases = [perturb(s.model, s.state, one, mistake) for one in parameters]
     true, *others = accurate_runs([(s.model, s.state), *cases], times)
@@ -181,7 +180,8 @@ def test_two_hundred_figures_of_the_catalogue():
 @pytest.mark.parametrize("name", ["double-loaded-rods", "loaded-tree", "tree-of-seven-sprung"])
 def test_every_number_of_a_model_is_a_parameter(name):
     """One parameter for every number of every field, and a change of one number changes its field only."""
-    model, state = scenario(name).model, scenario(name).state
+    s = catalogue_scenario(name)
+    model, state = s.model, s.state
     parameters, changed_places, fields = list_parameters(model, state), {}, model.fields
     for one in parameters:
         changed, moved = perturb(model, state, one, 1e-3)
@@ -217,7 +217,8 @@ def test_effects_at_a_state_are_those_of_differences(name):
     rounding below.
     """
     reference, d, rtol = load_adapter("reference"), 1e-4, 1e-6
-    model, state = scenario(name).model, scenario(name).state
+    s = catalogue_scenario(name)
+    model, state = s.model, s.state
     parameters = list_parameters(model, state)
     (effects,) = effects_at_states(model, [state], parameters)
     for i, one in enumerate(parameters):
@@ -244,7 +245,8 @@ def test_effects_in_a_loop_are_those_of_differences():
     term of d² is 0.2 d² of the effect (2e-5 at d = 1e-2), here a thousandth of b/d.
     """
     reference, d = load_adapter("reference"), 1e-4
-    model, state = scenario("flyball-governor").model, scenario("flyball-governor").state
+    s = catalogue_scenario("flyball-governor")
+    model, state = s.model, s.state
     kinds = ("mass", "inertia", "force", "moment", "drag_moment", "stiffness", "damping", "effort", "rest")
     some = [one for one in list_parameters(model, state) if one.kind in kinds and one.body < 4]
     effects, bound = effects_at_states(model, [state], some)[0], state_rounding_bound(model, state)
@@ -260,8 +262,8 @@ def test_effects_in_a_loop_are_those_of_differences():
 @pytest.mark.parametrize("name", ["bricard", "flyball-governor", "crowded-loops-bare", "crowded-loops-3"])
 def test_loops_without_a_mistake_have_the_quantities_of_the_truth(name):
     """With dependent rows, rods, several loops; of changed points, energies are those of whole bodies."""
-    model = scenario(name).model
-    states = compared_states(model, scenario(name).state, name, 2)[1:]
+    model = catalogue_scenario(name).model
+    states = compared_states(model, catalogue_scenario(name).state, name, 2)[1:]
     one = next(x for x in list_parameters(model, states[0]) if x.kind == "proximal")
     changed, at = perturb_model(model, one, 0.1), stack_states(states)
     cases = [(model, at), (changed, complete_state(changed, at))]
@@ -279,7 +281,7 @@ def test_loops_without_a_mistake_have_the_quantities_of_the_truth(name):
 
 
 def test_the_table_of_a_scenario_has_every_parameter_once():
-    s = scenario("free-top")
+    s = catalogue_scenario("free-top")
     entries = coverage("free-top", "step")
     names = [(e.body, e.parameter) for e in entries]
     assert len(set(names)) == len(names) == len(list_parameters(s.model, s.state))
@@ -301,7 +303,7 @@ def test_proofs_hold_for_large_changes():
 
 def test_blind_spots_are_found():
     """Without drag on a later body, and without rods, sentences say so."""
-    s = scenario("double-aligned")
+    s = catalogue_scenario("double-aligned")
     entries = scenario_coverage(s.name, s.model, s.state, s.times, [s.state], [], ("state",))
     found = blind_spots(entries)
     assert "state level: no scenario sees drag_force of a later body on a rod" in found
@@ -314,7 +316,7 @@ def test_no_parameter_is_blind_at_state_and_step_level():
     """Two bodies or the loaded tree and six states suffice: every kind of joint is among them."""
     entries = []
     for name in [*catalogue(2), "loaded-tree", "tree-of-seven-sprung", "four-bar"]:
-        s = scenario(name)
+        s = catalogue_scenario(name)
         levels = (
             ("state", "step") if s.model.has_chain_joints else ("state",)
         )  # steps of trees: with the motions

@@ -19,15 +19,16 @@ from plumbline.model.datatypes import BALL, FREE, KINDS, ROD, SPRING_FIELDS
 from plumbline.model.kinematics import complete_state, quaternion_exponential, quaternion_product
 from plumbline.model.loops import STABILISATION
 from plumbline.model.random_mechanisms import random_loop_mechanism, random_tree
-from plumbline.model.sampling import compared_states, random_states
+from plumbline.model.sampling import random_states
 from plumbline.model.step_methods import TABLEAUS, ConstrainedMethod, JointSpaceMethod, classical_runge_kutta
 from plumbline.scenario.generator import RandomScenarios, random_scenario
-from plumbline.scenario.loader import find_scenario_file, load_scenario, load_scenarios
+from plumbline.scenario.loader import load_scenarios
 from plumbline.truth import step_comparison, step_formulas
 from plumbline.truth.certified_state import certify_state
 from plumbline.truth.step_charts import StepCharts
 from plumbline.truth.step_comparison import step_counts
 from tests.helpers import pendulums
+from tests.helpers.catalogue import catalogue_scenario, states_of
 from tests.helpers.nightly_tests import SLOW, some_fast
 from tests.helpers.pendulums import JOINT_PATTERNS
 from tests.helpers.pinocchio_by_crba import steps_by_crba
@@ -66,7 +67,7 @@ def judged(adapter, integrator, model, states):
 
 @pytest.mark.parametrize(("engine", "name"), [("mujoco", "RK4"), ("pinocchio", "semi-implicit-euler")])
 def test_steps_of_bodies_without_inertia_are_judged(engine, name):
-    scenario, adapter = load_scenario(find_scenario_file("point-mass-arm")), load_adapter(engine)
+    scenario, adapter = catalogue_scenario("point-mass-arm"), load_adapter(engine)
     states = [scenario.state, *random_states(scenario.model, 1, 1)]
     rows = judged(adapter, adapter.integrator(name), scenario.model, states)
     assert len(rows) == 4 and all(row.verdict == Verdict.AGREES for row in rows)
@@ -445,8 +446,8 @@ LOOPS = ("four-bar", "slider-crank", "flyball-governor", "squeezer", "four-bars-
 
 @cache
 def loop_subject(name):
-    scenario = load_scenario(find_scenario_file(name))
-    return scenario.model, compared_states(scenario.model, scenario.state, scenario.seed, 1)
+    scenario = catalogue_scenario(name)
+    return scenario.model, states_of(scenario, 1)
 
 
 @pytest.mark.parametrize("name", [*LOOPS[:3], *(pytest.param(x, marks=SLOW) for x in LOOPS[3:])])

@@ -20,11 +20,11 @@ from plumbline.judging.state_level import judge_variants
 from plumbline.judging.surface_rows import judge_surface
 from plumbline.model.kinematics import complete_state, quaternion_product, rotation_matrix
 from plumbline.model.random_mechanisms import random_tree
-from plumbline.model.sampling import compared_states, random_states
-from plumbline.scenario.loader import load_scenarios
+from plumbline.model.sampling import random_states
 from plumbline.studies.exercised_names import exercised_names
 from plumbline.truth.ground_truth import state_truth
 from plumbline.truth.surface_truth import SURFACE_QUANTITIES
+from tests.helpers.catalogue import catalogue_scenario, states_of
 
 WHO = RowContext("s", "f", "e", "The engine", "0")
 KINDS = ("rod", "ball", "hinge", "slide", "cylindrical", "free", "weld")
@@ -161,8 +161,8 @@ def test_energies_of_heavy_bodies_on_springs_and_dampers_in_weak_gravity_are_wit
 
 @pytest.mark.parametrize("engine", ["pinocchio", "exudyn"])
 def test_bodies_of_a_loop_are_compared_and_a_relative_change_of_1e_6_is_seen(engine):
-    (s,) = load_scenarios(["slider-crank"])
-    states = compared_states(s.model, s.state, s.seed, 2)[:2]
+    s = catalogue_scenario("slider-crank")
+    states = states_of(s, 2)[:2]
     truth, answers = state_truth(s.model, states), answers_of(engine, s.model, states)
     found = verdicts(truth, answers)
     wrong = {name for name, verdict in found.items() if verdict != Verdict.AGREES}

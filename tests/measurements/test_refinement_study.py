@@ -16,8 +16,8 @@ from plumbline.measurements import refinement_study
 from plumbline.measurements.order_and_limit import refinement_resolutions
 from plumbline.measurements.refinement_study import MIN_RUNS, STOP_MARGIN, is_resolved, run_refinement_study
 from plumbline.model.datatypes import Integrator
-from plumbline.scenario.loader import load_scenarios
 from plumbline.truth.ground_truth import motion_truth
+from tests.helpers.catalogue import catalogue_scenario
 from tests.judging.test_trajectory_verdicts import (
     METHOD,
     MODEL,
@@ -136,7 +136,7 @@ def test_no_finer_step_lowers_a_bound_by_more_than_the_margin(coefficients, size
 
 @pytest.mark.parametrize("engine", ["mujoco", "pinocchio"])
 def test_a_stopped_study_has_the_first_runs_of_the_whole_one_and_its_verdicts(engine):
-    (scenario,) = load_scenarios(["planar-small"])
+    scenario = catalogue_scenario("planar-small")
     method = {"mujoco": "RK4", "pinocchio": "rkmk4"}[engine]
     s, integrator = scenario, Integrator(method, "step", 4, (4, 5, 6, 7, 8))
     steps = refinement_resolutions(integrator, s.model.n, s.duration)
@@ -157,7 +157,7 @@ def test_a_stopped_study_has_the_first_runs_of_the_whole_one_and_its_verdicts(en
 
 def test_sampled_rates_that_are_scaled_late_are_reported():
     """By 1e-7 after 1 s: neither positions and attitudes nor the step level up to its ten steps show it."""
-    (s,) = load_scenarios(["double-hinge-skew"])
+    s = catalogue_scenario("double-hinge-skew")
     integrator = load_adapter("mujoco").integrator("RK4")
     steps = refinement_resolutions(integrator, s.model.n, s.duration)
     study = run_refinement_study("mujoco", "RK4", s.model, s.state, s.times, steps)

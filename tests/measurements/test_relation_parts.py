@@ -29,11 +29,11 @@ from plumbline.measurements.state_relations import (
 )
 from plumbline.model.datatypes import EngineFailure, Integrator, StateQuantities, Trajectory, Unsupported
 from plumbline.model.kinematics import angular_velocity, quaternion_product, quaternion_rate, stretched_length
-from plumbline.scenario.loader import find_scenario_file, load_scenario
 from plumbline.truth.ground_truth import RUN_ROUNDING
 from plumbline.truth.predictability_horizon import perturbation_growth
 from plumbline.truth.rounding_bound import state_rounding_bound
 from tests.helpers import pendulums
+from tests.helpers.catalogue import catalogue_scenario
 from tests.helpers.relation_checks import check_relations
 
 MODEL = pendulums.make_model("br")
@@ -189,7 +189,7 @@ def test_the_quickest_is_a_body_a_rod_or_the_shortest_link():
 
 
 def test_a_loop_that_a_motor_starts_from_rest_is_as_fast_as_its_acceleration_makes_it():
-    squeezer = load_scenario(find_scenario_file("squeezer"))
+    squeezer = catalogue_scenario("squeezer")
     assert np.max(np.abs(squeezer.state.omega)) == 0 == np.max(np.abs(squeezer.model.gravity))
     assert fastest_rate(squeezer.model, squeezer.state) > np.sqrt(2 * 1.4e4)  # ω̇ = 1.4e4 rad/s² at the start
 

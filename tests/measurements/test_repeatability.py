@@ -13,9 +13,8 @@ from plumbline.judging.relation_rows import judge_relations
 from plumbline.judging.rows import RowContext
 from plumbline.measurements.repeatability import check_repeatability
 from plumbline.model.datatypes import EngineFailure, Unsupported
-from plumbline.model.sampling import compared_states
-from plumbline.scenario.loader import load_scenarios
 from tests.helpers import pendulums
+from tests.helpers.catalogue import catalogue_scenario, states_of
 from tests.helpers.pendulums import JOINT_PATTERNS
 from tests.helpers.relation_checks import check_relations
 
@@ -47,9 +46,9 @@ def test_every_engine_gives_the_same_bits_again(engine):
 @pytest.mark.parametrize("engine", ["mujoco", "pinocchio", "exudyn", "reference"])
 def test_every_engine_gives_the_same_bits_of_a_loop_again(engine):
     """MuJoCo's are limits of softer runs, which are compared as well."""
-    (s,) = load_scenarios(["slider-crank"])
+    s = catalogue_scenario("slider-crank")
     adapter = load_adapter(engine)
-    found = rows(adapter, s.model, compared_states(s.model, s.state, s.seed, 2))
+    found = rows(adapter, s.model, states_of(s, 2))
     assert set(found) == {"-", *(one.name for one in adapter.integrators if one.has_motions)}
     assert {row.verdict for row in found.values()} == {"agrees"}, [row.reason for row in found.values()]
 

@@ -25,13 +25,13 @@ from plumbline.model.loops import loop_gaps
 from plumbline.model.random_mechanisms import random_loop_mechanism, random_tree
 from plumbline.model.redescription import moved_root
 from plumbline.model.sampling import random_states
-from plumbline.scenario.loader import find_scenario_file, load_scenario
 from plumbline.truth.rounding_bound import state_rounding_bound
+from tests.helpers.catalogue import catalogue_scenario
 from tests.helpers.random_chains import random_chain
 from tests.helpers.relation_checks import check_run_relations, check_state_relations
 from tests.helpers.shared_answers import sharing
 
-TREE = load_scenario(find_scenario_file("tree-of-seven"))
+TREE = catalogue_scenario("tree-of-seven")
 BY_TENDONS = "by tendon equalities"
 LOOP_ENGINES = ["reference", "mujoco", "pinocchio", "pinocchio-maximal", "exudyn"]
 

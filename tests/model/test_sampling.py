@@ -3,25 +3,22 @@
 import numpy as np
 import pytest
 
-from plumbline.model.sampling import RANDOM_STATES, compared_states
+from plumbline.model.sampling import RANDOM_STATES
 from plumbline.scenario.generator import random_mechanism, random_scenario
-from tests.helpers.catalogue import catalogue_scenarios
+from tests.helpers.catalogue import catalogue_scenario, states_of
 
 CASES = (
     random_scenario(1, 0),
     random_mechanism(1, 0),
     random_mechanism(1, 1),
-    catalogue_scenarios()["four-bar"],
+    catalogue_scenario("four-bar"),
 )
 
 
 @pytest.mark.parametrize("scenario", CASES, ids=lambda scenario: scenario.name)
 def test_a_run_of_its_file_has_the_states_of_a_night_among_others(scenario):
     """A night compares nine states of a random scenario, a run of its file fifty."""
-    few, many = (
-        compared_states(scenario.model, scenario.state, scenario.seed, n)
-        for n in (4, 12 if scenario.model.has_loops else RANDOM_STATES)
-    )
+    few, many = (states_of(scenario, n) for n in (4, 12 if scenario.model.has_loops else RANDOM_STATES))
     assert len(few) == 5 < len(many)
     for one, other in zip(few, many, strict=False):
         for name, values in vars(one).items():

@@ -10,9 +10,9 @@ import psutil
 from plumbline.engines import registry
 from plumbline.processes import worker_process
 from plumbline.processes.worker_pool import Limits
-from plumbline.scenario import loader
 from plumbline.storage.history_of_nights import History
 from tests.helpers import faulty_engines as faulty
+from tests.helpers.catalogue import catalogue_scenario
 from tests.helpers.nights import run_night
 
 LIMITS = Limits(seconds=30, gigabytes=4)  # a sound cell beside two other test processes takes up to 10 s
@@ -37,7 +37,7 @@ def test_every_fault_at_once_loses_exactly_its_own_cell(tmp_path, monkeypatch, c
     workers_of_other_tests = (
         find_plumbline_workers()
     )  # the pool of the matrix test lives as long as its session
-    (s,) = loader.load_scenarios(["planar-small"])
+    s = catalogue_scenario("planar-small")
     short, options = [replace(s, duration=0.5)], {"jobs": 2, "limits": LIMITS, "level": "trajectory"}
     result, place = run_night(tmp_path / "out", "mujoco", *names, scenarios=short, **options)
     lost = {(row.engine, row.integrator): row.reason for row in result.rows if row.verdict == "failed"}

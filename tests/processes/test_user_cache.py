@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from plumbline.processes.user_cache import CheckedFiles, DamagedFile, content_key, recall, remember
-from plumbline.scenario import loader
 from plumbline.scenario.yaml_reader import read_yaml
 from plumbline.truth import taylor
+from tests.helpers.catalogue import catalogue_scenario
 
 pytestmark = pytest.mark.usefixtures("nothing_remembered")
 
@@ -67,7 +67,7 @@ def test_a_parsed_file_is_recalled_and_a_changed_one_parsed(own_cells, tmp_path)
 
 def test_a_compiled_integrator_is_recalled_with_equal_bits(own_cells):
     pytest.importorskip("heyoka")
-    s = loader.load_scenario(loader.find_scenario_file("double-tumbling-balls"))
+    s = catalogue_scenario("double-tumbling-balls")
     runs = []
     for count in (1, 1):
         taylor._compiled_integrator.cache_clear()

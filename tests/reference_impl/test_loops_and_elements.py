@@ -6,7 +6,6 @@ import pytest
 from plumbline.model.kinematics import maximal_coordinates
 from plumbline.model.random_mechanisms import random_tree
 from plumbline.model.sampling import random_states
-from plumbline.scenario.loader import find_scenario_file, load_scenario
 from reference_impl.direct import DirectSystem
 from reference_impl.elements import Elements
 from reference_impl.euler_parameters import L
@@ -19,12 +18,13 @@ from reference_impl.integrate import (
     state_scales,
 )
 from reference_impl.mechanism import JOINT_ELEMENTS, SPRING_FIELDS, Mechanism
+from tests.helpers.catalogue import catalogue_scenario
 
 LOOPS = ("four-bar", "slider-crank", "bricard")  # the last is overconstrained: one row depends on the others
 
 
 def loop_state(name):
-    s = load_scenario(find_scenario_file(name))
+    s = catalogue_scenario(name)
     return s.model, maximal_coordinates(s.state)
 
 
@@ -69,7 +69,7 @@ def test_a_run_chooses_as_many_rows_again_where_its_own_come_near_to_dependence(
 
 @pytest.mark.parametrize("name", ["four-bar", "double-loaded-balls"])
 def test_a_mechanism_is_made_again_of_its_fields(name):
-    model = load_scenario(find_scenario_file(name)).model
+    model = catalogue_scenario(name).model
     again = Mechanism.from_fields({key: np.asarray(x).tolist() for key, x in model.fields.items()})
     assert vars(again).keys() == vars(model).keys()
     for key, value in vars(model).items():
@@ -179,7 +179,7 @@ def test_sizes_of_a_motion_are_those_of_the_stretched_mechanism():
 
 
 def test_the_printed_equations_as_a_right_hand_side():
-    s = load_scenario(find_scenario_file("double-tumbling-rods"))
+    s = catalogue_scenario("double-tumbling-rods")
     parts = maximal_coordinates(s.state)
     printed, direct = notes_acceleration(s.model)(*parts), direct_acceleration(s.model)(*parts)
     np.testing.assert_allclose(printed, direct, rtol=1e-10, atol=1e-10)

@@ -9,7 +9,6 @@ from plumbline.model.datatypes import KINDS
 from plumbline.model.kinematics import maximal_coordinates
 from plumbline.model.random_mechanisms import ELEMENTS, random_tree
 from plumbline.model.sampling import random_states
-from plumbline.scenario.loader import find_scenario_file, load_scenario
 from plumbline.truth.rounding_bound import EPS, state_rounding_bound
 from reference_impl.direct import DirectSystem
 from reference_impl.euler_parameters import L, dot
@@ -19,6 +18,7 @@ from reference_impl.fast.tree_elimination import DenseSystem, TreeSystem, elimin
 from reference_impl.integrate import integrate_dop853
 from reference_impl.joints import constraint_rows
 from reference_impl.singular_system import SingularSystem
+from tests.helpers.catalogue import catalogue_scenario
 from tests.helpers.notes_test_data import body_first, components
 from tests.helpers.random_chains import random_model
 
@@ -61,7 +61,7 @@ def test_trees_side_by_side_do_not_touch_each_other():
 
 def test_loops_with_rotors_side_by_side_do_not_touch_each_other():
     """The rows of rotors follow those of all constraints. Seen: an index beyond the first mechanism."""
-    s = load_scenario(find_scenario_file("four-bar"))
+    s = catalogue_scenario("four-bar")
     rotors = np.zeros((4, 2))
     rotors[[0, 2], 0] = 0.02, 0.05
     models = [replace(s.model, armature=factor * rotors) for factor in (1.0, 3.0)]
@@ -151,7 +151,7 @@ def test_a_singular_body_is_an_error():
 
 def test_a_light_body_before_a_heavy_one_keeps_its_digits():
     """A cart of a milligram and a bob of a kilogram; without the refinement 12 bounds off."""
-    case = load_scenario(find_scenario_file("light-cart-pole"))
+    case = catalogue_scenario("light-cart-pole")
     for state in random_states(case.model, 8, 1):
         parts = maximal_coordinates(state)
         found, bound = TreeSystem([case.model]).solve(*parts), state_rounding_bound(case.model, state)

@@ -7,7 +7,7 @@ import reports
 from plumbline.execution.plan import Plan
 from plumbline.execution.runner import run_plan, save
 from reports.stored_results import Results
-from tests.helpers.catalogue import catalogue_scenarios
+from tests.helpers.catalogue import catalogue_scenario
 from tests.reports.test_report import decoded_chunks
 
 NAMES = ("bricard", "flyball-governor")
@@ -15,7 +15,7 @@ NAMES = ("bricard", "flyball-governor")
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    scenarios = [catalogue_scenarios()[name] for name in NAMES]
+    scenarios = [catalogue_scenario(name) for name in NAMES]
     result = run_plan(Plan(scenarios, ["reference"], "state", random_state_count=1), lambda *_: None)
     place = tmp_path_factory.mktemp("loops") / "run"
     save(result, place, "-")
@@ -32,7 +32,7 @@ def shown(folder):
 
 def test_the_initial_state_is_drawn_with_every_joint(shown):
     for name in NAMES:
-        scenario, motion = catalogue_scenarios()[name], shown[name]["motion"]
+        scenario, motion = catalogue_scenario(name), shown[name]["motion"]
         model = scenario.model
         assert motion["bodies"] == model.n and motion["base"] == ["", "t = 0"]
         drawn = motion["r"].reshape(-1, 3) * motion["span"] / 32767

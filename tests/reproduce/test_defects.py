@@ -18,7 +18,7 @@ from plumbline.reproduce.engine_client import EngineClient
 from plumbline.reproduce.measure import Disagreement, StateMeasure
 from plumbline.reproduce.shrink import ReproductionCase, starting_cases
 from plumbline.reproduce.write import make_script
-from plumbline.scenario.loader import find_scenario_file, load_scenario
+from tests.helpers.catalogue import catalogue_scenario
 from tests.helpers.planted_defects import STATE_DEFECTS
 from tests.helpers.planting import plant
 from tests.helpers.reproduction import defective, execute, run_alone, script_of, state_case, stored_row
@@ -176,7 +176,7 @@ def test_a_defect_of_the_surface_is_shown_by_the_source_of_its_adapter(
     engine, scenario, quantity, call, lines, tmp_path
 ):
     """The script is run in a process of its own; without a planted defect the same script finds nothing."""
-    s = load_scenario(find_scenario_file(scenario))
+    s = catalogue_scenario(scenario)
     case = ReproductionCase(s.model, s.state)
     found = disagreement(engine, (quantity,), case, level="surface", call=call, seconds=0.0)
     with defective(lines):
@@ -193,7 +193,7 @@ def test_a_defect_of_the_surface_is_shown_by_the_source_of_its_adapter(
 
 def test_the_smallest_chain_on_which_aba_loses_its_digits(tmp_path):
     """A real one: Pinocchio's aba on thirty balls, with simpler numbers, and still disagreeing alone."""
-    scenario = load_scenario(find_scenario_file("chain-30-balls"))
+    scenario = catalogue_scenario("chain-30-balls")
     case = ReproductionCase(scenario.model, scenario.state)
     wanted = ("acceleration", "angular_acceleration", "joint_reaction")
     small = disagreement("pinocchio-aba", wanted, case).shrink()

@@ -19,7 +19,7 @@ from plumbline.reproduce.render import render_script
 from plumbline.reproduce.shrink import ReproductionCase
 from plumbline.reproduce.write import make_script
 from plumbline.truth.rounding_bound import EPS
-from tests.helpers.catalogue import catalogue_scenarios
+from tests.helpers.catalogue import catalogue_scenario
 from tests.helpers.reproduction import (
     DRIFTS,
     defective,
@@ -47,7 +47,7 @@ pinocchio.Inertia = lambda mass, *more: real(1.0001 * mass, *more)
 
 
 def case_of(scenario):
-    found = catalogue_scenarios()[scenario]
+    found = catalogue_scenario(scenario)
     return ReproductionCase(found.model, found.state)
 
 

@@ -7,13 +7,13 @@ import pytest
 
 from plumbline.model.sampling import random_states
 from plumbline.reproduce.shrink import ReproductionCase, smallest_case
-from plumbline.scenario.loader import find_scenario_file, load_scenario
+from tests.helpers.catalogue import catalogue_scenario
 
 
 @pytest.mark.timeout(60)
 def test_the_search_ends_where_rounding_undoes_a_change():
     """Of these states two are projected to and fro for ever: u̇ differs by a rounding each time."""
-    model = load_scenario(find_scenario_file("tumbling-rod")).model
+    model = catalogue_scenario("tumbling-rod").model
 
     def measure(case):
         shows = len(set(np.abs(case.state.udot).round(3).ravel())) == 3

@@ -15,10 +15,10 @@ from plumbline.layout import ROOT
 from plumbline.processes.worker_pool import Outcome
 from plumbline.reproduce import write
 from plumbline.reproduce.write import NotReproducible, write_scripts
-from plumbline.scenario.loader import find_scenario_file, load_scenario
 from plumbline.storage import results_store
 from plumbline.storage.results_schema import DamagedResults
 from plumbline.storage.script_index import read_script_index
+from tests.helpers.catalogue import catalogue_scenario
 from tests.helpers.commands import invoke
 from tests.helpers.reproduction import run_alone
 
@@ -31,7 +31,7 @@ SLOW = {"level": "trajectory", "integrator": "rkmk4", "quantity": "attitude", "c
 @pytest.fixture
 def results(tmp_path):
     """A results folder with real disagreements of aba, one row that agrees and one without a script."""
-    scenario = load_scenario(find_scenario_file("chain-30-balls"))
+    scenario = catalogue_scenario("chain-30-balls")
     about = {
         "family": "chain",
         "title": "Thirty balls",

@@ -11,10 +11,10 @@ from plumbline.execution.exit_codes import ExitCode
 from plumbline.judging.rows import RowContext
 from plumbline.judging.state_level import judge_states
 from plumbline.model.loops import immovable_joints
-from plumbline.model.sampling import compared_states
-from plumbline.scenario.loader import catalogue, find_scenario_file, load_scenario, load_scenario_text
+from plumbline.scenario.loader import find_scenario_file, load_scenario_text
 from plumbline.truth.certified_state import certify_state
 from plumbline.truth.ground_truth import state_truth
+from tests.helpers.catalogue import catalogue_scenario, states_of
 from tests.helpers.commands import invoke
 from tests.helpers.nightly_tests import slow
 
@@ -78,7 +78,7 @@ def test_joints_that_cannot_move_are_found_and_have_rates_of_zero(name):
     s = load_scenario_text(TEXTS[name])
     still = STILL.get(name, [0, 1, 3])
     assert immovable_joints(s.model, s.state) == still
-    states = compared_states(s.model, s.state, s.seed, 5)
+    states = states_of(s, 5)
     held = [k for k in still if k < s.model.n]
     assert len(states) == 6
     for state in states:
@@ -91,7 +91,7 @@ def test_joints_that_cannot_move_are_found_and_have_rates_of_zero(name):
 
 @pytest.mark.parametrize("name", ["bricard", "four-bar", "slider-crank", "squeezer", "four-bars-2-flat"])
 def test_dead_points_and_dependent_rows_hold_no_joint(name):
-    s = load_scenario(catalogue()[name])
+    s = catalogue_scenario(name)
     assert immovable_joints(s.model, s.state) == []
 
 
@@ -99,7 +99,7 @@ def test_dead_points_and_dependent_rows_hold_no_joint(name):
 @pytest.mark.parametrize("name", ["truss", "bricard held", "bob on truss"])
 def test_engines_agree_on_mechanisms_that_cannot_move(name, engine):
     s = load_scenario_text(TEXTS[name])
-    states = compared_states(s.model, s.state, s.seed, 3)
+    states = states_of(s, 3)
     truth, answer = state_truth(s.model, states), evaluate_states(engine, s.model, states, ["surface"])
     rows = judge_states(RowContext(name, "own", engine, engine, "1"), truth, answer).rows
     assert {row.verdict for row in rows if row.level == "surface"} <= {"agrees"}

@@ -14,10 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from plumbline.engines.adapter import check_state, check_times
 from plumbline.model.kinematics import joint_vectors, rotation_matrix
-from plumbline.model.sampling import compared_states
 from plumbline.scenario import loader as scenarios
 from plumbline.scenario.schema import Attitude, Document, Inertia, attitude_quaternion, inertia_matrix
-from tests.helpers.catalogue import catalogue_scenarios
+from tests.helpers.catalogue import catalogue_scenario, catalogue_scenarios, states_of
 
 EPS = np.finfo(float).eps
 
@@ -26,11 +25,9 @@ _TABLE = (Path(__file__).parent / "catalogue.txt").read_text(encoding="utf-8").s
 CATALOGUE = {name: tuple(about) for name, *about in (line.split(" | ") for line in _TABLE)}
 
 
-def load(name):
-    return catalogue_scenarios()[name]
-
-
-CHAINS = [name for name in CATALOGUE if load(name).path.parent.name in ("single", "double", "chain")]
+CHAINS = [
+    name for name in CATALOGUE if catalogue_scenario(name).path.parent.name in ("single", "double", "chain")
+]
 
 
 def assert_close(got, expected, ulps=4):
@@ -43,15 +40,15 @@ def counted(kinds):
 
 
 def test_the_catalogue_is_the_issues_list():
-    named = [name for name in scenarios.catalogue() if not name.startswith("crowded-")]
-    found = {name: (counted(load(name).model.kind), load(name).closed_form) for name in named}
+    named = {name: s for name, s in catalogue_scenarios().items() if not name.startswith("crowded-")}
+    found = {name: (counted(s.model.kind), s.closed_form) for name, s in named.items()}
     assert list(found) == list(CATALOGUE)
     assert {name: tuple(filter(None, about)) for name, about in found.items()} == CATALOGUE
 
 
 @pytest.mark.parametrize("name", CHAINS)
 def test_scenario_starts_exactly_on_the_manifold(name):
-    s = load(name)
+    s = catalogue_scenario(name)
     check_state(s.model, s.state)
     check_times(s.times, s.sample_interval / 4)
     gap = np.linalg.norm(joint_vectors(s.model, s.state.r, s.state.p), axis=1) - s.model.length
@@ -65,7 +62,7 @@ def test_scenario_starts_exactly_on_the_manifold(name):
 
 @pytest.mark.parametrize("name", CHAINS)
 def test_a_scenario_has_title_and_purpose(name):
-    s = load(name)
+    s = catalogue_scenario(name)
     assert (s.name, s.family, s.schema_version) == (name, s.path.parent.name, 1)
     assert s.path.name == f"{name}.yaml"
     assert s.purpose.endswith(".") and len(s.purpose) > 60
@@ -84,13 +81,13 @@ def test_generic_scenarios_have_nothing_special_in_them():
         "double-tumbling-rods",
         "chain-3-balls",
     ]:
-        m, s = load(name).model, load(name).state
+        m, s = catalogue_scenario(name).model, catalogue_scenario(name).state
         assert np.all(m.inertia != 0) and np.all(m.proximal != 0) and np.all(m.distal[:-1] != 0)
         assert np.all(s.omega != 0) and np.all(s.p != 0)
         assert np.all(s.udot[m.rods] != 0)
         assert len(np.unique(m.mass)) == m.n
     for name in ["chain-10-balls", "chain-30-balls", "chain-50-balls", "chain-10-rods", "chain-5-mixed"]:
-        s = load(name)
+        s = catalogue_scenario(name)
         assert np.linalg.matrix_rank(np.diff(s.state.r, axis=0)) == 3, "the chain lies in a plane"
         assert len(np.unique(s.state.p.round(9), axis=0)) == s.model.n
         assert np.all(s.model.inertia != 0) and np.all(s.model.proximal != 0)
@@ -100,7 +97,7 @@ def test_generic_scenarios_have_nothing_special_in_them():
     "name", ["planar-small", "planar-170", "planar-rotating", "double-planar-large", "double-planar-small"]
 )
 def test_planar_scenarios_move_in_one_plane(name):
-    s = load(name)
+    s = catalogue_scenario(name)
     normal = rotation_matrix(s.state.p)[:, :, 1]  # each body's y axis
     assert_close(normal, normal[:1] * np.ones_like(normal))
     assert abs(normal[0, 2]) < EPS and np.all(np.abs(normal[0, :2]) > 0.1)  # horizontal, no axis of the world
@@ -110,7 +107,7 @@ def test_planar_scenarios_move_in_one_plane(name):
 
 
 def test_planar_rotating_is_above_the_separatrix():
-    m, s = load("planar-rotating").model, load("planar-rotating").state
+    m, s = catalogue_scenario("planar-rotating").model, catalogue_scenario("planar-rotating").state
     inertia = m.inertia[0, 1, 1] + m.mass[0] * m.proximal[0] @ m.proximal[0]
     assert inertia * s.omega[0, 1] ** 2 / 2 > 2 * m.mass[0] * 9.81 * np.linalg.norm(m.proximal[0])
 
@@ -119,7 +116,7 @@ def test_free_top_flips_about_its_intermediate_axis_within_its_duration():
     """Euler's equations, one body at a time: the spin about y changes its sign before 2 s."""
     from scipy.integrate import solve_ivp
 
-    s = load("free-top")
+    s = catalogue_scenario("free-top")
     J = s.model.inertia[0]
     run = solve_ivp(
         lambda t, w: np.linalg.solve(J, -np.cross(w, J @ w)),
@@ -340,14 +337,14 @@ def test_the_digest_is_of_the_content():
 
 
 def test_a_seed_keeps_the_states_where_only_a_text_changes():
-    first = load("nesc-tumbling-brick")
+    first = catalogue_scenario("nesc-tumbling-brick")
     changed = first.document | {"purpose": "Another text."}
     other, kept = (
         scenarios.scenario_from_dict(document, "copy.yaml")
         for document in (changed, changed | {"seed": first.digest})
     )
     assert len({first.digest, other.digest, kept.digest}) == 3
-    states = [compared_states(s.model, s.state, s.seed, 2)[1].p for s in (first, other, kept)]
+    states = [states_of(s, 2)[1].p for s in (first, other, kept)]
     assert np.array_equal(states[0], states[2]) and not np.any(states[0] == states[1])
 
 

@@ -10,8 +10,9 @@ from plumbline.model.kinematics import joint_coordinates
 from plumbline.model.loops import loop_gaps, smallest_singular_value
 from plumbline.model.sampling import random_loop_states
 from plumbline.scenario.line_and_column_errors import ScenarioError
-from plumbline.scenario.loader import find_scenario_file, load_scenario, load_scenario_text
+from plumbline.scenario.loader import find_scenario_file, load_scenario_text
 from plumbline.truth.certified_state import certify_state
+from tests.helpers.catalogue import catalogue_scenario
 from tests.helpers.tables import table
 
 FOUR_BAR = find_scenario_file("four-bar").read_text(encoding="utf-8")
@@ -27,7 +28,7 @@ def problems(old, new):
 
 @pytest.mark.parametrize("name", ["four-bar", "slider-crank", "bricard", "squeezer", "flyball-governor"])
 def test_loops_are_closed_to_rounding(name):
-    s = load_scenario(find_scenario_file(name))
+    s = catalogue_scenario(name)
     gaps, rates = loop_gaps(s.model, s.state)
     assert np.max(gaps) < 1e-15 and np.max(rates) < 1e-14
     assert s.model.has_loops and not s.model.has_chain_joints and len(s.model.kind) > s.model.n
@@ -62,7 +63,7 @@ def test_rates_that_open_the_loop_are_refused():
 
 
 def test_the_squeezer_starts_as_published():
-    s = load_scenario(find_scenario_file("squeezer"))
+    s = catalogue_scenario("squeezer")
     truth = certify_state(s.model, s.state).quantities
     alpha = truth.angular_acceleration[:2, 2]
     np.testing.assert_allclose([alpha[0], alpha[1] - alpha[0]], PUBLISHED_SQUEEZER, rtol=1e-12)
@@ -71,7 +72,7 @@ def test_the_squeezer_starts_as_published():
 @pytest.mark.parametrize("name, windows", [("four-bars-2", 2), ("four-bars-6", 6)])
 def test_four_bars_move_as_the_parallelogram_does(name, windows):
     """θ̈ = g sin θ ((N+1)/2 + N)/((N+1) I + N), θ from the upright, I = 1/4 + J of a bar about its end."""
-    s = load_scenario(find_scenario_file(name))
+    s = catalogue_scenario(name)
     truth = certify_state(s.model, s.state).quantities
     np.testing.assert_allclose(truth.angular_acceleration, 0, atol=1e-12)  # upright: no torque
     np.testing.assert_allclose(truth.acceleration[0], [0, 0, -0.5], atol=1e-12)  # ω² ℓ/2 towards the world
@@ -85,9 +86,9 @@ def test_four_bars_move_as_the_parallelogram_does(name, windows):
 
 
 def test_flat_four_bars_are_singular():
-    s = load_scenario(find_scenario_file("four-bars-2-flat"))
+    s = catalogue_scenario("four-bars-2-flat")
     assert smallest_singular_value(s.model, s.state) < 1e-6
-    upright = load_scenario(find_scenario_file("four-bars-2"))
+    upright = catalogue_scenario("four-bars-2")
     assert smallest_singular_value(upright.model, upright.state) > 0.1
 
 
@@ -102,7 +103,7 @@ def test_dead_centres_of_a_slider_crank_are_regular():
 
 
 def test_engines_agree_on_what_dependent_rows_leave_determinate():
-    s = load_scenario(find_scenario_file("bricard"))
+    s = catalogue_scenario("bricard")
     answers = [load_adapter(name).evaluate(s.model, [s.state])[0] for name in ("reference", "exudyn")]
     for name in ("joint_reaction", "joint_moment"):
         one, other = (getattr(answer, name) for answer in answers)

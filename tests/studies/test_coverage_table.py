@@ -6,12 +6,12 @@ import pytest
 
 from plumbline.judging.rows import RowContext, Verdict
 from plumbline.studies import coverage_study
-from tests.helpers.catalogue import catalogue_scenarios
+from tests.helpers.catalogue import catalogue_scenario
 from tests.helpers.immediate_executor import Immediate
 
 
 def test_parameters_in_several_tasks_give_the_table_of_one(monkeypatch):
-    scenarios, rows = [catalogue_scenarios()[name] for name in ("planar-small", "tumbling-rod")], []
+    scenarios, rows = [catalogue_scenario(name) for name in ("planar-small", "tumbling-rod")], []
     for s in scenarios:
         context = RowContext(s.name, "", "mujoco", "MuJoCo", "0")
         figures = {"value": 1e-12, "tolerance": 1e-10, "compared_until": s.duration / 16}

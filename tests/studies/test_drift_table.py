@@ -18,6 +18,7 @@ from plumbline.studies.drift import VARIANTS, drift_errors
 from reference_impl.euler_parameters import angular_velocity
 from reference_impl.fast.collocation import integrate_collocation
 from reference_impl.joints import constraint_rows
+from tests.helpers.catalogue import catalogue_scenario
 from tests.helpers.commands import invoke
 from tests.helpers.random_chains import random_chain
 
@@ -51,7 +52,7 @@ def test_a_time_that_costs_too_much_is_left_out_with_a_reason():
 
 
 def test_a_run_that_fails_is_a_row_with_its_reason():
-    (s,) = scenarios.load_scenarios(["tumbling-ball"])
+    s = catalogue_scenario("tumbling-ball")
     massless = replace(s, model=replace(s.model, mass=np.zeros(1)))
     rows = drift.measure_drift([massless], 60, times=(1.0, 10.0), rtols=(1e-6,)).to_pylist()
     assert len(rows) == 2 * len(VARIANTS)
@@ -78,7 +79,7 @@ def start_of(rng, rods, **options):
 
 def table_of(model, state, **options):
     """The drift table of a chain that is no scenario of the catalogue."""
-    (s,) = scenarios.load_scenarios(["tumbling-ball"])
+    s = catalogue_scenario("tumbling-ball")
     return drift.measure_drift([replace(s, model=model, state=state)], 1e4, **options).to_pylist()
 
 

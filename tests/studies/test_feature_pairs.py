@@ -13,20 +13,14 @@ from plumbline.judging.state_level import judge_states
 from plumbline.model.datatypes import JOINT_ELEMENTS, KINDS
 from plumbline.model.features import ROLES, Feature, Place, features, joint_roles, without_feature
 from plumbline.model.kinematics import complete_state
-from plumbline.model.sampling import compared_states
 from plumbline.scenario.generator import random_mechanism
-from plumbline.scenario.loader import catalogue
 from plumbline.studies import feature_pairs
 from plumbline.truth.ground_truth import state_truth
-from tests.helpers.catalogue import catalogue_scenarios
+from tests.helpers.catalogue import catalogue_scenario, catalogue_scenarios, states_of
 from tests.helpers.immediate_executor import Immediate
 
 PARTS = [f"crowded-loops-{k}" for k in range(1, 7)]  # together they have all pairs
 GROUP = 14  # places: larger groups make fewer examples of the same pairs
-
-
-def load(name):
-    return catalogue_scenarios()[name]
 
 
 def test_every_kind_is_legal_in_every_role_but_a_free_body_that_closes_a_loop():
@@ -36,7 +30,9 @@ def test_every_kind_is_legal_in_every_role_but_a_free_body_that_closes_a_loop():
 
 def test_no_legal_pair_is_lost():
     legal = feature_pairs.legal_pairs(GROUP)
-    counts = Counter(pair for name in PARTS for pair in feature_pairs.all_pairs(features(load(name).model)))
+    counts = Counter(
+        pair for name in PARTS for pair in feature_pairs.all_pairs(features(catalogue_scenario(name).model))
+    )
     assert not [pair for pair in legal if not counts[pair]], "no scenario has these pairs"
     assert {counts[pair] for pair in legal} >= {1, 2}  # without any of the scenarios pairs were lost
     for one, other in (
@@ -62,15 +58,15 @@ def test_every_legal_pair_of_places_is_in_the_examples():
 
 
 def test_every_legal_pair_is_covered():
-    shown = feature_pairs.measure_features(Immediate(), [load(name) for name in PARTS])
+    shown = feature_pairs.measure_features(Immediate(), [catalogue_scenario(name) for name in PARTS])
     covered = set().union(*map(feature_pairs.all_pairs, shown.values()))
     assert feature_pairs.legal_pairs() <= covered
 
 
 def test_roles_of_joints():
-    model = load("flyball-governor").model
+    model = catalogue_scenario("flyball-governor").model
     assert joint_roles(model)[model.n :] == ["closing"] * (len(model.kind) - model.n)
-    tree = load("tree-of-seven-sprung").model
+    tree = catalogue_scenario("tree-of-seven-sprung").model
     assert dict(zip(tree.kind, joint_roles(tree), strict=True)) == {
         "ball": "beside",  # the drifter is on the world too
         "hinge": "beside", "universal": "single", "weld": "single", "cylindrical": "beside", "rod": "single",
@@ -79,7 +75,7 @@ def test_roles_of_joints():
 
 
 def test_features_are_what_is_not_neutral_and_can_be_left_out():
-    model = load("crowded-loops-6").model
+    model = catalogue_scenario("crowded-loops-6").model
     for one in features(model)[::5]:
         left = features(without_feature(model, one))
         assert one not in left or one.field == "parent", one
@@ -90,8 +86,8 @@ def test_features_are_what_is_not_neutral_and_can_be_left_out():
 
 def wrong_rows(engine, name, feature):
     """Rows of a real engine on a scenario that disagree if its adapter leaves the feature out."""
-    scenario = load(name)
-    states = compared_states(scenario.model, scenario.state, scenario.seed, feature_pairs.STATES)
+    scenario = catalogue_scenario(name)
+    states = states_of(scenario, feature_pairs.STATES)
     changed = without_feature(scenario.model, feature)
     answers = load_adapter(engine).evaluate(changed, [complete_state(changed, one) for one in states])
     context = RowContext(name, "", engine, engine, "0")
@@ -103,8 +99,8 @@ def wrong_rows(engine, name, feature):
 
 def confirmed(engine, name, count):
     """Features of a scenario drawn at random, and those of them that a wrong adapter shows as predicted."""
-    scenario = load(name)
-    states = compared_states(scenario.model, scenario.state, scenario.seed, feature_pairs.STATES)
+    scenario = catalogue_scenario(name)
+    states = states_of(scenario, feature_pairs.STATES)
     shown = feature_pairs.shown_features(scenario.model, states)
     # without a point or an axis a loop is open, and what an engine makes of that is its own
     some = [one for one in shown if not one.field.startswith(("point", "axes", "parent", "length"))]
@@ -154,7 +150,7 @@ def test_everything_of_a_joint_a_body_or_a_spring_stands_alone_once():
     of_spring = ("spring_stiffness", "spring_damping", "spring_length")
     needs = {"rest": {"stiffness"}, "spring_length": {"spring_stiffness"}}  # without effect beside it alone
     found, wanted = set(), set()
-    for model in (load(name).model for name in catalogue()):
+    for model in (s.model for s in catalogue_scenarios().values()):
         for k, kind in enumerate(model.kinds):
             where = "a closing joint" if k >= model.n else "a joint"
             for i in range(kind.element_count):

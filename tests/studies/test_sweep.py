@@ -17,10 +17,10 @@ from plumbline.judging.rows import RowContext
 from plumbline.judging.trajectory_level import judge_trajectory
 from plumbline.measurements.order_and_limit import refinement_resolutions
 from plumbline.processes.worker_pool import Limits, WorkerPool
-from plumbline.scenario import loader as scenarios
 from plumbline.scenario.line_and_column_errors import ScenarioError
 from plumbline.studies import sweep, sweep_file
 from plumbline.studies.parquet_files import write_table
+from tests.helpers.catalogue import catalogue_scenario
 from tests.helpers.mutations import limited_time
 from tests.helpers.planted_defects import MOTION_DEFECTS
 from tests.helpers.planting import Defect, motion_subject, planted
@@ -104,7 +104,7 @@ def test_values_that_make_no_pendulum_are_a_cell_with_a_reason(tmp_path):
 @cache
 def cell(loaded=False):
     """A slow tumble whose every mistake shows within two seconds."""
-    (s,) = scenarios.load_scenarios(["double-tumbling-balls"])
+    s = catalogue_scenario("double-tumbling-balls")
     model, state, truth = motion_subject("balls", loaded)
     return replace(s, model=model, state=state, duration=2.0, sample_interval=0.125), truth
 
@@ -154,7 +154,7 @@ def test_an_engine_too_coarse_to_resolve_a_mistake_is_unresolved(tmp_path):
 @pytest.mark.parametrize("interval", [0.03125, 0.05])
 def test_every_step_hits_every_sample(interval):
     """The steps of a run where the samples allow them; else shorter ones, or those of the file."""
-    s = replace(scenarios.load_scenarios(["tumbling-rod"])[0], sample_interval=interval)
+    s = replace(catalogue_scenario("tumbling-rod"), sample_interval=interval)
     method = load_adapter("mujoco").integrator("RK4")
     usual = refinement_resolutions(method, s.model.n, s.duration)
     steps = sweep._resolutions(method, s, None)

@@ -11,7 +11,6 @@ import pytest
 
 from plumbline.model.datatypes import EngineFailure
 from plumbline.model.kinematics import stretched_length
-from plumbline.scenario.loader import find_scenario_file, load_scenario
 from plumbline.truth import TruthUnavailable, certificate_proof, import_truth_tool
 from plumbline.truth.certificate_file import Certificate, parse_certificate
 from plumbline.truth.certificate_proof import (
@@ -26,7 +25,7 @@ from plumbline.truth.certificate_proof import (
 from plumbline.truth.certified_state import certify_state
 from plumbline.truth.taylor import simulate_taylor
 from plumbline.truth.trajectory_truth import judge_claim, trajectory_truth
-from tests.helpers.catalogue import catalogue_scenarios
+from tests.helpers.catalogue import catalogue_scenario, catalogue_scenarios
 from tests.helpers.nightly_tests import SLOW
 from tests.helpers.random_chains import random_chain
 from tests.helpers.stored_certificates import FOLDER as STORED
@@ -66,7 +65,7 @@ class Proofs(dict):
             model = replace(model, armature=np.array([[0.3, 0], [0.1, 0]]), damping=np.array([[0.2, 0]] * 2))
             model = replace(model, stiffness=np.array([[3.0, 0], [0.9, 0]]))
         else:
-            scenario = load_scenario(find_scenario_file(name))
+            scenario = catalogue_scenario(name)
             model, state = scenario.model, scenario.state
         raw, enclosure = prove_motion(model, state, TIMES)
         self[name] = model, state, json.loads(gzip.decompress(raw)), enclosure
@@ -118,12 +117,12 @@ def test_the_numbers_of_a_certificate_are_those_of_the_scenario(scenario):
 
 
 def test_loops_are_refused():
-    bricard = load_scenario(find_scenario_file("bricard"))
+    bricard = catalogue_scenario("bricard")
     with pytest.raises(TruthUnavailable, match="motions of closed loops are not proved"):
         prove_motion(bricard.model, bricard.state, TIMES)
     for name in ("sprung-ball", "sprung-hinge"):
-        assert not reason_not_provable(load_scenario(find_scenario_file(name)).model)
-    assert "closed loops" in reason_not_provable(load_scenario(find_scenario_file("bricard")).model)
+        assert not reason_not_provable(catalogue_scenario(name).model)
+    assert "closed loops" in reason_not_provable(catalogue_scenario("bricard").model)
 
 
 @pytest.mark.parametrize(
@@ -293,7 +292,7 @@ def test_a_motion_from_perturbed_initial_values_stays_inside(proofs, name):
 
 @pytest.mark.parametrize("name", ["double-tumbling-balls", "tumbling-rod", *TREES[:3], "loaded-tree"])
 def test_the_truth_of_runs_is_within_its_claimed_uncertainty(name):
-    check_present_truth(load_scenario(find_scenario_file(name)), 0.3)
+    check_present_truth(catalogue_scenario(name), 0.3)
 
 
 @pytest.mark.full
@@ -334,7 +333,7 @@ def test_enclosures_of_small_scenarios_in_two_precisions_overlap_at_every_sample
 @pytest.mark.parametrize("name", PUBLISHED["motions"])
 def test_published_solutions_are_proved_again_up_to_their_first_time(name):
     """docs/reference-solutions.json, in quad precision instead of octuple."""
-    record, scenario = PUBLISHED["motions"][name], load_scenario(find_scenario_file(name))
+    record, scenario = PUBLISHED["motions"][name], catalogue_scenario(name)
     numbers = checked_numbers(scenario.model, scenario.state)
     assert record["doubles"] == {
         key: np.frompyfunc(float.hex, 1, 1)(x).tolist() for key, x in numbers.items()
@@ -412,7 +411,7 @@ def test_a_certificate_names_its_scenario(proofs):
 
 def test_a_mechanism_of_more_springs_than_coordinates_is_enclosed():
     """A slide, which has one coordinate, between two springs."""
-    scenario = load_scenario(find_scenario_file("sprung-slide"))
+    scenario = catalogue_scenario("sprung-slide")
     points = np.array([[[0.0, 0.1, 1.0], [0.0, 0.0, 0.1]], [[0.1, 0.0, -1.0], [0.0, 0.0, -0.1]]])
     model = replace(
         scenario.model,
@@ -501,7 +500,7 @@ def test_the_unit_of_time_makes_rates_about_one():
 
 def test_a_motion_is_proved_with_shorter_steps_before_more_digits_are_taken():
     """Half a unit of time is too long for the linear part of a conical motion."""
-    scenario = load_scenario(find_scenario_file("conical"))
+    scenario = catalogue_scenario("conical")
     raw, enclosure = prove_motion(scenario.model, scenario.state, np.array([0.0, 0.5]))
     certificate = parse_certificate(raw)
     assert certificate.bits == 110 and enclosure.radius("r") < 1e-24
@@ -510,7 +509,7 @@ def test_a_motion_is_proved_with_shorter_steps_before_more_digits_are_taken():
 
 def test_a_motion_is_enclosed_while_its_steps_shrink():
     """A cart of a millionth of the mass of the bob on its pole, whose lowest point is at 0.4515 s."""
-    scenario = load_scenario(find_scenario_file("light-cart-pole"))
+    scenario = catalogue_scenario("light-cart-pole")
     _, enclosure = prove_motion(scenario.model, scenario.state, np.array([0.0, 0.451]))
     assert enclosure.radius("r") < 1e-24
 
@@ -518,7 +517,7 @@ def test_a_motion_is_enclosed_while_its_steps_shrink():
 @pytest.mark.full
 def test_a_motion_is_enclosed_through_two_nearly_singular_poses():
     """It turns there within microseconds; steps shrink by a million and grow again."""
-    scenario = load_scenario(find_scenario_file("light-cart-pole"))
+    scenario = catalogue_scenario("light-cart-pole")
     raw, enclosure = prove_motion(scenario.model, scenario.state, np.arange(33) / 16)
     lengths = [step[0] for step in parse_certificate(raw).steps]
     assert enclosure.radius("r") < 1e-40 and max(lengths) > 1e5 * min(lengths)

@@ -8,7 +8,7 @@ import pytest
 
 from plumbline.model.kinematics import complete_state
 from plumbline.model.loops import assembled
-from plumbline.scenario.loader import find_scenario_file, load_scenario
+from tests.helpers.catalogue import catalogue_scenario
 
 pytestmark = pytest.mark.skipif(
     not (find_spec("heyoka") and find_spec("flint")), reason="the truth tools are not installed"
@@ -20,10 +20,6 @@ def motions():
     from bench import classic_motions
 
     return classic_motions
-
-
-def scenario(name):
-    return load_scenario(find_scenario_file(name))
 
 
 def certified_rates(s, x, xdot):
@@ -48,7 +44,7 @@ def test_the_squeezer_accelerates_as_its_certified_equations_say(motions):
     slope = (after.rates["beta"] - before.rates["beta"]) / 2e-5
     order = ("beta", "Theta", "gamma", "delta", "Phi", "epsilon", "Omega")
     x, xdot = ([values[name] for name in order] for values in (at.angles, at.rates))
-    found = certified_rates(scenario("squeezer"), x, xdot)[0, 2]
+    found = certified_rates(catalogue_scenario("squeezer"), x, xdot)[0, 2]
     curvature = abs(after.rates["beta"] - 2 * at.rates["beta"] + before.rates["beta"]) / 1e-5
     assert slope == pytest.approx(found, abs=0.05 * curvature + 1e-6 * abs(found))
 
@@ -88,5 +84,5 @@ def test_four_bars_accelerate_as_their_certified_equations_say(motions, time):
     before, at, after = motions.four_bar_angle(2, 0.05, np.array([time - h, time, time + h]))
     tilt, rate = np.pi / 2 - at, -(after - before) / (2 * h)
     pattern = np.array([1, -1, 1, -1, 1])
-    found = certified_rates(scenario("four-bars-2"), tilt * pattern, rate * pattern)
+    found = certified_rates(catalogue_scenario("four-bars-2"), tilt * pattern, rate * pattern)
     assert -(after - 2 * at + before) / h**2 == pytest.approx(found[0, 1], rel=1e-5)

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 from plumbline.model.equivalent import rotate_body_frames, rotate_world
-from plumbline.model.sampling import compared_states
 from plumbline.scenario.generator import random_mechanism, random_scenario
 from plumbline.truth.certified_state import certify_state, enclose_quantities
 from plumbline.truth.definition import DefinitionViolated, definition_holds
-from tests.helpers.catalogue import catalogue_scenarios
+from tests.helpers.catalogue import catalogue_scenario, catalogue_scenarios, states_of
 from tests.helpers.nightly_tests import slow
 
 BITS, MISTAKE = 200, 1e-9  # relative to the size of the quantity's terms
@@ -25,7 +24,7 @@ CHECKED = (
 
 
 def solved(scenario, index=1):
-    state = compared_states(scenario.model, scenario.state, scenario.seed, 4)[index]
+    state = states_of(scenario, 4)[index]
     return scenario.model, state, enclose_quantities(scenario.model, state, BITS, mass_matrix=True)
 
 
@@ -36,13 +35,13 @@ def holds(model, state, balls):
 
 @pytest.mark.parametrize("name", PLANTED_IN)
 def test_a_right_solution_is_accepted(name):
-    assert holds(*solved(catalogue_scenarios()[name]))
+    assert holds(*solved(catalogue_scenario(name)))
 
 
 def turned(name, seed):
     """A loop whose geometry is rounded, since it is turned in the world and in the axes of its bodies."""
-    scenario, rng = catalogue_scenarios()[name], np.random.default_rng(seed)
-    model, state = scenario.model, compared_states(scenario.model, scenario.state, scenario.seed, 1)[1]
+    scenario, rng = catalogue_scenario(name), np.random.default_rng(seed)
+    model, state = scenario.model, states_of(scenario, 1)[1]
     for turn in (rotate_world, rotate_body_frames):
         q = rng.normal(size=4)
         model, state = turn(model, state, q / np.linalg.norm(q))
@@ -75,7 +74,7 @@ def test_a_mistake_in_a_solution_of_rounded_geometry_is_rejected(name):
 @pytest.mark.parametrize("field", ["x", "xdot"])
 def test_a_solution_of_another_pose_of_a_loop_is_rejected(name, field):
     """Coordinates of loops are proved where they close, which is near those of the state."""
-    model, state, balls = solved(catalogue_scenarios()[name])
+    model, state, balls = solved(catalogue_scenario(name))
     values, scale = getattr(state, field), balls["scale"]
     size = max(1.0, scale["r"], scale["v"], scale["angular_velocity"])
     for k in range(model.n):
@@ -89,7 +88,7 @@ def test_a_solution_of_another_pose_of_a_loop_is_rejected(name, field):
 @slow
 def test_every_right_solution_of_the_catalogue_is_accepted():
     for scenario in catalogue_scenarios().values():
-        for state in compared_states(scenario.model, scenario.state, scenario.seed, 5):
+        for state in states_of(scenario, 5):
             certify_state(scenario.model, state, mass_matrix=True)
 
 
@@ -98,7 +97,7 @@ def test_right_solutions_of_random_mechanisms_are_accepted(seed):
     for make in (random_mechanism, random_scenario):
         for index in range(6):
             scenario = make(seed, index)
-            for state in compared_states(scenario.model, scenario.state, scenario.seed, 2):
+            for state in states_of(scenario, 2):
                 certify_state(scenario.model, state, mass_matrix=True)
 
 
@@ -137,14 +136,14 @@ def accepted_mistakes(model, state, balls, size=MISTAKE):
 
 @pytest.mark.parametrize("name", PLANTED_IN)
 def test_a_mistake_in_any_number_of_a_solution_is_rejected(name):
-    model, state, balls = solved(catalogue_scenarios()[name])
+    model, state, balls = solved(catalogue_scenario(name))
     accepted, tried = accepted_mistakes(model, state, balls)
     assert not accepted
     assert tried > 20 * model.n
 
 
 def test_a_mass_matrix_of_another_mechanism_is_rejected():
-    model, state, balls = solved(catalogue_scenarios()["tree-of-seven-sprung"])
+    model, state, balls = solved(catalogue_scenario("tree-of-seven-sprung"))
     for k in range(model.n):
         heavier = replace(model, mass=model.mass * (1 + MISTAKE * (np.arange(model.n) == k)))
         other = enclose_quantities(heavier, state, BITS, mass_matrix=True)
@@ -193,7 +192,7 @@ def test_a_solution_of_another_mechanism_or_state_is_rejected(name, is_of_state,
 
     Where that changes the solution, the old one is rejected.
     """
-    model, state, balls = solved(catalogue_scenarios()[name])
+    model, state, balls = solved(catalogue_scenario(name))
     accepted, rejected = [], 0
     for field in fields:
         value = np.asarray(getattr(state if is_of_state else model, field), float)

@@ -20,7 +20,7 @@ from plumbline.truth.trajectory_truth import (
     simulate_notes_form,
     trajectory_truth,
 )
-from tests.helpers.catalogue import catalogue_scenarios
+from tests.helpers.catalogue import catalogue_scenario
 
 pytestmark = pytest.mark.skipif(
     not (find_spec("heyoka") and find_spec("flint")), reason="the truth tools are not installed"
@@ -50,7 +50,7 @@ def state_at(scenario, run, sample):
 
 
 def test_equal_four_bars_move_as_their_closed_form(motions):
-    s = catalogue_scenarios()["four-bars-2"]
+    s = catalogue_scenario("four-bars-2")
     times = s.times[s.times <= 0.5]
     truth = trajectory_truth(s.model, s.state, times)
     claimed = float(np.max(truth.uncertainty["position"]))
@@ -65,7 +65,7 @@ def test_equal_four_bars_move_as_their_closed_form(motions):
 
 
 def test_the_squeezer_moves_as_its_quadrature(motions):
-    s = catalogue_scenarios()["squeezer"]
+    s = catalogue_scenario("squeezer")
     exact = motions.squeezer_motion("0.01953125")
     times = np.array([0.0, 0.01953125])
     truth = trajectory_truth(s.model, s.state, times)
@@ -83,7 +83,7 @@ def test_the_squeezer_moves_as_its_quadrature(motions):
 
 @pytest.mark.parametrize("name", ["four-bar", "slider-crank", "bricard"])
 def test_the_catalogues_loops_stay_closed_and_keep_their_energy(name):
-    s = catalogue_scenarios()[name]
+    s = catalogue_scenario(name)
     truth = trajectory_truth(s.model, s.state, s.times[:9])
     assert "tree without its closing joints" in truth.method
     # The uncertainty is what two methods differ by, one of them with a tolerance of 1e-13: it is no smaller.
@@ -106,14 +106,14 @@ def test_both_methods_agree_on_random_loops():
 
 
 def test_a_motion_ends_before_its_singular_pose(motions):
-    s = catalogue_scenarios()["four-bars-2"]
+    s = catalogue_scenario("four-bars-2")
     found = regular_motion(s.model, s.state, s.times)
     angle = motions.four_bar_angle(2, 0.05, np.array([found.end]))[0]
     assert found.is_singular and 0 < angle < 0.05  # nearly flat
     truth = motion_truth(s.model, s.state, s.times, None)
     assert truth.trajectory.t[-1] <= found.end < truth.trajectory.t[-1] + s.sample_interval
     assert truth.singular.startswith("singular: from t = ") and not truth.conflict
-    regular = catalogue_scenarios()["four-bar"]
+    regular = catalogue_scenario("four-bar")
     times = regular.times[:5]
     run, _ = simulate_taylor(regular.model, regular.state, times)
     value = smallest_singular_value(regular.model, state_at(regular, run, 4))
@@ -123,7 +123,7 @@ def test_a_motion_ends_before_its_singular_pose(motions):
 
 def test_samples_of_a_run_show_whether_a_singular_pose_may_be_between_them():
     """The bars come to lie flat at 0.7144 s, between two samples whose singular values are above 0.01."""
-    s = catalogue_scenarios()["four-bars-2"]
+    s = catalogue_scenario("four-bars-2")
     times = s.times[:12]
     run = simulate_notes_form(s.model, s.state, times, 1e-9)
     assert times[-1] == 0.6875 and first_doubt(s.model, s.state, run) == 0.6875
@@ -132,7 +132,7 @@ def test_samples_of_a_run_show_whether_a_singular_pose_may_be_between_them():
 
 
 def test_neighbours_of_a_loop_and_models_with_other_numbers_are_closed():
-    s = catalogue_scenarios()["slider-crank"]
+    s = catalogue_scenario("slider-crank")
     pairs = [(s.model, state) for state in perturbed_states(s.model, s.state)]
     others = perturbed_models(s.model, s.state)
     for model, state in (
@@ -150,7 +150,7 @@ def test_neighbours_of_a_loop_and_models_with_other_numbers_are_closed():
 
 def test_a_loop_moved_on_its_manifold_is_the_same_motion():
     """Started at a later sample, the motion goes on as before."""
-    s = catalogue_scenarios()["slider-crank"]
+    s = catalogue_scenario("slider-crank")
     times = np.arange(9) / 16
     whole, _ = simulate_taylor(s.model, s.state, times)
     there = state_at(s, whole, 4)

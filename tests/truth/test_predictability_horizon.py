@@ -14,7 +14,6 @@ from plumbline.model.kinematics import (
     stretched_length,
     with_joint_coordinates,
 )
-from plumbline.scenario.loader import find_scenario_file, load_scenario
 from plumbline.truth.ground_truth import RUN_ROUNDING
 from plumbline.truth.predictability_horizon import (
     HORIZON_TOLERANCE,
@@ -30,7 +29,7 @@ from plumbline.truth.predictability_horizon import (
 )
 from plumbline.truth.trajectory_truth import simulate_notes_form
 from tests.helpers import pendulums
-from tests.helpers.catalogue import catalogue_scenarios
+from tests.helpers.catalogue import catalogue_scenario, catalogue_scenarios
 from tests.helpers.random_chains import random_chain
 
 EPS = 2.0**-53
@@ -238,7 +237,7 @@ def test_horizon_is_the_last_tolerable_time():
 @pytest.mark.full
 @pytest.mark.parametrize("name", [n for n, s in catalogue_scenarios().items() if s.model.has_chain_joints])
 def test_no_unstable_scenario_is_left_out(name):
-    scenario = load_scenario(find_scenario_file(name))
+    scenario = catalogue_scenario(name)
     found = perturbation_growth(scenario.model, scenario.state, np.arange(301) * 0.05)
     assert (np.max(found) > RENORMALISATION_GROWTH) == (name in UNSTABLE_SCENARIOS)
 
@@ -280,7 +279,7 @@ def count_divergences(name, precision, duration):
     """
     from plumbline.truth.taylor import simulate_taylor
 
-    scenario = load_scenario(find_scenario_file(name))
+    scenario = catalogue_scenario(name)
     times = np.arange(20 * duration + 1) * 0.05
     double, fine = (
         simulate_taylor(scenario.model, scenario.state, times, kind)[0] for kind in ("double", precision)

@@ -14,7 +14,7 @@ from plumbline.model.kinematics import complete_state
 from plumbline.model.sampling import compared_states, random_states
 from plumbline.model.welding import split_bodies
 from plumbline.scenario.generator import random_mechanism
-from plumbline.scenario.loader import find_scenario_file, load_scenario, scenario_from_dict
+from plumbline.scenario.loader import scenario_from_dict
 from plumbline.truth.certified_state import certify_state
 from plumbline.truth.rounding_bound import (
     EPS,
@@ -24,7 +24,7 @@ from plumbline.truth.rounding_bound import (
     rounding_bounds,
     state_rounding_bound,
 )
-from tests.helpers.catalogue import catalogue_scenarios
+from tests.helpers.catalogue import catalogue_scenario, states_of
 from tests.helpers.random_chains import in_other_units, norms_per_body, random_chain
 from tests.helpers.shared_answers import sharing
 
@@ -167,7 +167,7 @@ def test_positions_far_from_the_origin_lose_digits_of_arms_within_the_bound(case
 def test_a_real_loss_of_digits_exceeds_the_bound():
     """The articulated-body recursion on a chain of 50 balls is off by far more than roundings explain."""
     pytest.importorskip("pinocchio")
-    scenario = load_scenario(find_scenario_file("chain-50-balls"))
+    scenario = catalogue_scenario("chain-50-balls")
     (state,) = random_states(scenario.model, 1, seed=3)
     true, bound = certify_state(scenario.model, state).quantities, state_rounding_bound(scenario.model, state)
     recursion, matrix = (
@@ -180,7 +180,7 @@ def test_a_real_loss_of_digits_exceeds_the_bound():
 def test_scales_do_not_vanish_with_the_quantity():
     """In steady conical motion and at rest ω̇′ is zero, and a tolerance relative to it would mean nothing."""
     for name in ("double-conical", "planar-rotating", "rest", "chain-10-small"):
-        scenario = load_scenario(find_scenario_file(name))
+        scenario = catalogue_scenario(name)
         assert (
             state_rounding_bound(scenario.model, scenario.state).relative_bound("angular_acceleration")
             < MAX_RELATIVE_BOUND
@@ -275,8 +275,8 @@ def test_a_scale_of_zero_does_not_count_in_the_relative_bound():
 
 @pytest.mark.parametrize("name", ["chain-5-mixed", "tree-of-seven-sprung", "flyball-governor", "four-bars-2"])
 def test_bounds_of_many_states_are_those_of_each(name):
-    scenario = catalogue_scenarios()[name]
-    states = compared_states(scenario.model, scenario.state, scenario.seed, 3)
+    scenario = catalogue_scenario(name)
+    states = states_of(scenario, 3)
     for together, state in zip(rounding_bounds(scenario.model, states), states, strict=True):
         alone = state_rounding_bound(scenario.model, state)
         for quantity in alone.scale:
@@ -287,7 +287,7 @@ def test_bounds_of_many_states_are_those_of_each(name):
 @pytest.mark.parametrize("name", ["mujoco", "pinocchio", "exudyn", "exudyn-tree", "reference"])
 def test_a_small_body_on_a_rod_at_its_centre_of_mass_keeps_within_the_bound(name):
     """Spatial algebra holds ṙ × m ṙ, whose rounding turns a body of small inertia."""
-    model = catalogue_scenarios()["spherical"].model
+    model = catalogue_scenario("spherical").model
     model = model.changed(inertia=1e-4 * model.inertia)
     states = random_states(model, 5, seed=7)
     try:
@@ -302,7 +302,7 @@ def test_a_small_body_on_a_rod_at_its_centre_of_mass_keeps_within_the_bound(name
 def test_what_a_dense_solve_leaves_at_a_ball_beside_other_branches_is_within_the_bound():
     """Factors of M fill its zeros: the moment is off by 1e-13 N m, by a solution in 40 digits 1e-15 N m."""
     s = random_mechanism(32281128, 60)
-    state = compared_states(s.model, s.state, s.seed, STATES_PER_RANDOM_SCENARIO)[3]
+    state = states_of(s, STATES_PER_RANDOM_SCENARIO)[3]
     try:
         (answer,) = load_adapter("pinocchio").evaluate(s.model, [state])
     except ImportError as error:
@@ -313,7 +313,7 @@ def test_what_a_dense_solve_leaves_at_a_ball_beside_other_branches_is_within_the
 
 def test_welded_parts_widen_the_bounds_of_every_mechanism():
     for name in ("chain-3-rods", "tree-of-seven-sprung"):
-        scenario = catalogue_scenarios()[name]
+        scenario = catalogue_scenario(name)
         plain, welded = (
             state_rounding_bound(scenario.model, scenario.state, parts)
             for parts in (None, split_bodies(scenario.model))

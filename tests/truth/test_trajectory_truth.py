@@ -10,7 +10,6 @@ import pytest
 from plumbline.model.datatypes import EngineFailure
 from plumbline.model.invariants import attitude_error, motion_errors, motion_scales, position_error
 from plumbline.processes.worker_pool import Limits, Task, WorkerPool
-from plumbline.scenario.loader import find_scenario_file, load_scenario
 from plumbline.truth import ground_truth
 from plumbline.truth import trajectory_truth as trajectory
 from plumbline.truth.certified_state import certify_state
@@ -22,7 +21,7 @@ from plumbline.truth.trajectory_truth import (
     simulate_notes_form,
     trajectory_truth,
 )
-from tests.helpers.catalogue import catalogue_scenarios
+from tests.helpers.catalogue import catalogue_scenario, catalogue_scenarios
 from tests.helpers.nightly_tests import fast_are
 from tests.helpers.random_chains import random_chain
 
@@ -158,7 +157,7 @@ def test_accelerations_along_a_run_agree_with_the_certified_ones():
     ],
 )
 def test_a_parameter_error_of_1e_11_in_one_method_is_detected(monkeypatch, side, field, factor):
-    scenario = load_scenario(find_scenario_file("double-tumbling-balls"))
+    scenario = catalogue_scenario("double-tumbling-balls")
     usual = ground_truth.motion_truth(scenario.model, scenario.state, TIMES, None)
     right = getattr(trajectory, side)
 
@@ -173,7 +172,7 @@ def test_a_parameter_error_of_1e_11_in_one_method_is_detected(monkeypatch, side,
 
 
 def test_an_error_in_a_closed_form_is_detected():
-    scenario = load_scenario(find_scenario_file("lagrange-top"))
+    scenario = catalogue_scenario("lagrange-top")
     r, p = closed_form_motion(scenario)(TIMES)
     truth = ground_truth.motion_truth(
         scenario.model, scenario.state, TIMES, (r * (1 + 1e-9), p, "a misprint")
@@ -185,7 +184,7 @@ def test_an_error_in_a_closed_form_is_detected():
 
 
 def check_fall_back(reason, **arguments):
-    scenario = load_scenario(find_scenario_file("double-tumbling-balls"))
+    scenario = catalogue_scenario("double-tumbling-balls")
     truth = ground_truth.motion_truth(scenario.model, scenario.state, TIMES[:11], None, **arguments)
     assert truth.method == (
         "the notes' form by collocation; uncertainty: its difference from the same by DOP853, "
@@ -211,7 +210,7 @@ def test_without_heyoka_dop853_is_the_second_method(monkeypatch):
 
 
 def test_the_closed_form_is_compared_without_heyoka_too():
-    scenario = load_scenario(find_scenario_file("lagrange-top"))
+    scenario = catalogue_scenario("lagrange-top")
     r, p = closed_form_motion(scenario)(TIMES)
     truth = trajectory_truth(scenario.model, scenario.state, TIMES, (r, p, "a book"), max_compiled_bodies=0)
     assert truth.method.startswith(
@@ -231,7 +230,7 @@ def test_the_truth_survives_a_failure_of_heyoka(monkeypatch):
 
 def test_the_truth_of_ten_bodies_fits_into_a_worker():
     """Ten bodies compile and run within a quarter of a worker's address space."""
-    scenario = load_scenario(find_scenario_file("chain-10-rods"))
+    scenario = catalogue_scenario("chain-10-rods")
     arguments = (scenario.model, scenario.state, TIMES)
     with WorkerPool(1, Limits(gigabytes=2.0)) as workers:
         (outcome,) = workers.run([Task("truth", trajectory_truth, arguments)])

@@ -11,7 +11,6 @@ from plumbline.model.invariants import attitude_error, position_error
 from plumbline.model.kinematics import ball_spring_rest, complete_state, quaternion_rate
 from plumbline.model.random_mechanisms import ELEMENTS, random_tree
 from plumbline.model.sampling import random_states
-from plumbline.scenario.loader import find_scenario_file, load_scenario
 from plumbline.truth import ground_truth
 from plumbline.truth import trajectory_truth as trajectory
 from plumbline.truth.ground_truth import perturbed_models
@@ -19,6 +18,7 @@ from plumbline.truth.predictability_horizon import perturbation_growth, perturbe
 from plumbline.truth.taylor import simulate_taylor
 from plumbline.truth.trajectory_truth import NOTES_RTOL, simulate_notes_form, trajectory_truth
 from reference_impl.joints import constraint_rows
+from tests.helpers.catalogue import catalogue_scenario
 from tests.helpers.nightly_tests import SLOW
 
 TIMES = np.arange(9) * 0.125
@@ -115,7 +115,7 @@ def test_precisions_agree():
 @pytest.mark.parametrize("side", ["simulate_taylor", "simulate_notes_form"])
 @pytest.mark.parametrize("field", ["mass", "point"])
 def test_a_parameter_error_of_1e_10_in_one_method_is_detected(monkeypatch, side, field):
-    case = load_scenario(find_scenario_file("cart-pole"))
+    case = catalogue_scenario("cart-pole")
     assert not ground_truth.motion_truth(case.model, case.state, TIMES, None).conflict
     right = getattr(trajectory, side)
 
@@ -149,7 +149,7 @@ def test_perturbed_states_are_on_the_manifold_and_near():
 
 
 def test_growth_of_perturbations_is_that_of_two_runs():
-    case = load_scenario(find_scenario_file("double-hinge-skew"))
+    case = catalogue_scenario("double-hinge-skew")
     times = np.arange(5) * 0.5
     growth = perturbation_growth(case.model, case.state, times)
     near = perturbed_states(case.model, case.state, 1e-9, 1)[0]
@@ -162,7 +162,7 @@ def test_growth_of_perturbations_is_that_of_two_runs():
 
 
 def test_perturbed_models_change_points_of_joints():
-    case = load_scenario(find_scenario_file("tree-of-seven"))
+    case = catalogue_scenario("tree-of-seven")
     *_, moved = perturbed_models(case.model, case.state)
     ratio = moved[0].point[case.model.point != 0] / case.model.point[case.model.point != 0]
     np.testing.assert_allclose(np.abs(ratio - 1), 1e-4, rtol=1e-8)
