@@ -30,8 +30,7 @@ CONTEXT = RowContext("scenario", "family", "engine", "Engine", "1.0")
 
 
 def test_help_has_examples_and_exit_codes():
-    result = run_plumbline("--help")
-    assert result.returncode == 0
+    result = run_plumbline("--help", code=0)
     for words in (
         "Exit codes",
         "0  everything agrees",
@@ -232,9 +231,8 @@ def test_list_scenarios_and_engines_as_text_and_json():
 
 def test_a_run_writes_everything_and_exits_by_its_verdict(tmp_path):
     result = run_plumbline(
-        "run", "rest", "--engine", "mujoco", "--engine", "reference", "--out", tmp_path / "o o"
+        "run", "rest", "--engine", "mujoco", "--engine", "reference", "--out", tmp_path / "o o", code=0
     )
-    assert result.returncode == 0, result.stdout + result.stderr
     assert "agree" in result.stdout
     assert "report.html" in result.stdout
     files = {p.name for p in (tmp_path / "o o").iterdir()}
@@ -251,8 +249,7 @@ def test_a_run_writes_everything_and_exits_by_its_verdict(tmp_path):
         assert f"{count} independent checks" in (tmp_path / "o o" / name).read_text(), name
     assert (tmp_path / "o o" / "junit.xml").read_text().count("<testcase ") == len(checks)
     (tmp_path / "o o" / "report.html").unlink()
-    again = invoke("report", tmp_path / "o o")
-    assert again.exit_code == 0, again.output
+    invoke("report", tmp_path / "o o", code=0)
     assert (tmp_path / "o o" / "report.html").exists()
 
 
@@ -270,9 +267,8 @@ def test_a_name_stays_text_on_the_terminal_in_html_and_in_junit(tmp_path):
     rest = (ROOT / "scenarios" / "single" / "rest.yaml").read_text()
     mine.write_text(rest.replace("schema_version: 1", f"schema_version: 1\nname: {json.dumps(name)}"))
     result = invoke(
-        "run", mine, "--engine", "mujoco", "--level", "state", "--matrix", "--out", tmp_path / "out"
+        "run", mine, "--engine", "mujoco", "--level", "state", "--matrix", "--out", tmp_path / "out", code=0
     )
-    assert result.exit_code == 0, result.output
     assert name[:30] in result.stdout
     assert "<img" not in (tmp_path / "out" / "report.html").read_text()
     cases = ElementTree.parse(tmp_path / "out" / "junit.xml").iter("testcase")
@@ -284,8 +280,7 @@ def test_a_name_stays_text_on_the_terminal_in_html_and_in_junit(tmp_path):
     table(__file__),
 )
 def test_bad_usage_ends_with_2_and_a_suggestion(words, expected):
-    result = invoke(*words)
-    assert result.exit_code == 2, result.output
+    result = invoke(*words, code=2)
     assert expected in " ".join(result.stderr.split())
 
 
@@ -317,8 +312,7 @@ def test_a_closed_form_that_does_not_fit_is_reported_with_line_and_column(tmp_pa
     for name, scenario in (("a", "tumbling-ball"), ("b", "tumbling-rod")):
         text = (ROOT / "scenarios" / "single" / f"{scenario}.yaml").read_text()
         (tmp_path / f"{name}.yaml").write_text(f"exact: free-top\n{text}")
-    result = invoke("check", tmp_path / "a.yaml", tmp_path / "b.yaml")
-    assert result.exit_code == 2
+    result = invoke("check", tmp_path / "a.yaml", tmp_path / "b.yaml", code=2)
     lines = result.stderr.splitlines()
     for name, line in zip("ab", lines, strict=True):
         assert line.startswith(f"{tmp_path / name}.yaml:1:8: exact: this closed form needs ")
@@ -327,8 +321,7 @@ def test_a_closed_form_that_does_not_fit_is_reported_with_line_and_column(tmp_pa
 
 def test_an_output_folder_that_cannot_be_written_is_an_error_before_any_work(tmp_path):
     (tmp_path / "file").write_text("x")
-    result = invoke("run", "rest", "--out", tmp_path / "file" / "out")
-    assert result.exit_code == 2
+    result = invoke("run", "rest", "--out", tmp_path / "file" / "out", code=2)
     assert "cannot write to" in result.stderr
 
 

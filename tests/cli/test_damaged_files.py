@@ -162,7 +162,7 @@ def check_user_files(tmp_path, make, words, count, seed):
         about = f"example {number} of seed {seed}, {name}"
         try:
             with limited_time(READING_SECONDS):
-                result = invoke(*words, str(path))
+                result = invoke(*words, path)
         except Accepted:
             outcomes["accepted"] += 1
             continue

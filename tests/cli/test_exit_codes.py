@@ -22,6 +22,7 @@ from tests.helpers import wrong_truths
 from tests.helpers.commands import ROOT, invoke, run_plumbline, run_python, user_environment
 
 ON_ONE = ("--jobs", "1", "--out")
+AT_STATES = ("--level", "state", *ON_ONE)
 
 
 def with_module(folder, name, text):
@@ -52,17 +53,15 @@ def test_the_pages_have_the_same_table(page):
 
 
 def test_an_engine_without_the_level_compares_nothing(tmp_path):
-    result = invoke("run", "rest", "--engine", "pinocchio-aba", "--level", "trajectory", *ON_ONE, tmp_path)
-    assert result.exit_code == ExitCode.DISAGREEMENT, result.output
+    chosen = ["run", "rest", "--engine", "pinocchio-aba", "--level", "trajectory"]
+    result = invoke(*chosen, *ON_ONE, tmp_path, code=ExitCode.DISAGREEMENT)
     assert "nothing was compared" in result.stdout
     assert "Every cell agrees" not in (tmp_path / "report.html").read_text()
 
 
 def test_recorded_gaps_alone_are_no_comparison(tmp_path):
-    result = invoke(
-        "run", "chain-3-balls", "--engine", "reference-printed", "--level", "state", *ON_ONE, tmp_path
-    )
-    assert result.exit_code == ExitCode.DISAGREEMENT, result.output
+    chosen = ["run", "chain-3-balls", "--engine", "reference-printed"]
+    result = invoke(*chosen, *AT_STATES, tmp_path, code=ExitCode.DISAGREEMENT)
     assert "0 independent checks: 1 unsupported as declared, nothing was compared" in result.stdout
 
 
@@ -80,9 +79,8 @@ def test_recorded_gaps_alone_are_no_comparison(tmp_path):
 )
 def test_an_engine_that_fails_at_import_has_failed(tmp_path, text, words):
     place = with_module(tmp_path, "mujoco", text)
-    names = ["--engine", "mujoco", "--engine", "reference", "--level", "state", "--timeout", "5"]
-    result = run_plumbline("run", "rest", *names, *ON_ONE, tmp_path / "out", **place)
-    assert result.returncode == ExitCode.ENGINE_FAILED, result.stdout + result.stderr
+    chosen = ["run", "rest", "--engine", "mujoco", "--engine", "reference", "--timeout", "5", *AT_STATES]
+    result = run_plumbline(*chosen, tmp_path / "out", **place, code=ExitCode.ENGINE_FAILED)
     shown = " ".join(result.stdout.split())
     assert words in shown and "1 failed" in shown and "7 agree" in shown
     page = (tmp_path / "out" / "report.html").read_text()
@@ -95,21 +93,18 @@ MISSING = "raise ModuleNotFoundError(\"No module named 'exudyn'\", name='exudyn'
 
 def test_a_missing_engine_is_a_failure_only_where_it_was_named(tmp_path):
     place = with_module(tmp_path, "exudyn", MISSING)
-    named = run_plumbline(
-        "run", "rest", "--engine", "exudyn", "--level", "state", *ON_ONE, tmp_path / "a", **place
-    )
-    assert named.returncode == ExitCode.ENGINE_FAILED, named.stdout + named.stderr
+    chosen = ["run", "rest", "--engine", "exudyn", *AT_STATES, tmp_path / "a"]
+    named = run_plumbline(*chosen, **place, code=ExitCode.ENGINE_FAILED)
     assert "it was named explicitly" in " ".join(named.stdout.split())
-    usual = run_plumbline("run", "rest", "--level", "state", *ON_ONE, tmp_path / "b", **place)
-    assert usual.returncode == ExitCode.SUCCESS, usual.stdout + usual.stderr
+    usual = run_plumbline("run", "rest", *AT_STATES, tmp_path / "b", **place, code=ExitCode.SUCCESS)
     assert "2 not installed" in usual.stdout
 
 
 def test_a_version_whose_environment_cannot_be_made_has_failed(tmp_path, monkeypatch):
     for name in ("PATH", "XDG_CACHE_HOME"):
         monkeypatch.setenv(name, str(tmp_path))
-    result = invoke("run", "rest", "--engine", "mujoco@0.0.1", "--level", "state", *ON_ONE, tmp_path / "out")
-    assert result.exit_code == ExitCode.ENGINE_FAILED, result.output
+    chosen = ["run", "rest", "--engine", "mujoco@0.0.1", *AT_STATES, tmp_path / "out"]
+    result = invoke(*chosen, code=ExitCode.ENGINE_FAILED)
     assert "1 failed" in result.stdout
     beside = (ROOT, Path(sys.prefix).resolve().parent)
     if not any((folder / ".uv").exists() for folder in beside):  # else uv knows no such version
@@ -136,8 +131,8 @@ def test_a_sweep_needs_the_engines_that_its_file_names(verdicts, code):
 
 def test_a_truth_with_a_wrong_gravity_fails_the_harness(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(worker_process, "initialize_worker", wrong_truths.prepare)
-    result = invoke("run", "tumbling-ball", "--engine", "mujoco", *ON_ONE, tmp_path)
-    assert result.exit_code == ExitCode.HARNESS_FAILED, result.output
+    chosen = ["run", "tumbling-ball", "--engine", "mujoco", *ON_ONE, tmp_path]
+    result = invoke(*chosen, code=ExitCode.HARNESS_FAILED)
     first = " ".join(result.stdout.split())
     assert first.startswith(f"☒ the harness failed: tumbling-ball: {TRUTHS_DIFFER}")
     document = json.loads((tmp_path / "results.json").read_text())
@@ -150,9 +145,8 @@ def test_a_truth_with_a_wrong_gravity_fails_the_harness(monkeypatch, tmp_path, c
 
 def test_a_certified_state_that_contradicts_the_definition_fails_the_harness(monkeypatch, tmp_path):
     monkeypatch.setattr(worker_process, "initialize_worker", wrong_truths.prepare_states)
-    chosen = ["run", "double-loaded-rods", "--engine", "pinocchio", "--level", "state"]
-    result = invoke(*chosen, *ON_ONE, tmp_path)
-    assert result.exit_code == ExitCode.HARNESS_FAILED, result.output
+    chosen = ["run", "double-loaded-rods", "--engine", "pinocchio", *AT_STATES]
+    result = invoke(*chosen, tmp_path, code=ExitCode.HARNESS_FAILED)
     assert "contradicts the definition of the mechanism" in " ".join(result.stdout.split())
     document = json.loads((tmp_path / "results.json").read_text())
     assert {row["verdict"] for row in document["rows"]} == {"harness failed"}
@@ -164,8 +158,7 @@ def test_engines_that_agree_against_an_accepted_truth_put_the_harness_in_doubt(
 ):
     monkeypatch.setattr(worker_process, "initialize_worker", wrong_truths.prepare_accepted)
     chosen = ["run", "tumbling-ball", "--engine", "mujoco", "--engine", "reference", "--level", level]
-    result = invoke(*chosen, *ON_ONE, tmp_path)
-    assert result.exit_code == ExitCode.HARNESS_FAILED, result.output
+    result = invoke(*chosen, *ON_ONE, tmp_path, code=ExitCode.HARNESS_FAILED)
     shown = " ".join(result.stdout.split())
     assert shown.startswith(
         f"☒ the harness failed: tumbling-ball, {level}: all engines that were compared (reference and "
@@ -287,8 +280,7 @@ def test_a_bad_file_of_known_issues_is_bad_usage(tmp_path, command, text, words)
     path = tmp_path / "known.yaml"
     if text is not None:
         path.write_text(text)
-    result = invoke(command, "rest", "--known", path, "--out", tmp_path / "out")
-    assert result.exit_code == ExitCode.BAD_USAGE, result.output
+    result = invoke(command, "rest", "--known", path, "--out", tmp_path / "out", code=ExitCode.BAD_USAGE)
     assert f"{path}" in result.stderr and words in result.stderr, result.stderr
     assert not (tmp_path / "out").exists()
 

@@ -32,8 +32,7 @@ MJCF = """<mujoco model="m"><option gravity="0 0 -1.62"/>
 def test_importers_that_agree_exit_with_0_and_a_table(tmp_path):
     path = tmp_path / "arm.urdf"
     path.write_text(ROBOT)
-    result = run(path, "--engine", "mujoco", "--engine", "pinocchio", "--states", 3)
-    assert result.exit_code == 0, result.output
+    result = run(path, "--engine", "mujoco", "--engine", "pinocchio", "--states", 3, code=0)
     assert "3 bodies, 1 degree of freedom" in result.stdout
     assert "✗" not in result.stdout
     assert "not compared: 1 × limit" in result.stdout
@@ -103,9 +102,8 @@ def test_a_bad_file_exits_with_2_and_does_not_stop_the_others(tmp_path):
     (tmp_path / "bad.urdf").write_text(ROBOT.replace('mass value="2.5"', 'mass value="-2.5"'))
     result = run(
         tmp_path / "bad.urdf", tmp_path / "good.urdf", tmp_path / "none.urdf", "--engine", "mujoco",
-        "--states", 2,
+        "--states", 2, code=2,
     )  # fmt: skip
-    assert result.exit_code == 2
     assert "bad.urdf:5:77: <mass> value: is -2.5 kg" in result.stderr
     assert "none.urdf: cannot be read: No such file or directory" in result.stderr
     assert "good.urdf: 3 bodies" in result.stdout.replace("[bold]", "")
@@ -114,8 +112,7 @@ def test_a_bad_file_exits_with_2_and_does_not_stop_the_others(tmp_path):
 def test_mujocos_refusal_of_an_mjcf_is_a_bad_file_with_its_line(tmp_path):
     path = tmp_path / "m.xml"
     path.write_text(MJCF.replace('axis="0 1 0"', 'axis="0 1"'))
-    result = run(path, "--engine", "mujoco")
-    assert result.exit_code == 2
+    result = run(path, "--engine", "mujoco", code=2)
     assert f"{path}:2:18: MuJoCo, which defines MJCF, refuses it" in result.stderr
 
 
@@ -133,8 +130,7 @@ def test_mujocos_refusal_of_an_mjcf_is_a_bad_file_with_its_line(tmp_path):
 def test_bad_options_exit_with_2(tmp_path, arguments, message):
     path = tmp_path / "arm.urdf"
     path.write_text(ROBOT)
-    result = run(path, *arguments)
-    assert result.exit_code == 2
+    result = run(path, *arguments, code=2)
     assert message in " ".join(result.stderr.replace("│", "").split())
 
 
@@ -197,9 +193,8 @@ def test_one_state_can_be_given(tmp_path):
     path = tmp_path / "arm.urdf"
     path.write_text(ROBOT)
     result = invoke(
-        "model", "--jobs", 1, path, "--engine", "mujoco", "--at", "j1=0.3", "--base", "free", "--json"
+        "model", "--jobs", 1, path, "--engine", "mujoco", "--at", "j1=0.3", "--base", "free", "--json", code=0
     )
-    assert result.exit_code == 0, result.output
     (file,) = json.loads(result.stdout)["files"]
     assert file["degrees_of_freedom"] == 7
     assert {row["verdict"] for row in file["rows"]} <= {"agrees", "information"}
@@ -208,8 +203,7 @@ def test_one_state_can_be_given(tmp_path):
 def test_a_scenario_file_is_sent_to_run(tmp_path):
     path = tmp_path / "arm.yaml"
     path.write_text("schema_version: 1\n")
-    result = run(path)
-    assert result.exit_code == 2
+    result = run(path, code=2)
     assert (
         f"{path}:1:1: is not well-formed XML: syntax error; scenario files are for: plumbline run {path}"
         in (result.stderr)

@@ -36,8 +36,7 @@ def test_a_folder_that_another_command_writes_to_is_refused(results, tmp_path, c
     }[command]
     before = {path: path.stat().st_mtime_ns for path in results.rglob("*")}
     with FileLock(results / LOCK_FILE):
-        result = invoke(command, *words)
-        assert result.exit_code == ExitCode.BAD_USAGE, result.output
+        result = invoke(command, *words, code=ExitCode.BAD_USAGE)
         assert "another command writes to" in " ".join(result.stderr.split())
     assert before.items() == {path: path.stat().st_mtime_ns for path in results.rglob("*")}.items()
 
@@ -58,10 +57,8 @@ def test_a_command_holds_the_lock_while_it_runs_and_leaves_none(tmp_path):
 @pytest.mark.parametrize("command", ["report", "reproduce"])
 def test_results_are_named_by_their_folder_or_their_file(results, command):
     for name in (results, results / "results.json"):
-        result = invoke(command, name)
-        assert result.exit_code == 0, result.output
-    other = invoke(command, results / "summary.parquet")
-    assert other.exit_code == ExitCode.BAD_USAGE
+        invoke(command, name, code=0)
+    other = invoke(command, results / "summary.parquet", code=ExitCode.BAD_USAGE)
     assert "is neither a results folder nor its results.json" in " ".join(other.stderr.split())
 
 
@@ -90,8 +87,7 @@ def test_a_damaged_file_leaves_the_report_as_it_was(results, name, damage, words
                 scenario["model"][name] *= 2
             scenario.pop("state", None)
         (results / "results.json").write_text(json.dumps(document))
-    result = invoke("report", results)
-    assert result.exit_code == ExitCode.BAD_USAGE, result.output
+    result = invoke("report", results, code=ExitCode.BAD_USAGE)
     assert words in result.stderr
     assert all(page.read_text() == "as it was" for page in pages)
 
@@ -108,8 +104,7 @@ def test_a_folder_or_a_pipe_in_the_place_of_a_file_is_a_bad_file(results, make):
         path.unlink(missing_ok=True)
         getattr(os, make)(path)
         for command in commands:
-            result = invoke(command, results)
-            assert result.exit_code == ExitCode.BAD_USAGE, result.output
+            result = invoke(command, results, code=ExitCode.BAD_USAGE)
             message = " ".join(result.stderr.split())
             assert path.name in message and "not a regular file" in message
         path.rmdir() if make == "mkdir" else path.unlink()
@@ -123,8 +118,7 @@ def test_the_command_that_repeats_a_cell_names_the_file_as_given(tmp_path, monke
     shutil.copy(ROOT / "scenarios" / "single" / "rest.yaml", mine)
     for given, stored in (("rest.yaml", "./rest.yaml"), (str(mine), str(mine)), ("rest", "rest.yaml")):
         words = ["run", given, "--engine", "mujoco", "--level", "state", "--jobs", "1", "--out", "out"]
-        done = run_plumbline(*words, cwd=tmp_path)
-        assert done.returncode == 0, done.stdout + done.stderr
+        run_plumbline(*words, cwd=tmp_path, code=0)
         document = json.loads((tmp_path / "out" / "results.json").read_text())
         assert document["scenarios"]["rest"]["file"] == stored
 
@@ -132,10 +126,8 @@ def test_the_command_that_repeats_a_cell_names_the_file_as_given(tmp_path, monke
 def test_an_engine_that_crashes_at_import_ends_no_sweep(tmp_path):
     (tmp_path / "sweep.yaml").write_text(SWEEP + "engines: {mujoco: RK4}\n")
     (tmp_path / "mujoco.py").write_text("import os\nos.abort()\n")
-    done = run_plumbline(
-        "sweep", "sweep.yaml", "--jobs", "1", "--out", "out", cwd=tmp_path, path=(tmp_path, ROOT)
-    )
-    assert done.returncode == ExitCode.ENGINE_FAILED, done.stdout + done.stderr
+    words = ["sweep", "sweep.yaml", "--jobs", "1", "--out", "out"]
+    done = run_plumbline(*words, cwd=tmp_path, path=(tmp_path, ROOT), code=ExitCode.ENGINE_FAILED)
     assert "mujoco failed 2; reference agrees 2" in done.stdout
     assert "crashed: the worker died of SIGABRT" in done.stdout
     assert "of 1 tasks done" in done.stderr

@@ -42,8 +42,8 @@ def test_a_program_is_a_column_and_its_answers_are_kept_until_it_changes(tmp_pat
     lifted = {row["quantity"] for row in results["rows"] if row["extra"].get("lifted")}
     assert lifted == {"acceleration", "angular_acceleration"}
     server.write_text(server.read_text().replace("omega, J @ omega", "omega, 1.001 * J @ omega"))
-    third = invoke(*words)
-    assert third.exit_code == 1 and "disagree" in third.stdout, third.output
+    third = invoke(*words, code=1)
+    assert "disagree" in third.stdout, third.output
 
 
 @pytest.mark.usefixtures("nothing_remembered")
@@ -58,8 +58,8 @@ def test_what_the_folder_names_is_started_only_with_consent_to_its_contents(tmp_
     for command in (words, (*RUN, "--engine", "reference", "--out", tmp_path / "out")):
         refused = invoke(*command)
         assert not marks.exists()
-    refused = invoke(*words)
-    assert refused.exit_code == 2 and "--trust allows it" in refused.stderr and not marks.exists()
+    refused = invoke(*words, code=2)
+    assert "--trust allows it" in refused.stderr and not marks.exists()
     assert invoke(*words, "--trust").exit_code == 3 and marks.exists()
     USER_ENGINES.clear()
     marks.unlink()
@@ -84,8 +84,8 @@ def test_what_the_folder_names_is_started_only_with_consent_to_its_contents(tmp_
     ],
 )
 def test_a_specification_with_a_mistake_is_bad_usage(text, reason):
-    done = invoke(*RUN, "--adapter", text)
-    assert done.exit_code == 2 and reason in " ".join(done.stderr.split())
+    done = invoke(*RUN, "--adapter", text, code=2)
+    assert reason in " ".join(done.stderr.split())
 
 
 def test_words_of_a_command_reach_the_program_as_they_are(tmp_path):
@@ -100,8 +100,8 @@ def test_a_bad_project_file_is_bad_usage(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for text in ("[engines", "[engines]\nx = 1\n", "engines = 3\n"):
         Path("plumbline.toml").write_text(text)
-        done = invoke(*RUN, "--engine", "mine")
-        assert done.exit_code == 2 and "plumbline.toml" in done.stderr
+        done = invoke(*RUN, "--engine", "mine", code=2)
+        assert "plumbline.toml" in done.stderr
     with pytest.raises(BadSpecification):
         list(specifications.found_engines(tmp_path))
 
@@ -112,15 +112,14 @@ def test_an_adapter_of_a_file_is_a_column(tmp_path):
         "from adapters.reference_engine import Reference\n"
         "class Mine(Reference):\n    name = 'mine'\n    title = 'Mine'\n"
     )
-    done = invoke(*RUN, "--adapter", f"{file}:Mine", "--out", tmp_path / "out")
-    assert done.exit_code == 0 and "7 agree" in done.stdout, done.output
+    done = invoke(*RUN, "--adapter", f"{file}:Mine", "--out", tmp_path / "out", code=0)
+    assert "7 agree" in done.stdout, done.output
 
 
 def test_a_contract_names_what_differs_with_its_cause_and_writes_junit(tmp_path):
     wrong = tmp_path / "wrong.py"
     wrong.write_text(TOY.read_text().replace("omega, J @ omega", "omega, 1.001 * J @ omega"))
-    done = invoke("contract", toy(wrong), "--level", "state", "--junit", tmp_path / "junit.xml")
-    assert done.exit_code == 1, done.stderr
+    done = invoke("contract", toy(wrong), "--level", "state", "--junit", tmp_path / "junit.xml", code=1)
     assert "✗ tumbling-ball/wrong/state/-/acceleration" in done.stdout
     assert "unsupported as declared" in done.stdout
     assert "<failure" in (tmp_path / "junit.xml").read_text()

@@ -64,8 +64,7 @@ def test_the_wheel_is_small_and_has_one_package(wheel, unpacked):
 
 def test_installed_it_compares_engines_and_writes_one_folder(unpacked, tmp_path):
     (tmp_path / ".git").mkdir()  # of the user: not of this project
-    done = run_plumbline(*RUN, "--fresh", cwd=tmp_path, path=[unpacked])
-    assert done.returncode == 0, done.stdout + done.stderr
+    done = run_plumbline(*RUN, "--fresh", cwd=tmp_path, path=[unpacked], code=0)
     assert {path.name for path in tmp_path.iterdir()} == {".git", "plumbline-out"}
     assert (tmp_path / "plumbline-out/report.html").is_file()
     assert agreed(done.stdout) >= 14

@@ -16,9 +16,11 @@ from plumbline.cli.main import main
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def invoke(*words: object) -> Result:
-    """A command in this process."""
-    return CliRunner().invoke(main, [*map(str, words)])
+def invoke(*words: object, code: int | None = None) -> Result:
+    """A command in this process, which must end with the exit code, if one is given."""
+    result = CliRunner().invoke(main, [*map(str, words)])
+    assert code in (None, result.exit_code), result.output
+    return result
 
 
 def user_environment(*first: object, **variables: str) -> dict[str, str]:
@@ -27,18 +29,22 @@ def user_environment(*first: object, **variables: str) -> dict[str, str]:
     return kept | {"PYTHONPATH": os.pathsep.join(map(str, first or (ROOT,)))} | variables
 
 
-def run_plumbline(
-    *words: object, cwd: Path = ROOT, path: Iterable[object] = (ROOT,), **variables: str
-) -> subprocess.CompletedProcess[str]:
+def run_plumbline(*words: object, **options: Any) -> subprocess.CompletedProcess[str]:
     """A command in a process that has not the current folder among its modules."""
-    return run_python("-m", "plumbline", *words, cwd=cwd, path=path, **variables)
+    return run_python("-m", "plumbline", *words, **options)
 
 
 def run_python(
-    *words: object, cwd: Path = ROOT, path: Iterable[object] = (ROOT,), **variables: Any
+    *words: object,
+    cwd: Path = ROOT,
+    path: Iterable[object] = (ROOT,),
+    code: int | None = None,
+    **variables: str,
 ) -> subprocess.CompletedProcess[str]:
-    """Python with the folders of ``path``."""
-    return subprocess.run(
+    """Python with the folders of ``path``, which must end with the exit code, if one is given."""
+    done = subprocess.run(
         [sys.executable, "-P", *map(str, words)], cwd=cwd, env=user_environment(*path, **variables),
         capture_output=True, text=True, timeout=240, check=False,
     )  # fmt: skip
+    assert code in (None, done.returncode), done.stdout + done.stderr
+    return done

@@ -69,7 +69,7 @@ def store(folder, document):
 
 def command(*arguments):
     """The command's exit code and its output; a traceback is a failure."""
-    done = invoke(*(str(a) for a in arguments))
+    done = invoke(*arguments)
     assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
     return done.exit_code, done.output
 

@@ -82,5 +82,5 @@ def test_a_disagreement_of_version_1_can_be_selected(results):
         if row["key"] == KEY:
             row |= {"verdict": "disagrees", "extra": row["extra"] | {"ratio": 30.0}}
     (results / "results.json").write_text(json.dumps(document))
-    answer = invoke("reproduce", str(results), KEY)
+    answer = invoke("reproduce", results, KEY)
     assert "the engine agrees" in answer.output, answer.output

@@ -117,11 +117,10 @@ def test_a_corpus_keeps_new_combinations_up_to_its_size_and_where_a_search_ended
 
 def test_a_batch_that_is_not_finished_in_time_does_not_count_and_explain_reads_the_folder(tmp_path):
     words = ["--minutes", "0", "--corpus", str(tmp_path / "corpus"), "--out", str(tmp_path / "out")]
-    done = invoke("fuzz", "--engine", "reference", *words)
-    assert done.exit_code == ExitCode.DISAGREEMENT, done.output
+    done = invoke("fuzz", "--engine", "reference", *words, code=ExitCode.DISAGREEMENT)
     assert "0 mechanisms, 0 new findings: nothing was compared in time" in done.stderr
     assert not (tmp_path / "corpus").exists()
-    explained = invoke("explain", "--results", str(tmp_path / "out"))
+    explained = invoke("explain", "--results", tmp_path / "out")
     assert (explained.exit_code, explained.stderr) == (0, "no finding\n"), explained.output
 
 
@@ -131,14 +130,12 @@ def test_a_planted_defect_is_found_named_and_shown_by_the_smallest_mechanism(tmp
     planted, out = tmp_path / "planted.py", tmp_path / "out"
     planted.write_text(PLANTED)
     words = ["--adapter", f"{planted}:Planted", "--seed", "3", "--findings", "5", "--jobs", "1", "--json"]
-    done = invoke("fuzz", *words, "--minutes", "60", "--out", str(out))
-    assert done.exit_code == ExitCode.DISAGREEMENT, done.output
+    done = invoke("fuzz", *words, "--minutes", "60", "--out", out, code=ExitCode.DISAGREEMENT)
     assert {found["name"] for found in json.loads(done.stdout)} == FIVE
     smallest = load_scenarios([str(path) for path in out.glob("*.yaml")])
     assert len(smallest) == 5 and all(scenario.model.n <= 3 for scenario in smallest)
-    again = invoke("run", *(str(path) for path in out.glob("*.yaml")), *words[:2], "--engine", "planted",
-                   "--level", "state", "--out", str(tmp_path / "again"))  # fmt: skip
-    assert again.exit_code == ExitCode.DISAGREEMENT, again.output
+    words = [*out.glob("*.yaml"), *words[:2], "--engine", "planted", "--level", "state"]
+    invoke("run", *words, "--out", tmp_path / "again", code=ExitCode.DISAGREEMENT)
     assert {found["name"] for found in read_results(tmp_path / "again")["findings"]} == FIVE
-    explained = invoke("explain", "--results", str(out))
+    explained = invoke("explain", "--results", out)
     assert {line.split(":")[0] for line in explained.stdout.splitlines()} == FIVE
