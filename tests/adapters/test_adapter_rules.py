@@ -1,16 +1,16 @@
 """Rules for adapters: short functions, and a contract that an engine of one body on a ball joint can pass."""
 
 import ast
-from pathlib import Path
 
 import pytest
 
 from plumbline.engines.adapter import UNSUPPORTED_KINDS
 from plumbline.model.datatypes import Unsupported
 from tests.adapters import test_adapter_contract as contract
+from tests.helpers import ROOT
 
 MAX_FUNCTION_LINES = 60
-ADAPTERS = sorted((Path(__file__).parents[2] / "adapters").glob("*.py"))
+ADAPTERS = sorted((ROOT / "adapters").glob("*.py"))
 
 
 @pytest.mark.parametrize("path", ADAPTERS, ids=lambda path: path.stem)

@@ -1,7 +1,6 @@
 """Importer columns: a pendulum in closed form, agreement of the columns, refusals, losses of the worker."""
 
 import os
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,8 +11,8 @@ from plumbline.engines.registry import IMPORTERS
 from plumbline.importers.importer import ModelFile
 from plumbline.importers.neutral_model import CanonicalState
 from plumbline.processes.worker_pool import Limits, Task, WorkerPool
+from tests.helpers.model_mutations import FOLDER
 
-FILES = Path(__file__).parent / "model_files"
 GRAVITY = 9.81
 # Tolerances of these files of one to four bodies are some fifty roundings of numbers of size 1: 1e-14.
 MASS, ARM, INERTIA = 2.0, 0.5, 0.375  # of the pendulum files: kg, m, kg m²
@@ -43,7 +42,7 @@ ACCURACY = {"pybullet": 1e-8}
 
 def file_of(name, base="fixed"):
     form = "urdf" if name.endswith(".urdf") else "mjcf"
-    return ModelFile(str(FILES / name), form, base, str(FILES))
+    return ModelFile(str(FOLDER / name), form, base, str(FOLDER))
 
 
 @pytest.fixture(scope="module")
@@ -171,7 +170,7 @@ def test_an_importer_describes_itself(pool, importer):
 def test_an_importer_that_ends_its_process_is_survived(pool, tmp_path):
     python = optional_python("drake")
     path = tmp_path / "limits.urdf"
-    text = (FILES / "pendulum.urdf").read_text(encoding="utf-8")
+    text = (FOLDER / "pendulum.urdf").read_text(encoding="utf-8")
     path.write_text(text.replace('lower="-2" upper="2"', 'lower="2" upper="-2"'), encoding="utf-8")
     file = ModelFile(str(path), "urdf", root=str(tmp_path))
     (outcome,) = pool.run([Task(0, read_model_file, ("drake", file), Limits(60.0), python=python)])

@@ -1,14 +1,12 @@
 """The servers of this repository agree with certified truth, in the environment of `make importers`."""
 
-from pathlib import Path
-
 import pytest
 
 from plumbline.engines.registry import USER_ENGINES
 from plumbline.execution.comparison import compare
 from plumbline.judging.rows import Verdict
+from tests.helpers import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 PYTHON = ROOT / ".importers" / "bin" / "python"
 SERVERS = sorted((ROOT / "servers").glob("*_server.py"))
 SCENARIOS = (

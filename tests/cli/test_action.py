@@ -5,15 +5,15 @@ import re
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 from types import MappingProxyType
 
 import pytest
 from ruamel.yaml import YAML
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.helpers import ROOT
+from tests.helpers.model_mutations import FOLDER
+
 ACTION = YAML(typ="safe").load(ROOT / "action.yml")
-FILES = ROOT / "tests" / "adapters" / "model_files"
 
 
 def run_step(name, folder, variables=MappingProxyType({}), **inputs):
@@ -34,7 +34,7 @@ def run_step(name, folder, variables=MappingProxyType({}), **inputs):
 @pytest.fixture
 def robots(tmp_path):
     for name in ("pendulum.urdf", "arm.urdf"):
-        shutil.copy(FILES / name, tmp_path)
+        shutil.copy(FOLDER / name, tmp_path)
     (tmp_path / "known.yaml").write_text("")
     return tmp_path
 

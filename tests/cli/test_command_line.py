@@ -23,7 +23,8 @@ from plumbline.judging.findings import find_findings
 from plumbline.judging.rows import RowContext, Verdict
 from plumbline.scenario import loader
 from plumbline.storage.results_store import SCHEMA_VERSION
-from tests.helpers.commands import ROOT, invoke, run_plumbline, run_python
+from tests.helpers import ROOT
+from tests.helpers.commands import invoke, run_plumbline, run_python
 from tests.helpers.tables import table
 
 CONTEXT = RowContext("scenario", "family", "engine", "Engine", "1.0")

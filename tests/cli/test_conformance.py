@@ -4,7 +4,8 @@ import os
 import re
 import sys
 
-from tests.helpers.commands import ROOT, run_python
+from tests.helpers import ROOT
+from tests.helpers.commands import run_python
 
 PYTEST = ("-m", "pytest", "-q", "-p", "no:cacheprovider", "-c", os.devnull, "--rootdir")
 TOY = ROOT / "tests" / "helpers" / "toy_server.py"

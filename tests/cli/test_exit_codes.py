@@ -18,8 +18,8 @@ from plumbline.judging.known_issues import load_known_issues
 from plumbline.processes import worker_process
 from plumbline.processes.worker_pool import ExecutorLost
 from plumbline.truth.ground_truth import TRUTHS_DIFFER
-from tests.helpers import wrong_truths
-from tests.helpers.commands import ROOT, invoke, run_plumbline, run_python, user_environment
+from tests.helpers import ROOT, wrong_truths
+from tests.helpers.commands import invoke, run_plumbline, run_python, user_environment
 
 ON_ONE = ("--jobs", "1", "--out")
 AT_STATES = ("--level", "state", *ON_ONE)

@@ -6,7 +6,8 @@ import sys
 
 import pytest
 
-from tests.helpers.commands import ROOT, invoke, run_plumbline
+from tests.helpers import ROOT
+from tests.helpers.commands import invoke, run_plumbline
 from tests.helpers.terminal_counts import agreed
 
 SECRET = "TOP-SECRET-4711"

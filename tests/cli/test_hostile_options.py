@@ -4,18 +4,16 @@ import os
 import random
 from collections import Counter
 from contextlib import ExitStack
-from pathlib import Path
 from unittest.mock import patch
 
 import click
 import pytest
 
 from plumbline.cli.main import COMMANDS, main
-from tests.helpers import example_results
+from tests.helpers import ROOT, example_results
 from tests.helpers.commands import invoke
 from tests.helpers.mutations import limited_time
 
-ROOT = Path(__file__).resolve().parents[2]
 WORDS = (  # no path outside the test's folder that could be written to
     "nan", "inf", "-inf", "-1", "-0", "0", "1", "2", "7", "0.5", "1e308", "1e-308", "1e400", "0x10", "1_000",
     "٣", "9" * 30, "9" * 5000, "", " ", "x", "-", "--", "--out", "a" * 300, "a" * 5000, "\udcff",

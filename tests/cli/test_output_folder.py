@@ -10,8 +10,8 @@ import pytest
 from plumbline.cli.options import LOCK_FILE
 from plumbline.execution.exit_codes import ExitCode
 from plumbline.processes.isolation import FileLock
-from tests.helpers import example_results
-from tests.helpers.commands import ROOT, invoke, run_plumbline
+from tests.helpers import ROOT, example_results
+from tests.helpers.commands import invoke, run_plumbline
 
 SWEEP = (
     "schema_version: 1\nscenario: tumbling-rod\nvary: {'bodies[0].mass': {values: [1, 2]}}\nduration: 0.25\n"

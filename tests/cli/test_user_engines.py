@@ -10,7 +10,8 @@ import pytest
 from plumbline.engines import specifications
 from plumbline.engines.registry import USER_ENGINES
 from plumbline.processes.line_process import BadSpecification
-from tests.helpers.commands import ROOT, invoke
+from tests.helpers import ROOT
+from tests.helpers.commands import invoke
 
 TOY = ROOT / "tests" / "helpers" / "toy_server.py"
 RUN = ("run", "tumbling-ball", "--level", "state")

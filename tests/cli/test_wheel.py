@@ -13,7 +13,8 @@ import pytest
 
 from plumbline.engines.environments import _run_uv
 from plumbline.truth import has_independent_truth
-from tests.helpers.commands import ROOT, run_plumbline
+from tests.helpers import ROOT
+from tests.helpers.commands import run_plumbline
 from tests.helpers.dask_cluster import cluster
 from tests.helpers.terminal_counts import agreed
 from tools.release import problem, release_notes

@@ -2,11 +2,11 @@
 
 import json
 from importlib.util import find_spec
-from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.helpers import ROOT
+
 STORED = json.loads((ROOT / "bench" / "results" / "classics.json").read_text(encoding="utf-8"))
 GOALS = {("A01", "reference"): 1e-6, ("A01", "mujoco"): 1e-6, ("A01", "pinocchio"): 1e-6,
          ("A01", "exudyn-tree"): 1e-6, ("cart-pole", "reference"): 1e-9}  # fmt: skip

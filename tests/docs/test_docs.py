@@ -19,8 +19,8 @@ import pytest
 from plumbline.cli.main import COMMANDS, main
 from plumbline.scenario.field_docs import field_reference
 from plumbline.scenario.schema import SCHEMA_VERSION
+from tests.helpers import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 PAGES = [
     "first-run.md", "add-a-scenario.md", "add-an-engine.md", "test-your-engine.md", "sweeps.md",
     "model-files.md", "test-your-robot.md", *(["test-your-engine-in-cpp.md"] if shutil.which("g++") else []),

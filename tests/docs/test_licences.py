@@ -6,13 +6,12 @@ import shutil
 import subprocess
 import tomllib
 from importlib.metadata import Distribution, distributions
-from pathlib import Path
 
 import pytest
 
+from tests.helpers import ROOT
 from tools.engine_servers import ENGINE_SERVERS, IMPORTERS_PYTHON
 
-ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs/licences.md").read_text(encoding="utf-8")
 LISTED = dict(re.findall(r"^\| ([\w.-]+) \| [^|]+ \| ([^|]+) \|$", PAGE, re.MULTILINE))
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]

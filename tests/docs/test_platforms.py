@@ -2,14 +2,14 @@
 
 import platform
 import sys
-from pathlib import Path
 
 import numpy as np
 
 from plumbline.truth.step_formulas import HAS_EXTENDED_PRECISION
+from tests.helpers import ROOT
 from tools.platform_table import PLATFORMS, absent_packages, table
 
-PAGE = Path(__file__).resolve().parents[2] / "docs/platforms.md"
+PAGE = ROOT / "docs/platforms.md"
 
 
 def test_the_page_has_the_table():

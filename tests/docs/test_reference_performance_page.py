@@ -1,12 +1,12 @@
 """docs/measurements/reference-performance.md cites stored runs: its tables' figures are in bench/results."""
 
 import json
-from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.helpers import ROOT
+
 PAGE = (ROOT / "docs" / "measurements" / "reference-performance.md").read_text(encoding="utf-8")
 FIGURES = json.loads((ROOT / "bench" / "results" / "figures.json").read_text(encoding="utf-8"))
 COLUMNS = {

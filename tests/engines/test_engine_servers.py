@@ -10,9 +10,8 @@ import pytest
 from plumbline.engines.registry import ENGINES, IMPORTERS
 from plumbline.execution.comparison import compare
 from plumbline.judging.rows import Verdict
+from tests.helpers import ROOT
 from tools.engine_servers import ENGINE_SERVERS
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 def listed(*words, path=None):

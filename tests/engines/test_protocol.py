@@ -16,10 +16,9 @@ from plumbline.model.datatypes import EngineFailure, Model, State, Unsupported
 from plumbline.model.kinematics import angular_velocity
 from plumbline.processes.line_process import LineProcess
 from plumbline.processes.worker_pool import Limits, Task, WorkerPool
-from tests.helpers import pendulums
+from tests.helpers import ROOT, pendulums
 from tests.helpers.tables import table
 
-ROOT = Path(__file__).resolve().parents[2]
 SERVER = ROOT / "tests" / "helpers" / "lying_server.py"
 TRANSCRIPTS = ROOT / "tests" / "engines" / "transcripts"  # question, answer, question, …
 MODEL = pendulums.make_model("bb")

@@ -1,7 +1,6 @@
 """The inventory of the engines' public names: complete, and each declared once."""
 
 import sys
-from pathlib import Path
 from types import ModuleType
 
 import pytest
@@ -20,8 +19,7 @@ from plumbline.model.datatypes import EngineFailure
 from plumbline.processes.worker_pool import WorkerPool
 from plumbline.studies.exercised_names import names_of_engine
 from plumbline.studies.surface_page import surface_pages
-
-ROOT = Path(__file__).resolve().parents[2]
+from tests.helpers import ROOT
 
 
 def test_every_public_name_of_the_installed_engines_is_declared():

@@ -5,7 +5,6 @@ import pickle
 import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,10 +22,9 @@ from plumbline.processes.user_cache import CheckedFiles, recall, remember
 from plumbline.processes.worker_environment import hashed_environment
 from plumbline.processes.worker_pool import Task, WorkerPool
 from plumbline.scenario import loader
+from tests.helpers import ROOT
 from tests.helpers.commands import invoke
 from tests.helpers.in_process import InProcessWorkers
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 def quiet(*_):

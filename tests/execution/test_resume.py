@@ -9,7 +9,6 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import psutil
@@ -23,10 +22,10 @@ from plumbline.execution.result_cache import DiskResultCache, task_hash
 from plumbline.execution.runner import run_plan
 from plumbline.processes.worker_pool import Outcome, Pickled, Task
 from plumbline.scenario import loader
+from tests.helpers import ROOT
 from tests.helpers.catalogue import catalogue_scenario
 from tests.helpers.commands import invoke
 
-ROOT = Path(__file__).resolve().parents[2]
 TIME_FIELDS = {"cpu_time", "cost"}  # what may differ between two runs
 SCENARIOS = ["rest", "tumbling-ball"]
 

@@ -12,8 +12,7 @@ from typing import Any
 from click.testing import CliRunner, Result
 
 from plumbline.cli.main import main
-
-ROOT = Path(__file__).resolve().parents[2]
+from tests.helpers import ROOT
 
 
 def invoke(*words: object, code: int | None = None) -> Result:

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import psutil
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.helpers import ROOT
+
 DASK = Path(sys.executable).with_name("dask")
 LOCALHOST_ARGUMENTS = ("--host", "127.0.0.1")
 

@@ -4,7 +4,8 @@ import ast
 from functools import cache
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.helpers import ROOT
+
 LAYERS = (  # from the top; a package imports only what follows it
     "cli", "conformance", "studies", "model_files", "execution", "reproduce", "storage", "judging",
     "measurements", "diagnosis", "truth", "equations", "engines", "importers", "scenario", "model",

@@ -5,14 +5,14 @@ from __future__ import annotations
 import random
 import re
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
+from tests.helpers import ROOT
 from tests.helpers.mutations import damaged_bytes
 from tests.helpers.random_robots import random_mjcf, random_urdf
 
-FOLDER = Path(__file__).parents[1] / "adapters" / "model_files"
+FOLDER = ROOT / "tests" / "adapters" / "model_files"
 EXTREME_NUMBERS = (
     "0", "-0", "-1", "1e308", "-1e308", "1.7976931348623157e308", "1e200", "-1e154", "1e100", "1e30", "1e-30",
     "1e-154", "-1e-200", "1e-308", "1e-320", "5e-324", "nan", "inf", "-inf", "1e999", "-1e-999", "0x10",

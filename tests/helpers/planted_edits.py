@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib import import_module
-from pathlib import Path
 from types import ModuleType
 
 from plumbline.engines.registry import ENGINES, load_adapter
@@ -18,10 +17,10 @@ from plumbline.judging.known_issues import KnownIssues, project_known_issues
 from plumbline.judging.rows import Row
 from plumbline.processes.worker_pool import run_task
 from plumbline.scenario.generator import RandomScenarios
+from tests.helpers import ROOT
 from tests.helpers.catalogue import catalogue_scenario
 from tests.helpers.tables import table
 
-ROOT = Path(__file__).parents[2]
 BETWEEN = {  # modules that hold parts of the edited one and are loaded between it and the adapter
     "reference_impl.elements": ("reference_impl.direct",),
     "reference_impl.joints": ("reference_impl.direct",),

@@ -1,16 +1,15 @@
 """The survey of public robots: its page from a small document, and the scripts that the page links."""
 
 import subprocess
-from pathlib import Path
 
 import pytest
 
 from plumbline.engines.environments import EnvironmentUnavailable, importer_interpreter
+from tests.helpers import ROOT
 from tools.model_survey.examined import EXAMINED
 from tools.model_survey.page import write_page
 from tools.model_survey.run import robot_files
 
-ROOT = Path(__file__).resolve().parents[2]
 SCRIPTS = sorted((ROOT / "docs" / "importers").glob("*.py"))
 MAX_LINES = 40
 

@@ -4,7 +4,6 @@ import json
 import math
 import re
 from dataclasses import FrozenInstanceError, asdict, replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -20,9 +19,9 @@ from plumbline.judging.rows import FAILED_CALLS, RowContext
 from plumbline.processes.cpu_time import CpuTimes
 from plumbline.scenario.line_and_column_errors import ScenarioError
 from plumbline.storage.results_store import ResultTables
+from tests.helpers import ROOT
 from tests.helpers.tables import table
 
-ROOT = Path(__file__).resolve().parents[2]
 CONTEXT = RowContext("tumbling-ball", "single", "mujoco", "MuJoCo", "4.0.0")
 ENTRY = {
     "id": "a", "scenario": "tumbling-ball", "engine": "mujoco", "quantity": "acceleration",

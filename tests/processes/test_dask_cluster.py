@@ -8,7 +8,6 @@ import sys
 import time
 from dataclasses import replace
 from importlib.util import find_spec
-from pathlib import Path
 
 import psutil
 import pytest
@@ -20,9 +19,8 @@ from plumbline.execution.plan import Plan
 from plumbline.execution.runner import run_plan
 from plumbline.processes.worker_pool import Limits, Task
 from plumbline.scenario import loader
+from tests.helpers import ROOT
 from tests.helpers.dask_cluster import cluster
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 def run_rows(plan, progress=lambda *_: None):

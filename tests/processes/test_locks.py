@@ -10,8 +10,7 @@ import pytest
 
 from plumbline.processes import isolation
 from plumbline.processes.isolation import FileLock, LockHeld, ScratchFolder
-
-ROOT = Path(__file__).resolve().parents[2]
+from tests.helpers import ROOT
 
 
 def test_a_lock_is_held_by_one_process_until_it_ends(tmp_path):

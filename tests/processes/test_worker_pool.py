@@ -15,10 +15,8 @@ import pytest
 
 from plumbline.processes.isolation import remove_orphaned_folders
 from plumbline.processes.worker_pool import Limits, Outcome, ResultCache, Scheduler, Task, WorkerPool
-from tests.helpers import faults
+from tests.helpers import ROOT, faults
 from tests.helpers.immediate_executor import Immediate
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 def parent_script(folder, body):

@@ -19,6 +19,7 @@ from plumbline.reproduce.render import render_script
 from plumbline.reproduce.shrink import ReproductionCase
 from plumbline.reproduce.write import make_script
 from plumbline.truth.rounding_bound import EPS
+from tests.helpers import ROOT
 from tests.helpers.catalogue import catalogue_scenario
 from tests.helpers.reproduction import (
     DRIFTS,
@@ -51,7 +52,7 @@ def case_of(scenario):
     return ReproductionCase(found.model, found.state)
 
 
-ROOT, RUFF = Path(__file__).resolve().parents[2], Path(sys.executable).parent / "ruff"
+RUFF = Path(sys.executable).parent / "ruff"
 THROUGHOUT = [
     (engine, scenario)
     for engine in ("mujoco", "pinocchio", "exudyn")

@@ -16,6 +16,7 @@ from plumbline.measurements.state_relations import STATE_RELATIONS
 from plumbline.reproduce.engine_client import EngineClient
 from plumbline.reproduce.measure import StateMeasure
 from plumbline.reproduce.render import TEMPLATES, no_script_reason
+from tests.helpers import ROOT
 from tests.helpers.reproduction import (
     ALL_QUANTITIES,
     ENGINES,
@@ -39,7 +40,6 @@ from tests.helpers.tables import table
 for name in ("mujoco", "pinocchio", "exudyn", "flint"):
     pytest.importorskip(name)
 
-ROOT = Path(__file__).resolve().parents[2]
 STEPS = [(engine, name) for engine in ENGINES for name in step_methods(engine)]
 WAYS = [(engine, name) for engine in ENGINES for name in second_ways(engine)]
 

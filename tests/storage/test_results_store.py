@@ -4,7 +4,6 @@ import dataclasses
 import json
 import os
 import re
-from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -14,6 +13,7 @@ import pytest
 from plumbline.judging.rows import Row, RowContext
 from plumbline.storage import results_store
 from plumbline.storage.results_schema import DamagedResults
+from tests.helpers import ROOT
 from tests.helpers.nightly_tests import SLOW
 
 ROW = RowContext("s", "single", "mujoco", "MuJoCo", "4.0").make_row(
@@ -140,7 +140,7 @@ def test_missing_results_are_reported_with_the_command_that_makes_them(tmp_path)
 
 
 def test_the_field_reference_names_every_field_and_column():
-    text = (Path(__file__).resolve().parents[2] / "docs" / "results.md").read_text()
+    text = (ROOT / "docs" / "results.md").read_text()
     for field in dataclasses.fields(Row):
         assert f"`{field.name}`" in text, field.name
     for name, schema in results_store.TABLES.items():

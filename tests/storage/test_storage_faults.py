@@ -16,10 +16,10 @@ from plumbline.cli import nightly
 from plumbline.execution import runner
 from plumbline.execution.plan import Plan
 from plumbline.storage.history_of_nights import History
+from tests.helpers import ROOT
 from tests.helpers.in_process import InProcessWorkers
 from tests.helpers.nights import run_night
 
-ROOT = Path(__file__).resolve().parents[2]
 DISK_ERRORS = [errno.ENOSPC, errno.EIO, errno.EROFS, errno.EDQUOT]
 
 

@@ -4,7 +4,6 @@ import gzip
 import json
 from dataclasses import replace
 from importlib.util import find_spec
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,6 +24,7 @@ from plumbline.truth.certificate_proof import (
 from plumbline.truth.certified_state import certify_state
 from plumbline.truth.taylor import simulate_taylor
 from plumbline.truth.trajectory_truth import judge_claim, trajectory_truth
+from tests.helpers import ROOT
 from tests.helpers.catalogue import catalogue_scenario, catalogue_scenarios
 from tests.helpers.nightly_tests import SLOW
 from tests.helpers.random_chains import random_chain
@@ -47,7 +47,7 @@ TREES = ("sprung-cylinder", "sprung-universal", "spring-pendulum", "balls-with-e
 PROVABLE = [s for s in catalogue_scenarios().values() if s.model.n <= 8 and not reason_not_provable(s.model)]
 OVERLAPPING = ("free-body-with-rotors", "chain-3-balls", "chain-3-rods")  # besides one and two bodies
 MEANT = [s for s in PROVABLE if not s.model.has_chain_joints or s.name == "double-ball-then-rod"]
-PUBLISHED = json.loads((Path(__file__).parents[2] / "docs" / "reference-solutions.json").read_text("utf-8"))
+PUBLISHED = json.loads((ROOT / "docs" / "reference-solutions.json").read_text("utf-8"))
 
 
 def chain(rods, seed=1):
