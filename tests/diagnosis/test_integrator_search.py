@@ -11,17 +11,15 @@ from plumbline.diagnosis.cause import describe
 from plumbline.diagnosis.integrator_search import UNEXPLAINED, explain_steps
 from plumbline.engines.registry import load_adapter
 from plumbline.model.kinematics import angular_velocity, quaternion_rate, rotation_matrix
-from plumbline.truth import step_formulas
 from tests.helpers.nightly_tests import some_fast
 from tests.helpers.planted_steps import STEP_DEFECTS
 from tests.helpers.planting import planted
+from tests.helpers.requirements import require_engines, require_extended_precision
 from tests.helpers.shared_answers import sharing
 from tests.judging.test_step_level import loop_subject, methods, stepped, subject
 
-for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
-    pytest.importorskip(engine)
-if not step_formulas.HAS_EXTENDED_PRECISION:
-    pytest.skip("no extended precision on this machine", allow_module_level=True)
+require_engines()
+require_extended_precision()
 
 
 @pytest.fixture(scope="module", autouse=True)

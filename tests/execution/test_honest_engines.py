@@ -12,9 +12,9 @@ from plumbline.execution.plan import Plan
 from plumbline.execution.runner import run_plan
 from plumbline.processes.worker_pool import Limits
 from plumbline.scenario.generator import RandomScenarios
+from tests.helpers.requirements import require_engines
 
-for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
-    pytest.importorskip(engine)
+require_engines()
 
 # loses digits: plumbline/judging/known_issues.yaml has the evidence, and crba + solve agrees
 DEFECTIVE = {"pinocchio-aba"}

@@ -24,11 +24,11 @@ from tests.helpers.catalogue import catalogue_scenarios, states_of
 from tests.helpers.nightly_tests import some_fast
 from tests.helpers.planted_branches import BRANCH_DEFECTS, BRANCH_STEPS
 from tests.helpers.planting import plant, planted
+from tests.helpers.requirements import require_engines
 from tests.helpers.shared_answers import sharing
 from tests.judging.test_step_level import judged
 
-for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
-    pytest.importorskip(engine)
+require_engines()
 
 CONTEXT = RowContext("branches", "test", "engine", "engine", "0")
 RANDOM_COUNT = 200  # of a night

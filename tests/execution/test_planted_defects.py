@@ -33,9 +33,9 @@ from tests.helpers.planting import (
     motion_report,
     subject,
 )
+from tests.helpers.requirements import require_engines
 
-for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
-    pytest.importorskip(engine)
+require_engines()
 
 CLEAN = Defect("clean")
 RUN = ("engine", "integrator", "mechanism", "loaded")  # what a run is beside its defect

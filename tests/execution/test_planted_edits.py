@@ -7,9 +7,9 @@ import pytest
 from plumbline.judging.rows import Verdict
 from tests.helpers.nightly_tests import SLOW
 from tests.helpers.planted_edits import EDITS, rows_of_run
+from tests.helpers.requirements import require_engines
 
-for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
-    pytest.importorskip(engine)
+require_engines()
 
 STATES = 20  # of 51 that a run compares: some mistakes act at few
 DEFECTS = [edit for edit in EDITS if not edit.is_control]

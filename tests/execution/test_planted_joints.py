@@ -23,9 +23,9 @@ from tests.helpers.planting import (
     evaluated,
     subject,
 )
+from tests.helpers.requirements import require_engines
 
-for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
-    pytest.importorskip(engine)
+require_engines()
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ from plumbline.model.kinematics import (
 )
 from plumbline.scenario.generator import random_mechanism, random_scenario
 from plumbline.studies.random_steps import mechanism_of
-from plumbline.truth import step_comparison, step_formulas
+from plumbline.truth import step_comparison
 from plumbline.truth.rounding_bound import EPS
 from plumbline.truth.step_charts import StepCharts
 from plumbline.truth.step_comparison import RUN_QUANTITIES, StepsFromSamples
@@ -33,9 +33,9 @@ from tests.helpers.nightly_tests import SLOW, slow, some_fast
 from tests.helpers.pinocchio_by_crba import steps_by_crba
 from tests.helpers.planted_runs import RUN_MISTAKES
 from tests.helpers.planting import planted
+from tests.helpers.requirements import require_extended_precision
 
-if not step_formulas.HAS_EXTENDED_PRECISION:
-    pytest.skip("no extended precision on this machine", allow_module_level=True)
+require_extended_precision()
 
 CONTEXT = RowContext("run", "test", "engine", "engine", "0")
 ENGINES = ("mujoco", "pinocchio", "exudyn", "exudyn-tree")

@@ -15,10 +15,10 @@ from plumbline.truth.ground_truth import state_truth
 from tests.helpers import pendulums
 from tests.helpers.planted_defects import STATE_DEFECTS
 from tests.helpers.planting import plant
+from tests.helpers.requirements import require_engines
 
 ENGINES = "reference", "mujoco", "pinocchio", "exudyn", "exudyn-tree"
-for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
-    pytest.importorskip(engine)
+require_engines()
 
 
 @cache

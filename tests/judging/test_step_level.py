@@ -34,12 +34,11 @@ from tests.helpers.pendulums import JOINT_PATTERNS
 from tests.helpers.pinocchio_by_crba import steps_by_crba
 from tests.helpers.planted_steps import STEP_DEFECTS, stale_velocity, step_defect, velocity_verlet
 from tests.helpers.planting import Defect, planted
+from tests.helpers.requirements import require_engines, require_extended_precision
 from tests.helpers.shared_answers import by_content
 
-for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
-    pytest.importorskip(engine)
-if not step_formulas.HAS_EXTENDED_PRECISION:
-    pytest.skip("no extended precision on this machine", allow_module_level=True)
+require_engines()
+require_extended_precision()
 
 ENGINES = ("mujoco", "pinocchio", "exudyn", "exudyn-tree")
 CONTEXT = RowContext("steps", "test", "engine", "engine", "0")

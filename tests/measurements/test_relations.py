@@ -37,10 +37,10 @@ from tests.helpers.planted_defects import STATE_DEFECTS
 from tests.helpers.planting import Defect, answer_change, model_change, number_change, plant
 from tests.helpers.random_chains import random_chain
 from tests.helpers.relation_checks import check_relations, check_run_relations, check_state_relations
+from tests.helpers.requirements import require_engines
 from tests.helpers.shared_answers import sharing
 
-for engine in ("mujoco", "pinocchio", "exudyn"):
-    pytest.importorskip(engine)
+require_engines()
 
 
 @pytest.fixture(scope="module", autouse=True)
