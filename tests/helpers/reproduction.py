@@ -13,6 +13,8 @@ from pathlib import Path
 
 from plumbline.engines.metamorphic_hooks import metamorphic_hooks
 from plumbline.engines.registry import load_adapter
+from plumbline.judging.refinement_analysis import RefinementAnalysis
+from plumbline.judging.rows import RowContext
 from plumbline.measurements.relation_result import OPTION_PREFIX, OTHER_FORMULATION_PREFIX
 from plumbline.measurements.state_relations import QUANTITIES, STATE_RELATIONS, WELDED_HALVES
 from plumbline.model.step_methods import JointSpaceMethod
@@ -130,6 +132,26 @@ def execute(script: str) -> tuple[list[float], dict]:
         except SystemExit as end:
             assert end.code == (max(ratios(printed.getvalue())) > 1), "exit status"
     return ratios(printed.getvalue()), names
+
+
+def check_script(evidence, factor: float) -> list[float]:
+    """The ratios of a script: none above 1, and all where what it expects is multiplied by the factor."""
+    found, _ = execute(script_of(evidence))
+    assert max(found) < 1, found
+    wrong = replace(evidence, expected={q: x * factor for q, x in evidence.expected.items()})
+    assert min(execute(script_of(wrong))[0]) > 1, "a wrong answer would not be noticed"
+    return found
+
+
+def measured_drifts(measure: ConvergenceMeasure, case: ReproductionCase):
+    """Evidence about drifts, the names of its script, whose ratios are below 1, and the harness's drifts."""
+    evidence = measure(case)
+    found, names = execute(script_of(evidence))
+    assert len(found) == len(evidence.drifts) and max(found) < 1
+    truth, runs = measure.run(case, measure.sample_times(case))
+    context = RowContext("", "", "", "", "")
+    analysis = RefinementAnalysis(context, case.model, truth, measure.integrator, runs, case.until)
+    return evidence, names, analysis.invariant_drifts
 
 
 def run_alone(script: str, folder: Path, before: str = "", python: str = sys.executable) -> list[float]:
