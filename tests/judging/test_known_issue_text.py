@@ -27,24 +27,25 @@ def row(scenario, verdict=Verdict.DISAGREES, level="state", **more):
     return context.make_row(level, "-", "joint_reaction", verdict, "why", ratio=12.0, **more)
 
 
+def marked_by(finding, rows, folder):
+    """Rows marked by the entry of a finding, written to a file and read again."""
+    path = folder / "known.yaml"
+    path.write_text("\n".join(entry_lines(entry_of(finding))))
+    return KnownIssues(load_known_issues(path), False).mark_known(rows, 1)
+
+
 @pytest.mark.parametrize("cause", CAUSES, ids=lambda cause: f"{cause.kind} {cause.term} {cause.needs}")
 def test_the_entry_of_a_finding_covers_its_rows_and_a_new_scenarios(tmp_path, cause):
     rows = [row("rest", causes=(asdict(cause),)), row("rest", level="relations")]
     (finding,) = find_findings(rows, {"rest": 1})
-    path = tmp_path / "known.yaml"
-    path.write_text("\n".join(entry_lines(entry_of(finding))))
-    marked = KnownIssues(load_known_issues(path), False).mark_known(
-        [*rows, row("conical", causes=(asdict(cause),))], 1
-    )
+    marked = marked_by(finding, [*rows, row("conical", causes=(asdict(cause),))], tmp_path)
     assert [r.known_issue for r in marked] == [finding.name] * 3, [r.reason for r in marked]
 
 
 def test_gaps_and_failures_have_an_entry_too(tmp_path):
     rows = [row("rest", Verdict.UNSUPPORTED), row("conical", Verdict.UNSUPPORTED)]
     (finding,) = find_findings(rows, {})
-    path = tmp_path / "known.yaml"
-    path.write_text("\n".join(entry_lines(entry_of(finding))))
-    marked = KnownIssues(load_known_issues(path), False).mark_known(rows, 1)
+    marked = marked_by(finding, rows, tmp_path)
     assert [r.known_issue for r in marked] == [finding.name] * 2
 
 
