@@ -5,7 +5,7 @@ from functools import cache
 import pytest
 
 from plumbline.judging.rows import Verdict
-from tests.helpers.nightly_tests import SLOW
+from tests.helpers.nightly_tests import fast_are, some_fast
 from tests.helpers.planted_edits import EDITS, rows_of_run
 from tests.helpers.requirements import require_engines
 
@@ -13,13 +13,7 @@ require_engines()
 
 STATES = 20  # of 51 that a run compares: some mistakes act at few
 DEFECTS = [edit for edit in EDITS if not edit.is_control]
-
-
-def one_fast(edits, place=0):
-    """Parameters of a test of which one, a cheap one, runs fast and the others nightly."""
-    return [
-        pytest.param(edit, id=edit.name, marks=SLOW if k != place else []) for k, edit in enumerate(edits)
-    ]
+CONTROLS = [edit for edit in EDITS if edit.is_control]
 
 
 @cache
@@ -36,17 +30,17 @@ def test_every_edit_fits_its_file():
     assert not [edit.name for edit in EDITS if not edit.fits]
 
 
-@pytest.mark.parametrize("edit", one_fast(DEFECTS))
+@pytest.mark.parametrize("edit", some_fast(DEFECTS, len(DEFECTS)))
 def test_every_defect_is_reported(edit):
     assert attention(edit.name), f"nothing reports {edit.name}"
 
 
-@pytest.mark.parametrize("edit", one_fast([d for d in DEFECTS if d.expected]))
+@pytest.mark.parametrize("edit", some_fast([d for d in DEFECTS if d.expected], len(DEFECTS)))
 def test_every_defect_with_words_is_named(edit):
     names = {row.diagnosis for row in attention(edit.name) if row.diagnosis}
     assert any(edit.expected in name and "cannot distinguish" not in name for name in names), names
 
 
-@pytest.mark.parametrize("edit", one_fast([edit for edit in EDITS if edit.is_control], place=1))
+@pytest.mark.parametrize("edit", fast_are([CONTROLS[1].name], CONTROLS))
 def test_no_control_is_accused(edit):
     assert not [row.reason for row in attention(edit.name)]

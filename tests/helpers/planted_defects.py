@@ -149,16 +149,19 @@ def moment_of_force_at(point: str, force: Callable[[Model, State], Array]) -> Ca
     return lambda m, s: np.cross(getattr(m, point)[: m.n], to_body(s, force(m, s)))
 
 
+def attitudes_before(state: State) -> Array:
+    """Attitude of the body before each one; of the first the identity."""
+    return np.concatenate([[[1.0, 0, 0, 0]], state.p[:-1]])
+
+
 def relative_attitudes(_: Model, state: State) -> Array:
     """Attitudes relative to the body before: q₁* q₂."""
-    before = np.concatenate([[[1.0, 0, 0, 0]], state.p[:-1]])
-    return normalised(quaternion_product(quaternion_conjugate(before), state.p))
+    return normalised(quaternion_product(quaternion_conjugate(attitudes_before(state)), state.p))
 
 
 def reversed_product(model: Model, state: State) -> Array:
     """q₁ and q₁* q₂ multiplied in the other order."""
-    before = np.concatenate([[[1.0, 0, 0, 0]], state.p[:-1]])
-    return normalised(quaternion_product(relative_attitudes(model, state), before))
+    return normalised(quaternion_product(relative_attitudes(model, state), attitudes_before(state)))
 
 
 def relative_rates(_: Model, state: State) -> Array:
@@ -167,19 +170,12 @@ def relative_rates(_: Model, state: State) -> Array:
     return state.omega - to_body(state, np.concatenate([np.zeros((1, 3)), absolute[:-1]]))
 
 
-def drag_moment_from(rate: Callable[[Model, State], Array]) -> Inputs:
-    """−c_r times another rate."""
+def drag_from(kind: str, rate: Callable[[Model, State], Array]) -> Inputs:
+    """The drag force −c_t v or moment −c_r ω′ of another velocity."""
+    drag = f"drag_{kind}"
     return model_change(
-        lambda m, s: {"drag_moment": 0 * m.drag_moment,
-                      "moment": m.moment - m.drag_moment[:, None] * rate(m, s)}
-    )  # fmt: skip
-
-
-def drag_force_from(velocity: Callable[[Model, State], Array]) -> Inputs:
-    """−c_t times another velocity."""
-    return model_change(
-        lambda m, s: {"drag_force": 0 * m.drag_force,
-                      "force": m.force - m.drag_force[:, None] * velocity(m, s)}
+        lambda m, s: {drag: 0 * getattr(m, drag),
+                      kind: getattr(m, kind) - getattr(m, drag)[:, None] * rate(m, s)}
     )  # fmt: skip
 
 
@@ -401,13 +397,13 @@ BODY_DEFECTS = (
     Defect("drag-ct-for-cr", "drag moment of all bodies were that of the drag force's coefficient", E,
            loaded=True, inputs=model_change(lambda m, _: {"drag_moment": m.drag_force})),
     Defect("drag-force-in-body-frame", "drag force of all bodies were taken with the body-frame velocity", M,
-           loaded=True, inputs=drag_force_from(lambda _, s: to_body(s, s.v))),
+           loaded=True, inputs=drag_from("force", lambda _, s: to_body(s, s.v))),
     Defect("drag-moment-in-world-frame",
            "drag moment of all bodies were taken with the world-frame angular velocity", P, loaded=True,
-           inputs=drag_moment_from(lambda _, s: to_world(s, s.omega))),
+           inputs=drag_from("moment", lambda _, s: to_world(s, s.omega))),
     Defect("drag-of-proximal-velocity",
            "drag force of all bodies were taken with the velocity of its joint's point", E, loaded=True,
-           inputs=drag_force_from(proximal_velocity)),
+           inputs=drag_from("force", proximal_velocity)),
     Defect("drag-at-proximal", "drag force of all bodies were applied at its joint's point", M, loaded=True,
            inputs=added_moment(moment_of_force_at("proximal", lambda m, s: -m.drag_force[:, None] * s.v))),
     Defect("damping-of-body-2", "drag moment of body 2 were", P,

@@ -7,7 +7,7 @@ every other step the engine is as it is.  Steps count from 1.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 from unittest.mock import patch
@@ -22,6 +22,7 @@ from tests.helpers.planting import Defect, Patch
 
 SIZE = 1e-9
 When = Callable[[int, Array, Array], bool]  # number of the step, q and v before it
+Change = Callable[[Any, Any], AbstractContextManager[None]]  # of MuJoCo's model and data during a step
 
 
 @dataclass(frozen=True)
@@ -39,48 +40,40 @@ class RunMistake:
         return self.defect.name
 
 
-def _scaled_masses(m: Any, d: Any) -> Callable[[], None]:
+@contextmanager
+def _scaled_masses(m: Any, d: Any) -> Iterator[None]:
     """Mass and inertia of the last body: all masses together change no motion under gravity alone."""
     kept = m.body_mass.copy(), m.body_inertia.copy()
     m.body_mass[-1] *= 1 + SIZE
     m.body_inertia[-1] *= 1 + SIZE
-
-    def back() -> None:
-        m.body_mass[:], m.body_inertia[:] = kept
-
-    return back
+    yield
+    m.body_mass[:], m.body_inertia[:] = kept
 
 
-def _scaled_gravity(m: Any, d: Any) -> Callable[[], None]:
+@contextmanager
+def _scaled_gravity(m: Any, d: Any) -> Iterator[None]:
     kept = m.opt.gravity.copy()
     m.opt.gravity *= 1 + SIZE
-
-    def back() -> None:
-        m.opt.gravity = kept
-
-    return back
+    yield
+    m.opt.gravity = kept
 
 
-def _scaled_step(m: Any, d: Any) -> Callable[[], None]:
+@contextmanager
+def _scaled_step(m: Any, d: Any) -> Iterator[None]:
     kept = m.opt.timestep
     m.opt.timestep *= 1 + SIZE
-
-    def back() -> None:
-        m.opt.timestep = kept
-
-    return back
+    yield
+    m.opt.timestep = kept
 
 
-def _scaled_rates(m: Any, d: Any) -> Callable[[], None]:
+@contextmanager
+def _scaled_rates(m: Any, d: Any) -> Iterator[None]:
     """The velocity after the step."""
-
-    def back() -> None:
-        d.qvel *= 1 + SIZE
-
-    return back
+    yield
+    d.qvel *= 1 + SIZE
 
 
-def mujoco_mistake(when: When, change: Callable[[Any, Any], Callable[[], None]], run: int = 0) -> Patch:
+def mujoco_mistake(when: When, change: Change, run: int = 0) -> Patch:
     """A change during some steps of MuJoCo; only on the given run of the adapter, from 1, or on every one."""
 
     @contextmanager
@@ -93,9 +86,8 @@ def mujoco_mistake(when: When, change: Callable[[Any, Any], Callable[[], None]],
                 if number == 1:
                     started.append(1)
                 is_meant = not run or len(started) == run
-                back = change(m, d) if is_meant and when(number, d.qpos, d.qvel) else lambda: None
-                real(m, d)
-                back()
+                with change(m, d) if is_meant and when(number, d.qpos, d.qvel) else nullcontext():
+                    real(m, d)
 
         with patch.object(mujoco_engine.mujoco, "mj_step", step):
             yield
@@ -115,14 +107,11 @@ def pinocchio_mistake(when: When, integrator: str, masses: bool = False) -> Patc
             if not when(number, q, v):
                 return real(chain, q, v, h)
             if masses:
-                kept = [pin.Inertia(x) for x in chain.pin_model.inertias]
-                for j in range(len(kept) - 1, len(kept)):
-                    chain.pin_model.inertias[j] = pin.Inertia(
-                        kept[j].mass * (1 + SIZE), kept[j].lever, kept[j].inertia * (1 + SIZE)
-                    )
+                inertias, last = chain.pin_model.inertias, len(chain.pin_model.inertias) - 1
+                kept = pin.Inertia(inertias[last])
+                inertias[last] = pin.Inertia(kept.mass * (1 + SIZE), kept.lever, kept.inertia * (1 + SIZE))
                 found = real(chain, q, v, h)
-                for j, x in enumerate(kept):
-                    chain.pin_model.inertias[j] = x
+                inertias[last] = kept
                 return found
             right = chain.acceleration
             with patch.object(chain, "acceleration", lambda q, v: right(q, v) * (1 + SIZE)):

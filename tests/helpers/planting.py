@@ -285,16 +285,17 @@ def with_row(k: int, right: Array, wrong: Array) -> Array:
 
 def body_change(k: int, **change: Callable[[Model, State], Array]) -> Inputs:
     """Fields of the model replaced in the row of one body."""
-    return model_change(
-        lambda m, s: {name: with_row(k, getattr(m, name), f(m, s)) for name, f in change.items()}
-    )
+    return model_change(lambda m, s: rows_changed(k, m, {name: f(m, s) for name, f in change.items()}))
 
 
 def body_state_change(k: int, **change: Callable[[Model, State], Array]) -> Inputs:
     """Minimal coordinates of one body replaced."""
-    return state_change(
-        lambda m, s: {name: with_row(k, getattr(s, name), f(m, s)) for name, f in change.items()}
-    )
+    return state_change(lambda m, s: rows_changed(k, s, {name: f(m, s) for name, f in change.items()}))
+
+
+def rows_changed(k: int, holder: Model | State, wrong: dict[str, Array]) -> dict[str, Array]:
+    """Row k of some fields replaced."""
+    return {name: with_row(k, getattr(holder, name), value) for name, value in wrong.items()}
 
 
 def when(condition: Callable[[Model, State], bool], change: Inputs) -> Inputs:
