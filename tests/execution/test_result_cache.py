@@ -2,7 +2,6 @@
 
 import os
 import pickle
-import subprocess
 import sys
 from dataclasses import replace
 
@@ -22,8 +21,7 @@ from plumbline.processes.user_cache import CheckedFiles, recall, remember
 from plumbline.processes.worker_environment import hashed_environment
 from plumbline.processes.worker_pool import Task, WorkerPool
 from plumbline.scenario import loader
-from tests.helpers import ROOT
-from tests.helpers.commands import invoke
+from tests.helpers.commands import invoke, run_plumbline
 from tests.helpers.in_process import InProcessWorkers
 
 
@@ -31,8 +29,13 @@ def quiet(*_):
     pass
 
 
-def forget_fingerprint():
+def hash_anew(task):
+    """The hash of a task with the files and variables of now."""
     environment_fingerprint.environment_fingerprint.cache_clear()
+    try:
+        return task_hash(task)
+    finally:
+        environment_fingerprint.environment_fingerprint.cache_clear()
 
 
 # --- what the hash covers ----------------------------------------------------------------------
@@ -107,18 +110,29 @@ def test_the_answers_of_another_version_depend_on_its_environment(tmp_path):
     task, hashes = Task("a", quiet, python=str(tmp_path / "bin" / "python")), set()
     for text in ("x = 1\n", "x = 2\n"):
         (site / "engine" / "__init__.py").write_text(text)
-        forget_fingerprint()
-        hashes.add(task_hash(task))
-    forget_fingerprint()
-    assert len(hashes) == 2 and task_hash(replace(task, python="")) not in hashes
+        hashes.add(hash_anew(task))
+    assert len(hashes) == 2 and hash_anew(replace(task, python="")) not in hashes
 
 
-def hash_anew(task):
-    forget_fingerprint()
-    try:
-        return task_hash(task)
-    finally:
-        forget_fingerprint()
+@pytest.mark.parametrize("file", ["engine-1.0.dist-info/RECORD", "engine/libengine.so.4", "mujoco.py"])
+def test_another_installation_has_other_cells(tmp_path, monkeypatch, file):
+    """The same version of an engine: installed again, built again in its place, replaced on PYTHONPATH."""
+    (tmp_path / file).parent.mkdir(exist_ok=True)
+    monkeypatch.syspath_prepend(tmp_path)
+    hashes = set()
+    for size in (1, 2):
+        (tmp_path / file).write_text("x" * size)
+        hashes.add(hash_anew(Task("a", quiet)))
+    assert len(hashes) == 2
+
+
+def test_another_processor_has_other_cells(monkeypatch):
+    """The last bits of results depend on its vector instructions."""
+    hashes = set()
+    for features in ("flags: fma", "flags: fma avx512f"):
+        monkeypatch.setattr(environment_fingerprint, "processor_features", lambda features=features: features)
+        hashes.add(hash_anew(Task("a", quiet)))
+    assert len(hashes) == 2
 
 
 @pytest.mark.parametrize("name", ["BAD", "MUJOCO_DEBUG", "LD_LIBRARY_PATH", "OPENBLAS_CORETYPE", "x"])
@@ -309,15 +323,8 @@ def test_a_run_goes_on_without_a_cache_that_cannot_be_made(tmp_path, monkeypatch
 @pytest.mark.skipif(sys.platform == "win32", reason="no limits of file size")
 def test_a_full_disk_is_reported_for_what_it_is(tmp_path):
     """The kernel refuses files above 2 kB: neither the cells fit, nor the results."""
-    import resource
-
-    command = [sys.executable, "-m", "plumbline", "run", "rest", "--engine", "reference", "--level", "state",
-               "--jobs", "1", "--out", str(tmp_path)]  # fmt: skip
-    done = subprocess.run(
-        command, cwd=ROOT, capture_output=True, text=True,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (2_000, 2_000)),
-    )  # fmt: skip
-    assert done.returncode == 4, done.stderr
+    words = ["run", "rest", "--engine", "reference", "--level", "state", "--jobs", "1", "--out", tmp_path]
+    done = run_plumbline(*words, code=4, largest_file=2_000)
     assert done.stderr.count("the result cache cannot be written, the run goes on without it") == 1
     assert done.stderr.rstrip().endswith("Finished cells were not saved; the same command begins again.")
 

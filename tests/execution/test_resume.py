@@ -16,7 +16,6 @@ import pyarrow.parquet as pq
 import pytest
 
 from plumbline.engines import engine_calls
-from plumbline.execution import environment_fingerprint
 from plumbline.execution.plan import Plan
 from plumbline.execution.result_cache import DiskResultCache, task_hash
 from plumbline.execution.runner import run_plan
@@ -24,7 +23,7 @@ from plumbline.processes.worker_pool import Outcome, Pickled, Task
 from plumbline.scenario import loader
 from tests.helpers import ROOT
 from tests.helpers.catalogue import catalogue_scenario
-from tests.helpers.commands import invoke
+from tests.helpers.commands import invoke, run_plumbline
 
 TIME_FIELDS = {"cpu_time", "cost"}  # what may differ between two runs
 SCENARIOS = ["rest", "tumbling-ball"]
@@ -34,15 +33,18 @@ def quiet(*_):
     pass
 
 
-def run_command(out, *more):
-    return [sys.executable, "-m", "plumbline", "run", *SCENARIOS,
-            "--engine", "mujoco", "--engine", "pinocchio",
-            "--jobs", "2", "--out", str(out), *more]  # fmt: skip
+def command(out, level):
+    """Words of a run, and its variables: cells of its own for each output folder."""
+    engines = "--engine", "mujoco", "--engine", "pinocchio"
+    words = "run", *SCENARIOS, *engines, "--jobs", "2", "--out", str(out), "--level", level
+    return words, {"PLUMBLINE_CACHE": str(out / "cache")}
 
 
-def environment(out):
-    """Cells of its own for each output folder."""
-    return {**os.environ, "PLUMBLINE_CACHE": str(out / "cache")}
+def finished_results(out, level):
+    """The results of a run that is not killed."""
+    words, variables = command(out, level)
+    run_plumbline(*words, code=0, **variables)
+    return comparable_results(out)
 
 
 def comparable_results(out):
@@ -58,19 +60,17 @@ def comparable_results(out):
     return run, rows, document["scenarios"], tables
 
 
-def run_and_kill(out, after, from_new_cell, *more):
+def run_and_kill(out, after, from_new_cell, level):
     """Run, kill -9 ``after`` seconds (from the first new cell, if asked); whether it was still running.
 
     No process of it may remain.
     """
     before = stored_cells(out)
+    words, variables = command(out, level)
     process = subprocess.Popen(
-        run_command(out, *more),
-        cwd=ROOT,
-        env=environment(out),
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
+        [sys.executable, "-m", "plumbline", *words], cwd=ROOT, env=os.environ | variables,
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
     while from_new_cell and process.poll() is None and stored_cells(out).keys() <= before.keys():
         time.sleep(0.01)
     try:
@@ -97,35 +97,23 @@ def stored_cells(out):
 def check_results_after_kills(tmp_path, kills, level):
     """Kill ``kills`` times at random moments; runs that finish between them are checked."""
     rng = random.Random(20)
-    uninterrupted = tmp_path / "calm"
     begin = time.monotonic()
-    subprocess.run(
-        run_command(uninterrupted, "--level", level),
-        cwd=ROOT,
-        env=environment(uninterrupted),
-        capture_output=True,
-        check=True,
-    )
+    expected = finished_results(tmp_path / "calm", level)
     longest = time.monotonic() - begin
-    expected = comparable_results(uninterrupted)
     done, finished = 0, 0
     while done < kills:
         out = tmp_path / f"rough{finished}"
         before = stored_cells(out)
         from_new_cell = bool(done % 2)
         after = rng.uniform(0.0, 0.2 * longest if from_new_cell else longest)
-        if run_and_kill(out, after, from_new_cell, "--level", level):
+        if run_and_kill(out, after, from_new_cell, level):
             done += 1
             kept = stored_cells(out)
             assert before.keys() <= kept.keys(), "a finished cell is lost"
         else:
             assert comparable_results(out) == expected
             finished += 1
-    out = tmp_path / f"rough{finished}"
-    subprocess.run(
-        run_command(out, "--level", level), cwd=ROOT, env=environment(out), capture_output=True, check=True
-    )
-    assert comparable_results(out) == expected
+    assert finished_results(tmp_path / f"rough{finished}", level) == expected
     return done, finished
 
 
@@ -277,29 +265,3 @@ def test_a_judge_that_changes_has_another_cell(tmp_path):
         replace(judged, needs_answer=quiet),
     ]
     assert len({task_hash(judged), *map(task_hash, others)}) == 5
-
-
-@pytest.mark.parametrize("file", ["engine-1.0.dist-info/RECORD", "engine/libengine.so.4", "mujoco.py"])
-def test_another_installation_has_other_cells(tmp_path, monkeypatch, file):
-    """The same version of an engine: installed again, built again in its place, replaced on PYTHONPATH."""
-    task = Task("a", quiet)
-    (tmp_path / file).parent.mkdir(exist_ok=True)
-    monkeypatch.syspath_prepend(tmp_path)
-    hashes = set()
-    for size in (1, 2):
-        (tmp_path / file).write_text("x" * size)
-        environment_fingerprint.environment_fingerprint.cache_clear()
-        hashes.add(task_hash(task))
-    environment_fingerprint.environment_fingerprint.cache_clear()
-    assert len(hashes) == 2
-
-
-def test_another_processor_has_other_cells(monkeypatch):
-    """The last bits of results depend on its vector instructions."""
-    task, hashes = Task("a", quiet), set()
-    for features in ("flags: fma", "flags: fma avx512f"):
-        monkeypatch.setattr(environment_fingerprint, "processor_features", lambda features=features: features)
-        environment_fingerprint.environment_fingerprint.cache_clear()
-        hashes.add(task_hash(task))
-    environment_fingerprint.environment_fingerprint.cache_clear()
-    assert len(hashes) == 2

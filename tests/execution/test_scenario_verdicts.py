@@ -31,6 +31,13 @@ def make_scenario_run(engines, level, name="rest", states=2, **more):
     return ScenarioRun(plan, chosen, engines, **more)
 
 
+def begun(engines, level="state"):
+    """A run of a scenario at one level, and the tasks that follow its truth."""
+    bench = make_scenario_run(engines, level)
+    (truth,) = bench.tasks()
+    return bench, bench.on_outcome(outcome_of(truth))
+
+
 def truth_of(bench, kind):
     """The task of the truth of a kind."""
     return next(x for x in bench.tasks() if x.key.kind == kind)
@@ -48,9 +55,7 @@ def with_verdict(outcome, verdict, *quantities):
 def test_runs_follow_their_truth_and_may_finish_in_any_order(engines):
     rows = []
     for turned in (False, True):
-        bench = make_scenario_run(engines, "trajectory")
-        (truth,) = bench.tasks()
-        tasks = bench.on_outcome(outcome_of(truth))
+        bench, tasks = begun(engines, "trajectory")
         for task in reversed(tasks) if turned else tasks:
             assert not bench.is_done
             assert bench.on_outcome(outcome_of(task)) == []
@@ -60,9 +65,7 @@ def test_runs_follow_their_truth_and_may_finish_in_any_order(engines):
 
 
 def test_states_follow_their_truth_and_are_judged_by_the_worker(engines):
-    bench = make_scenario_run(engines, "state")
-    (truth,) = bench.tasks()
-    cells = bench.on_outcome(outcome_of(truth))
+    bench, cells = begun(engines)
     assert [(task.key.engine, task.key.kind) for task in cells] == [
         (name, TaskKind.STATE) for name in ("reference", "mujoco")
     ]
@@ -80,9 +83,8 @@ def raise_key_error(*_):
 
 
 def test_a_judge_that_raises_is_a_failure_of_the_harness(engines):
-    bench = make_scenario_run(engines, "state")
-    (truth,) = bench.tasks()
-    for task in bench.on_outcome(outcome_of(truth)):
+    bench, cells = begun(engines)
+    for task in cells:
         bench.on_outcome(outcome_of(replace(task, judge=raise_key_error)))
     assert [(r.verdict, r.reason) for r in bench.findings().rows] == [
         ("harness failed", "the answer cannot be judged: KeyError: 'a mistake'")
@@ -285,9 +287,7 @@ def test_what_a_study_leaves_open_is_information_where_every_step_agrees(engines
 
 
 def test_a_worker_that_ends_in_what_is_asked_besides_costs_that_only(engines):
-    bench = make_scenario_run(engines, "state")
-    (truth,) = bench.tasks()
-    of_reference, of_mujoco = bench.on_outcome(outcome_of(truth))
+    bench, (of_reference, of_mujoco) = begun(engines)
     assert bench.on_outcome(Outcome(of_reference.key, failure="crashed")) == []  # nothing is asked besides
     (again,) = bench.on_outcome(Outcome(of_mujoco.key, failure="crashed"))
     (at_last,) = bench.on_outcome(Outcome(of_mujoco.key, failure="crashed again"))
@@ -304,9 +304,7 @@ def test_a_worker_that_ends_in_what_is_asked_besides_costs_that_only(engines):
 
 
 def test_an_engine_that_hangs_is_asked_for_the_states_alone_at_once(engines):
-    bench = make_scenario_run(engines, "state")
-    (truth,) = bench.tasks()
-    _, of_mujoco = bench.on_outcome(outcome_of(truth))
+    bench, (_, of_mujoco) = begun(engines)
     (at_last,) = bench.on_outcome(Outcome(of_mujoco.key, failure="hung", is_overdue=True))
     assert at_last.arguments[-1] == ()
     bench.on_outcome(Outcome(of_mujoco.key, failure="hung", is_overdue=True))

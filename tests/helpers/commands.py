@@ -38,12 +38,23 @@ def run_python(
     cwd: Path = ROOT,
     path: Iterable[object] = (ROOT,),
     code: int | None = None,
+    largest_file: int = 0,
     **variables: str,
 ) -> subprocess.CompletedProcess[str]:
-    """Python with the folders of ``path``, which must end with the exit code, if one is given."""
+    """Python with the folders of ``path``, which must end with the exit code, if one is given.
+
+    Files above ``largest_file`` bytes, if that is given, are refused by the kernel.
+    """
+
+    def refuse_larger_files() -> None:
+        import resource  # which Windows lacks
+
+        resource.setrlimit(resource.RLIMIT_FSIZE, (largest_file, largest_file))
+
     done = subprocess.run(
         [sys.executable, "-P", *map(str, words)], cwd=cwd, env=user_environment(*path, **variables),
         capture_output=True, text=True, timeout=240, check=False,
+        preexec_fn=refuse_larger_files if largest_file else None,
     )  # fmt: skip
     assert code in (None, done.returncode), done.stdout + done.stderr
     return done

@@ -3,7 +3,6 @@
 import errno
 import json
 import os
-import subprocess
 import sys
 import tempfile
 from dataclasses import replace
@@ -16,7 +15,7 @@ from plumbline.cli import nightly
 from plumbline.execution import runner
 from plumbline.execution.plan import Plan
 from plumbline.storage.history_of_nights import History
-from tests.helpers import ROOT
+from tests.helpers.commands import run_plumbline
 from tests.helpers.in_process import InProcessWorkers
 from tests.helpers.nights import run_night
 
@@ -28,14 +27,22 @@ class FaultyDisk:
 
     def __init__(self, monkeypatch):
         self.steps, self.at, self.for_good, self.error = 0, 0, False, errno.ENOSPC
-        replace_, fsync, fdopen, mkstemp, text, mkdir = (
-            os.replace, os.fsync, os.fdopen, tempfile.mkstemp, Path.write_text, Path.mkdir,
-        )  # fmt: skip
-        disk = self
+        disk, fdopen = self, os.fdopen
+
+        def halving(write):
+            """The same, which takes a half of the data before it fails."""
+
+            def half(owner, data, *args, **options):
+                try:
+                    disk.step()
+                except OSError:
+                    write(owner, data[: len(data) // 2], *args, **options)
+                    raise
+                return write(owner, data, *args, **options)
+
+            return half
 
         class File:
-            """A file that takes a half of the data before it fails."""
-
             def __init__(self, file):
                 self.file = file
 
@@ -45,24 +52,10 @@ class FaultyDisk:
             def __exit__(self, *_):
                 self.file.close()
 
-            def write(self, data):
-                try:
-                    disk.step()
-                except OSError:
-                    self.file.write(data[: len(data) // 2])
-                    raise
-                self.file.write(data)
+            write = halving(lambda self, data: self.file.write(data))
 
             def __getattr__(self, name):
                 return getattr(self.file, name)
-
-        def half_text(path, data, *args, **options):
-            try:
-                disk.step()
-            except OSError:
-                text(path, data[: len(data) // 2], *args, **options)
-                raise
-            return text(path, data, *args, **options)
 
         def stepping(call):
             def stepped(*args, **options):
@@ -71,11 +64,9 @@ class FaultyDisk:
 
             return stepped
 
-        monkeypatch.setattr(os, "replace", stepping(replace_))
-        monkeypatch.setattr(os, "fsync", stepping(fsync))
-        monkeypatch.setattr(tempfile, "mkstemp", stepping(mkstemp))
-        monkeypatch.setattr(Path, "mkdir", stepping(mkdir))
-        monkeypatch.setattr(Path, "write_text", half_text)
+        for owner, name in ((os, "replace"), (os, "fsync"), (tempfile, "mkstemp"), (Path, "mkdir")):
+            monkeypatch.setattr(owner, name, stepping(getattr(owner, name)))
+        monkeypatch.setattr(Path, "write_text", halving(Path.write_text))
         monkeypatch.setattr(os, "fdopen", lambda handle, mode: File(fdopen(handle, mode)))
 
     def step(self):
@@ -91,9 +82,13 @@ class FaultyDisk:
 
 
 @pytest.fixture
-def faulty_disk(monkeypatch):
+def quick_nights(monkeypatch):
     monkeypatch.setattr(runner, "WorkerPool", InProcessWorkers)
     monkeypatch.setattr(nightly, "Plan", lambda *a, **k: Plan(*a, **k, random_state_count=1))
+
+
+@pytest.fixture
+def faulty_disk(monkeypatch, quick_nights):
     return FaultyDisk(monkeypatch)
 
 
@@ -152,20 +147,12 @@ def test_every_error_at_every_step_once_and_for_good(faulty_disk, tmp_path, reco
 @pytest.mark.skipif(sys.platform == "win32", reason="no limits of file size")
 def test_the_command_reports_the_damage_and_continues(tmp_path, own_cells):
     """The kernel refuses files above 120 kB: the cells fit, the report does not."""
-    import resource
-
-    command = [sys.executable, "-m", "plumbline", "run", "rest", "--engine", "mujoco", "--level", "state",
-               "--jobs", "1", "--out", str(tmp_path)]  # fmt: skip
-    limited = subprocess.run(
-        command, cwd=ROOT, capture_output=True, text=True,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (120_000, 120_000)),
-    )  # fmt: skip
-    assert limited.returncode == 4, limited.stderr
+    words = ["run", "rest", "--engine", "mujoco", "--level", "state", "--jobs", "1", "--out", tmp_path]
+    limited = run_plumbline(*words, code=4, largest_file=120_000)
     assert "I/O error" in limited.stderr and "run the same command to resume" in limited.stderr
     assert not (tmp_path / "report.html").exists()
     assert len(list(own_cells.glob("*.cell"))) == 4  # description, states, truth, answer
-    again = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-    assert again.returncode == 0, again.stderr
+    again = run_plumbline(*words, code=0)
     assert (tmp_path / "report.html").exists() and "2 answers of earlier runs" in again.stderr
 
 
@@ -176,10 +163,9 @@ def test_a_clock_set_back_overwrites_no_night(tmp_path):
     assert nightly.unused_path(place).name == "20260101T000000Z-2"
 
 
+@pytest.mark.usefixtures("quick_nights")
 def test_nights_are_listed_in_the_order_of_their_making(tmp_path, monkeypatch):
     """The clock is set back, forward within the second night, and then shows the first one again."""
-    monkeypatch.setattr(runner, "WorkerPool", InProcessWorkers)
-    monkeypatch.setattr(nightly, "Plan", lambda *a, **k: Plan(*a, **k, random_state_count=1))
     days = iter([10, 10, 5, 8, 10, 10])  # when a night begins, and when its run does
 
     class Clock(datetime):
