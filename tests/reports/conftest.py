@@ -11,6 +11,7 @@ import pytest
 from reports import html_report, screenshot
 from reports.stored_results import Results
 from tests.helpers import example_results
+from tests.helpers.pages import watch
 from tests.helpers.shared_answers import folder_made_once
 
 AXE = Path(html_report.__file__).parent / "node_modules" / "axe-core" / "axe.min.js"
@@ -45,12 +46,30 @@ def chromium() -> Iterator[Any]:
 
 
 @pytest.fixture
-def violations() -> Callable[[Any, str], list[str]]:
+def open_file(chromium: Any) -> Iterator[Callable[..., Any]]:
+    """Open the page of a file; at the end no error, message, request or dialog may have been seen."""
+    contexts, trouble = [], list[str]()
+
+    def opened(path: Path, view: str = "", **options: Any) -> Any:
+        contexts.append(chromium.new_context(**options))
+        page = contexts[-1].new_page()
+        watch(page, path, trouble)
+        page.goto(path.as_uri() + view)
+        return page
+
+    yield opened
+    for context in contexts:
+        context.close()
+    assert trouble == []
+
+
+@pytest.fixture
+def violations() -> Callable[[Any], list[str]]:
     """Run axe on a page made with ``bypass_csp``; in the dark scheme only the rules about colours."""
     if not AXE.exists():
         pytest.skip("axe-core is not installed: run `npm ci` in reports/ first")
 
-    def run(page: Any, scheme: str) -> list[str]:
+    def run_scheme(page: Any, scheme: str) -> list[str]:
         page.emulate_media(color_scheme=scheme)
         if not page.evaluate("'axe' in window"):
             page.add_script_tag(path=str(AXE))
@@ -58,7 +77,12 @@ def violations() -> Callable[[Any, str], list[str]]:
         found = page.evaluate(f"axe.run(document, {{resultTypes: ['violations']{rules}}})")
         assert len(found["passes"]) > (15 if scheme == "light" else 0)
         return [
-            f"{v['id']}: {n['target']} {n['failureSummary']}" for v in found["violations"] for n in v["nodes"]
+            f"{scheme}: {v['id']}: {n['target']} {n['failureSummary']}"
+            for v in found["violations"]
+            for n in v["nodes"]
         ]
+
+    def run(page: Any) -> list[str]:
+        return [*run_scheme(page, "light"), *run_scheme(page, "dark")]
 
     return run

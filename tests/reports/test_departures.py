@@ -63,11 +63,9 @@ def test_only_proved_motions_have_a_table(shown):
 
 @pytest.mark.browser
 @pytest.mark.timeout(60)
-def test_the_page_tells_step_certificate_and_time(chromium, results, shown):
-    path, trouble = html_report.write(results), []
-    page = chromium.new_page(viewport={"width": 1280, "height": 900})
-    page.on("pageerror", lambda error: trouble.append(str(error)))
-    page.goto(path.as_uri() + f"#scenario={NAMES[0]}&engine=mujoco")
+def test_the_page_tells_step_certificate_and_time(open_file, results, shown):
+    path = html_report.write(results)
+    page = open_file(path, f"#scenario={NAMES[0]}&engine=mujoco", viewport={"width": 1280, "height": 900})
     page.wait_for_selector("html[data-shown]")
     lines = page.locator("table.departures tbody tr")
     runs = shown[NAMES[0]]["runs"]
@@ -88,5 +86,3 @@ def test_the_page_tells_step_certificate_and_time(chromium, results, shown):
     page.goto(path.as_uri() + f"#scenario={PLAIN}&engine=mujoco")
     page.locator("h1.cell-title", has_text=PLAIN).wait_for()
     assert page.locator("table.departures").count() == 0
-    page.close()
-    assert not trouble

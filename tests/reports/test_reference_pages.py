@@ -188,32 +188,17 @@ def test_intervals_cover_every_value_and_follow_ratios():
 
 @pytest.mark.browser
 @pytest.mark.parametrize("name", ["report.html", "sweep.html"])
-def test_no_request_no_violation_no_script_needed(chromium, out, name):
-    trouble: list[str] = []
-    page = chromium.new_page(java_script_enabled=False, offline=True)
-    page.on("console", lambda message: trouble.append(message.text))
-    page.on("dialog", lambda dialog: (trouble.append(dialog.message), dialog.dismiss()))
-    requests: list[str] = []
-    page.on("request", lambda request: requests.append(request.url))
-    page.goto((out / name).as_uri())
+def test_no_request_no_violation_no_script_needed(open_file, out, name):
+    page = open_file(out / name, java_script_enabled=False, offline=True)
     for part in ("#drift", "#benchmarks svg.wp") if name == "report.html" else (".map >> nth=2", "#poor"):
         assert page.locator(part).is_visible(), part
     page.wait_for_timeout(200)
-    page.close()
-    assert trouble == []
-    own = ("data:", (out / name).as_uri())
-    assert [url for url in requests if not url.startswith(own)] == []
 
 
 @pytest.mark.browser
 @pytest.mark.parametrize("name", ["report.html", "sweep.html"])
-def test_axe_finds_no_violation_here_either(chromium, out, name, violations):
-    context = chromium.new_context(bypass_csp=True, offline=True)
-    page = context.new_page()
-    page.goto((out / name).as_uri())
-    found = [violation for scheme in ("light", "dark") for violation in violations(page, scheme)]
-    context.close()
-    assert found == []
+def test_axe_finds_no_violation_here_either(open_file, out, name, violations):
+    assert violations(open_file(out / name, bypass_csp=True, offline=True)) == []
 
 
 def test_a_sweep_of_one_parameter_is_one_line(tmp_path):

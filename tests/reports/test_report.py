@@ -612,21 +612,12 @@ def tool(name):
     return str(found)
 
 
-def test_the_pages_own_script_is_type_checked():
-    done = subprocess.run(
-        [tool("tsc"), "--noEmit", "-p", "."], cwd=REPORTS, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-
-
-def test_the_pages_own_script_is_linted():
-    done = subprocess.run(
-        [tool("eslint"), "--max-warnings", "0", "assets"],
-        cwd=REPORTS,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+@pytest.mark.parametrize(
+    "words", ["tsc --noEmit -p .", "eslint --max-warnings 0 assets"], ids=["types", "lint"]
+)
+def test_the_pages_own_script_is_checked(words):
+    name, *options = words.split()
+    done = subprocess.run([tool(name), *options], cwd=REPORTS, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
 
 
