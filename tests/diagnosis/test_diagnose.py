@@ -160,6 +160,15 @@ def closing_forces(model, state, answer):
     return forces
 
 
+def with_parts(parts, model, truth):
+    """Answers whose joint forces count parts of them otherwise."""
+    reported = []
+    for state, a in zip(truth.states, truth.quantities, strict=True):
+        more = sum(share * carried(model, of(model, state, a)) for of, share in parts)
+        reported.append(determinate(model, state, replace(a, joint_reaction=a.joint_reaction + more)))
+    return reported
+
+
 SPRUNG = "tree-of-seven-sprung"
 PARTS = [
     (SPRUNG, "without the springs between points", [(spring_forces, 1)]),
@@ -179,11 +188,7 @@ FAST_PARTS = (0, 3)
 )
 def test_a_joint_force_that_counts_a_part_otherwise_is_named(name, change, parts):
     model, truth = known(name, 5)
-    reported = []
-    for state, a in zip(truth.states, truth.quantities, strict=True):
-        more = sum(share * carried(model, of(model, state, a)) for of, share in parts)
-        reported.append(determinate(model, state, replace(a, joint_reaction=a.joint_reaction + more)))
-    causes = diagnose(model, reported, truth).causes
+    causes = diagnose(model, with_parts(parts, model, truth), truth).causes
     assert {(cause.kind, cause.term) for cause in causes} == {("output", "joint reaction")}, causes
     assert sorted(cause.change for cause in causes) == sorted(change.split(" and "))
     assert all(cause.amount == ((1.25,) if "multiplied" in change else ()) for cause in causes)
@@ -332,13 +337,9 @@ def test_a_factor_is_named_beside_the_number_that_has_the_same_effect():
 def test_an_output_and_a_term_that_is_left_out_are_found_without_a_search(monkeypatch):
     model, truth = known(LOOP, 5)
     monkeypatch.setattr("plumbline.diagnosis.fit.number_edits", lambda _: pytest.fail("a search"))
-    parts = PARTS[4][2]
-    reported = []
-    for state, a in zip(truth.states, truth.quantities, strict=True):
-        more = sum(share * carried(model, of(model, state, a)) for of, share in parts)
-        reported.append(determinate(model, state, replace(a, joint_reaction=a.joint_reaction + more)))
-    (cause,) = diagnose(model, reported, truth).causes
-    assert cause.change == PARTS[4][1]
+    _, change, parts = PARTS[4]
+    (cause,) = diagnose(model, with_parts(parts, model, truth), truth).causes
+    assert cause.change == change
 
 
 @pytest.mark.parametrize("name", [CHAIN, TREE, LOOP])

@@ -12,9 +12,9 @@ from plumbline.equations.tree import Tree
 from plumbline.model.datatypes import KINDS
 from plumbline.model.kinematics import stack_states
 from plumbline.model.loops import cut_open, independent_rows
-from plumbline.model.random_mechanisms import ELEMENTS, random_tree
 from plumbline.model.sampling import random_states
 from plumbline.truth.parameters import derivative, list_parameters
+from tests.equations.test_tree import sprung_tree
 from tests.helpers.catalogue import catalogue_scenario
 
 BITS, STEP = 400, 1e-30
@@ -90,12 +90,7 @@ def midpoints(change):
 @pytest.mark.parametrize("kinds", [("rod", "ball"), tuple(KINDS)], ids=len)
 @pytest.mark.parametrize("seed", [1, *(pytest.param(n, marks=pytest.mark.full) for n in range(2, 12))])
 def test_derivatives_of_trees_with_every_element(kinds, seed):
-    rng = np.random.default_rng(seed)
-    model = random_tree(rng, 5, kinds, elements=ELEMENTS).changed(
-        spring_body=np.array([[0, 1], [1, 2], [2, -1]]),
-        spring_point=0.5 * rng.normal(size=(3, 2, 3)),
-        **{f"spring_{name}": rng.uniform(0.5, 1.5, 3) for name in ("stiffness", "damping", "length")},
-    )
+    model = sprung_tree(seed, kinds)
     check_jets(model, random_states(model, 1, seed)[0], seed, (), ())
 
 

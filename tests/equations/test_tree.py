@@ -30,17 +30,20 @@ SAMPLE = (
 TREES = [name for name, scenario in catalogue_scenarios().items() if not scenario.model.has_loops]
 
 
+def sprung_tree(seed, kinds):
+    """Rotors of ball joints on moving bodies, and several springs at one body."""
+    rng = np.random.default_rng(seed)
+    return random_tree(rng, 5, kinds, elements=ELEMENTS).changed(
+        spring_body=np.array([[0, 1], [1, 2], [2, -1]]),
+        spring_point=0.5 * rng.normal(size=(3, 2, 3)),
+        **{f"spring_{name}": rng.uniform(0.5, 1.5, 3) for name in ("stiffness", "damping", "length")},
+    )
+
+
 @pytest.mark.parametrize("kinds", [("ball",), ("hinge", "ball"), tuple(KINDS)], ids=len)
 @pytest.mark.parametrize("seed", [1, 2, *(pytest.param(n, marks=pytest.mark.full) for n in range(3, 20))])
 def test_trees_with_every_element_are_certified(kinds, seed):
-    """Rotors of ball joints on moving bodies, and several springs at one body."""
-    model = random_tree(np.random.default_rng(seed), 5, kinds, elements=ELEMENTS)
-    ends = np.array([[0, 1], [1, 2], [2, -1]])
-    model = model.changed(
-        spring_body=ends,
-        spring_point=0.5 * np.random.default_rng(seed).normal(size=(3, 2, 3)),
-        **{f"spring_{name}": np.array([0.7, 1.1, 1.3]) for name in ("stiffness", "damping", "length")},
-    )
+    model = sprung_tree(seed, kinds)
     for state in random_states(model, 2, seed):
         certify_state(model, state, mass_matrix=True)
 

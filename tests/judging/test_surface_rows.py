@@ -59,6 +59,21 @@ def verdicts(truth, answers):
     return {row.quantity: row.verdict for row in rows}
 
 
+def assert_all_but_wrong_agree(engine, found):
+    wrong = {name for name, verdict in found.items() if verdict != Verdict.AGREES}
+    assert len(found) >= 10 and wrong == WRONG.get(engine, set()) & set(found), found
+
+
+def assert_changes_are_seen(truth, answers):
+    """Relative ones of 1e-6."""
+    more = {name: {call: x * (1 + 1e-6) for call, x in calls.items()} for name, calls in answers.items()}
+    assert set(verdicts(truth, more).values()) == {Verdict.DISAGREES}
+
+
+def assert_agree(rows):
+    assert {row.verdict for row in rows} == {Verdict.AGREES}, [row.reason for row in rows]
+
+
 def rows_of_variants(truth, variants):
     return judge_variants(WHO, truth, Evaluation([], None, None, 0.0, variants=variants))
 
@@ -76,8 +91,7 @@ def test_every_call_agrees_and_a_relative_change_of_1e_6_is_seen(engine, given, 
     model, states, truth = request.getfixturevalue(given)
     answers = answers_of(engine, model, states)
     found = verdicts(truth, answers)
-    wrong = {name for name, verdict in found.items() if verdict != Verdict.AGREES}
-    assert len(found) >= 10 and wrong == WRONG.get(engine, set()) & set(found), found
+    assert_all_but_wrong_agree(engine, found)
     calls = {name for by_call in answers.values() for call in by_call for name in call}
     evaluation = Evaluation([], None, None, 0.0, surface=answers)
     assert set(exercised_names(truth, evaluation)) == calls
@@ -165,10 +179,8 @@ def test_bodies_of_a_loop_are_compared_and_a_relative_change_of_1e_6_is_seen(eng
     states = states_of(s, 2)[:2]
     truth, answers = state_truth(s.model, states), answers_of(engine, s.model, states)
     found = verdicts(truth, answers)
-    wrong = {name for name, verdict in found.items() if verdict != Verdict.AGREES}
-    assert len(found) >= 10 and wrong == WRONG.get(engine, set()) & set(found), found
-    more = {name: {call: x * (1 + 1e-6) for call, x in calls.items()} for name, calls in answers.items()}
-    assert set(verdicts(truth, more).values()) == {Verdict.DISAGREES}
+    assert_all_but_wrong_agree(engine, found)
+    assert_changes_are_seen(truth, answers)
 
 
 @pytest.mark.parametrize(("engine", "count"), [("mujoco", 30), ("pinocchio", 20), ("exudyn", 15)])
@@ -177,8 +189,7 @@ def test_every_variant_agrees_and_a_relative_change_of_1e_6_is_seen(engine, coun
     evaluation = Evaluation(
         [], None, None, 0.0, variants=evaluate_variants(load_adapter(engine), model, states)
     )
-    rows = judge_variants(WHO, truth, evaluation)
-    assert {row.verdict for row in rows} == {Verdict.AGREES}, [row.reason for row in rows]
+    assert_agree(judge_variants(WHO, truth, evaluation))
     names = {name for variants in evaluation.variants.values() for call in variants for name in call}
     assert len(names) >= count and set(exercised_names(truth, evaluation)) == names
 
@@ -208,8 +219,7 @@ def test_slow_motions_without_loads_agree_by_steps(engine):
     states = [complete_state(model, state) for state in slow]
     variants = evaluate_variants(load_adapter(engine), model, states)
     assert any({"SolveDynamic", "mj_step"} & set(names) for names in variants["option"])
-    rows = rows_of_variants(state_truth(model, states), {"option": variants["option"]})
-    assert {row.verdict for row in rows} == {Verdict.AGREES}, [row.reason for row in rows]
+    assert_agree(rows_of_variants(state_truth(model, states), {"option": variants["option"]}))
 
 
 def test_variants_of_flat_bodies_and_of_frames_turned_by_quarters_agree():
@@ -221,8 +231,7 @@ def test_variants_of_flat_bodies_and_of_frames_turned_by_quarters_agree():
     states = random_states(model, 3, 1)
     truth = state_truth(model, states)
     variants = evaluate_variants(load_adapter("mujoco"), model, states)
-    rows = rows_of_variants(truth, variants)
-    assert {row.verdict for row in rows} == {Verdict.AGREES}, [row.reason for row in rows]
+    assert_agree(rows_of_variants(truth, variants))
 
 
 def test_a_variant_that_fails_or_is_wrong_is_named(tree):
@@ -247,8 +256,7 @@ def test_pinocchios_rates_of_composite_joints_disagree_and_those_of_single_ones_
     truth, answers = state_truth(model, states), answers_of("pinocchio", model, states)
     found = verdicts(truth, answers)
     assert {name for name, verdict in found.items() if verdict != Verdict.AGREES} == RECORDED
-    more = {name: {call: x * (1 + 1e-6) for call, x in calls.items()} for name, calls in answers.items()}
-    assert set(verdicts(truth, more).values()) == {Verdict.DISAGREES}
+    assert_changes_are_seen(truth, answers)
     assert set(verdicts(truth, answers_of("mujoco", model, states)).values()) == {Verdict.AGREES}
 
 

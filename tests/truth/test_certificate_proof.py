@@ -215,17 +215,10 @@ def test_numbers_of_a_tree_off_by_one_ulp_give_wider_balls_that_are_true(proofs,
     fields = ["armature", "damping", "stiffness", "rest", "effort", "x", "xdot", "point", "spring_point"]
     fields += ["spring_length", "spring_stiffness", "spring_damping"]
     for field in fields + ["turn"] * (model.kind[-1] not in ("ball", "free")):
-        record = state if field in ("x", "xdot") else model
-        array = getattr(record, field).copy()
-        last = array[-1:]  # of the joints, not a free body's
-        if not np.any(last):
+        record = state if field in vars(state) else model
+        if not np.any(getattr(record, field)[-1:]):
             continue
-        largest = np.unravel_index(np.argmax(np.abs(last)), last.shape)
-        last[largest] = np.nextafter(last[largest], np.inf)
-        if field == "turn":
-            last[0, 0, 1] += 2.0**-52  # the largest may be the only one, and is normalised
-        changed = replace(record, **{field: array})
-        pair = (model, changed) if record is state else (changed, state)
+        pair = with_one_ulp(model, state, field, slice(-1, None))  # of the joints, not a free body's
         numbers = {key: hexadecimal(x) for key, x in checked_numbers(*pair).items()}
         try:
             found = enclose(document | numbers)
@@ -233,6 +226,19 @@ def test_numbers_of_a_tree_off_by_one_ulp_give_wider_balls_that_are_true(proofs,
             continue
         assert found.radius("r") + found.radius("p") > 1e-18, f"{field} makes no difference"
         assert overlap(found, prove_motion(*pair, TIMES)[1]), field
+
+
+def with_one_ulp(model, state, field, rows=slice(None)):
+    """The mechanism whose largest number in some rows of a field is off by one ulp."""
+    record = state if field in vars(state) else model
+    array = getattr(record, field).copy()
+    part = array[rows]
+    largest = np.unravel_index(np.argmax(np.abs(part)), part.shape)  # of an inertia, on the diagonal
+    part[largest] = np.nextafter(part[largest], np.inf)
+    if field == "turn":
+        part[0, 0, 1] += 2.0**-52  # the largest may be the only one, and is normalised
+    changed = replace(record, **{field: array})
+    return (model, changed) if record is state else (changed, state)
 
 
 def hexadecimal(x):
@@ -379,13 +385,7 @@ def test_a_wrong_coefficient_is_rejected_or_covered(proofs, name, bits, expected
 def test_a_number_that_is_off_by_one_ulp_gives_wider_balls_that_are_true(proofs, field):
     """The balls must contain the motion of the file's own numbers: proved from a candidate of them."""
     model, state, document, _ = proofs["rod-ball"]
-    record = state if field in ("p", "omega") else model
-    array = getattr(record, field).copy()
-    largest = np.unravel_index(np.argmax(np.abs(array)), array.shape)  # of an inertia, on the diagonal
-    array[largest] = np.nextafter(array[largest], np.inf)
-    changed = replace(state, **{field: array}) if record is state else replace(model, **{field: array})
-    pair = (model, changed) if record is state else (changed, state)
-    raw, right = prove_motion(*pair, TIMES)
+    raw, right = prove_motion(*with_one_ulp(model, state, field), TIMES)
     own = json.loads(gzip.decompress(raw))
     found = enclose(own | {"steps": document["steps"]})
     assert found.radius("r") > 1e3 * right.radius("r")
