@@ -8,7 +8,7 @@ import numpy as np
 
 from plumbline.model.kinematics import maximal_coordinates
 from reference_impl.fast.chain_elimination import component_first
-from tests.helpers.random_chains import random_state
+from tests.helpers.random_chains import random_model, random_state
 
 
 def state_on_manifold(chain, rng):
@@ -30,6 +30,13 @@ def body_first(q, v):
 def state_off_manifold(chain, rng):
     """r, p, ṙ, ṗ that satisfy nothing: no joint, no norm, pᵀṗ ≠ 0."""
     return tuple(x + 0.2 * rng.normal(size=x.shape) for x in state_on_manifold(chain, rng))
+
+
+def loaded_chain(rods, seed, states=state_on_manifold):
+    """A random chain with loads and drag, and r, p, ṙ, ṗ of it."""
+    rng = np.random.default_rng(seed)
+    chain = random_model(rng, rods, loads=True, drag=True)
+    return chain, states(chain, rng)
 
 
 class Symbols:

@@ -18,7 +18,7 @@ from reference_impl.integrate import (
     unpack_state,
 )
 from reference_impl.joints import constraint_rows
-from tests.helpers.notes_test_data import Symbols, state_off_manifold, state_on_manifold
+from tests.helpers.notes_test_data import Symbols, loaded_chain, state_off_manifold, state_on_manifold
 from tests.helpers.random_chains import random_model
 
 MIXES = [[True], [False], [True, True], [False, False], [True, False, False, True, False], [False] * 50]
@@ -45,9 +45,7 @@ def test_N2_is_lagranges_equation():
 @pytest.mark.parametrize("states", [state_on_manifold, state_off_manifold])
 @pytest.mark.parametrize("n", [1, 2])
 def test_N5_is_assembled_as_printed(n, states):
-    rng = np.random.default_rng(n)
-    chain = random_model(rng, [True] * n, loads=True, drag=True)
-    state = states(chain, rng)
+    chain, state = loaded_chain([True] * n, n, states)
     S, b = DirectSystem(chain).assemble(*state)
     S_printed, b_printed = notes.assemble_system(chain, *state)
     np.testing.assert_allclose(S, S_printed, rtol=1e-14, atol=1e-15)
@@ -58,9 +56,7 @@ def test_N5_is_assembled_as_printed(n, states):
 @pytest.mark.parametrize("rods", MIXES, ids=str)
 def test_the_band_and_the_dense_form_give_the_same_solution(rods, states):
     """Both solve S x = b to a backward error of a few roundings, so they differ by that times κ at most."""
-    rng = np.random.default_rng(len(rods))
-    chain = random_model(rng, rods, loads=True, drag=True)
-    state = states(chain, rng)
+    chain, state = loaded_chain(rods, len(rods), states)
     system = DirectSystem(chain)
     S, b = system.assemble(*state)
     x, dense = unknowns_vector(system.solve(*state)), solve_dense(S, b)
@@ -78,10 +74,8 @@ def test_the_band_and_the_dense_form_give_the_same_solution(rods, states):
 @pytest.mark.parametrize("rods", MIXES, ids=str)
 def test_the_solution_obeys_newton_and_euler(rods, without):
     """m r̈ = F + reactions and J ω̇′ + ω′ × J ω′ = moments of the reactions about the centre of mass + n′."""
-    rng = np.random.default_rng(11 + len(rods))
-    chain = random_model(rng, rods, loads=True, drag=True)
+    chain, (r, p, v, pdot) = loaded_chain(rods, 11 + len(rods))
     chain = chain.changed(**{name: np.zeros(chain.n) for name in without})
-    r, p, v, pdot = state_on_manifold(chain, rng)
     x = DirectSystem(chain).solve(r, p, v, pdot)
     omega, turn = angular_velocity(p, pdot), A(p)
     near, far = x.joint_reaction, -np.concatenate([x.joint_reaction[1:], np.zeros((1, 3))])
@@ -102,9 +96,7 @@ def test_the_solution_obeys_newton_and_euler(rods, without):
 
 def test_units_do_not_decide_the_digits():
     """The same motion with masses × 2^±30: without equilibration the pivots would follow the units."""
-    rng = np.random.default_rng(5)
-    chain = random_model(rng, [True, False, True], loads=True, drag=True)
-    state = state_on_manifold(chain, rng)
+    chain, state = loaded_chain([True, False, True], 5)
     x = DirectSystem(chain).solve(*state)
     loads = ("mass", "inertia", "force", "moment", "drag_force", "drag_moment")
     for scale in (2.0**-30, 2.0**30):
@@ -136,9 +128,7 @@ def test_refinement_solves_every_row_to_its_own_rounding():
 
 def test_a_planted_defect_is_added_to_every_gamma():
     """C_r r̈ + C_p p̈ = γ + δ, a δ for each row."""
-    rng = np.random.default_rng(14)
-    chain = random_model(rng, [True, False, True], loads=True, drag=True)
-    state = state_on_manifold(chain, rng)
+    chain, state = loaded_chain([True, False, True], 14)
     joints, delta = constraint_rows(chain, *state), np.arange(1.0, 6.0)
     x = DirectSystem(chain).solve(*state, gamma_defect=delta)
     np.testing.assert_allclose(
@@ -166,17 +156,14 @@ def test_units_do_not_decide_the_steps_of_N6():
 
 
 def test_a_vanishing_step_of_N6_is_an_error():
-    rng = np.random.default_rng(16)
-    chain = random_model(rng, [False], loads=True, drag=True)
+    chain, state = loaded_chain([False], 16)
     stiff = chain.changed(drag_force=np.array([1e17]))
     with pytest.raises(ArithmeticError, match="DOP853 stopped at t = "):
-        integrate_dop853(stiff, *state_on_manifold(chain, rng), np.array([1.0, 2.0]), 1e-6)
+        integrate_dop853(stiff, *state, np.array([1.0, 2.0]), 1e-6)
 
 
 def test_N6_orders_y_as_r_p_v_pdot():
-    rng = np.random.default_rng(8)
-    chain = random_model(rng, [True, False], loads=True, drag=True)
-    state = state_on_manifold(chain, rng)
+    chain, state = loaded_chain([True, False], 8)
     y = pack_state(*state)
     for part, back in zip(state, unpack_state(y, 2), strict=True):
         np.testing.assert_array_equal(part, back)
@@ -214,9 +201,7 @@ def test_N6_swings_with_the_exact_period():
 
 def test_samples_do_not_change_the_steps():
     """Dense output: the same steps whatever times are asked, and the last sample is a step's own end."""
-    rng = np.random.default_rng(9)
-    chain = random_model(rng, [True, False], loads=True, drag=True)
-    state = state_on_manifold(chain, rng)
+    chain, state = loaded_chain([True, False], 9)
     few = integrate_dop853(chain, *state, np.array([0.0, 1.0]), 1e-10)
     many = integrate_dop853(chain, *state, np.linspace(0, 1, 101), 1e-10)
     assert (few.steps, few.t.size, many.t.size) == (many.steps, 2, 101)
@@ -226,12 +211,10 @@ def test_samples_do_not_change_the_steps():
 
 
 def test_natural_sizes_are_of_the_stretched_chain_its_fall_and_its_motion():
-    rng = np.random.default_rng(12)
-    chain = random_model(rng, [True, False, True], loads=True, drag=True)
+    chain, (r, p, v, _) = loaded_chain([True, False, True], 12)
     near, far = (np.linalg.norm(s, axis=1) for s in (chain.proximal, chain.distal))
     reach = np.sum(chain.length) + np.sum(near) + far[0] + far[1]
     fall = np.sqrt(np.linalg.norm(chain.gravity) * reach)
-    r, p, v, _ = state_on_manifold(chain, rng)
 
     def sizes(r, v, omega, chain=chain):
         y = state_scales(chain, r, p, v, pdot_of(p, omega))
@@ -251,9 +234,8 @@ def test_natural_sizes_are_of_the_stretched_chain_its_fall_and_its_motion():
 
 
 def test_the_structured_form_integrates_the_same_and_steps_are_counted(monkeypatch):
-    rng = np.random.default_rng(13)
-    chain = random_model(rng, [True, False, True], loads=True, drag=True)
-    state, times = state_on_manifold(chain, rng), np.linspace(0, 0.3, 4)
+    chain, state = loaded_chain([True, False, True], 13)
+    times = np.linspace(0, 0.3, 4)
     counted = []
 
     class Counted(integrator.DOP853):
@@ -283,10 +265,9 @@ def test_the_printed_system_is_exact_on_complex_numbers():
 
 
 def test_one_and_two_bodies_are_what_the_notes_print():
-    rng = np.random.default_rng(3)
-    chain = random_model(rng, [True] * 3, loads=True, drag=True)
+    chain, state = loaded_chain([True] * 3, 3)
     with pytest.raises(ValueError, match="one and two bodies"):
-        notes.assemble_system(chain, *state_on_manifold(chain, rng))
+        notes.assemble_system(chain, *state)
 
 
 def test_equilibration_is_by_the_powers_of_two_that_bring_entries_near_1():

@@ -7,8 +7,7 @@ from reference_impl.euler_parameters import dot
 from reference_impl.joints import constraint_rows
 from reference_impl.mechanism import Mechanism
 from reference_impl.notes import DoublePendulum, SinglePendulum
-from tests.helpers.notes_test_data import Symbols, state_off_manifold, state_on_manifold
-from tests.helpers.random_chains import random_model
+from tests.helpers.notes_test_data import Symbols, loaded_chain, state_off_manifold, state_on_manifold
 
 
 def symbolic_chain(rods):
@@ -69,9 +68,7 @@ def test_every_mix_of_two_differentiates(rods):
 @pytest.mark.parametrize("states", [state_on_manifold, state_off_manifold])
 def test_a_long_mixed_chain_differentiates_by_complex_step(states):
     """Ċ and γ at N = 7; off the manifold pᵀṗ is taken out first, since γ holds only without it (E3)."""
-    rng = np.random.default_rng(0)
-    chain = random_model(rng, [True, False, True, True, False, False, True], loads=True, drag=True)
-    r, p, v, pdot = states(chain, rng)
+    chain, (r, p, v, pdot) = loaded_chain([True, False, True, True, False, False, True], 0, states)
     pdot = pdot - p * (dot(p, pdot) / dot(p, p))[:, None]
     joints, h = constraint_rows(chain, r, p, v, pdot), 1e-30
     moved = constraint_rows(chain, r + 1j * h * v, p + 1j * h * pdot, v.astype(complex), pdot.astype(complex))
@@ -80,9 +77,7 @@ def test_a_long_mixed_chain_differentiates_by_complex_step(states):
 
 
 def test_consistent_states_satisfy_every_row():
-    rng = np.random.default_rng(1)
-    chain = random_model(rng, [True, False, False, True, True], loads=True, drag=True)
-    r, p, v, pdot = state_on_manifold(chain, rng)
+    chain, (r, p, v, pdot) = loaded_chain([True, False, False, True, True], 1)
     joints = constraint_rows(chain, r, p, v, pdot)
     assert len(joints.C) == 9
     np.testing.assert_allclose(joints.C, 0, atol=1e-15)
@@ -91,9 +86,8 @@ def test_consistent_states_satisfy_every_row():
 
 
 def test_a_balls_rows_keep_their_order_in_a_long_chain():
-    rng = np.random.default_rng(2)
-    chain = random_model(rng, [True, False, False] * 15, loads=True, drag=True)
-    joints = constraint_rows(chain, *state_on_manifold(chain, rng))
+    chain, state = loaded_chain([True, False, False] * 15, 2)
+    joints = constraint_rows(chain, *state)
     assert np.all(np.diff(joints.joint) >= 0)
     balls = joints.r_near[~chain.rods[joints.joint]].reshape(-1, 3, 3)
     np.testing.assert_array_equal(balls, np.broadcast_to(np.eye(3), (30, 3, 3)))

@@ -8,7 +8,7 @@ import pytest
 from plumbline.studies.drift import drift_errors
 from reference_impl.integrate import direct_acceleration, integrate_dop853
 from reference_impl.joints import constraint_rows
-from tests.helpers.notes_test_data import state_on_manifold
+from tests.helpers.notes_test_data import loaded_chain, state_on_manifold
 from tests.helpers.random_chains import random_model
 
 GAMMA_DEFECT = 1e-4
@@ -17,9 +17,7 @@ GAMMA_DEFECT = 1e-4
 @pytest.mark.parametrize("rods", [[True], [False], [True, False, True]], ids=str)
 def test_an_injected_defect_comes_out_as_delta_t_and_half_delta_t_squared(rods):
     """One δ per row, all different, signs mixed; truncation (rtol 1e-12) is far below 1 % of it."""
-    rng = np.random.default_rng(len(rods))
-    chain = random_model(rng, rods, loads=True, drag=True)
-    state = state_on_manifold(chain, rng)
+    chain, state = loaded_chain(rods, len(rods))
     count = int(np.sum(np.where(rods, 1, 3)))
     delta = GAMMA_DEFECT * (1 + np.arange(count)) * (-1.0) ** np.arange(count)
     times = np.linspace(0, 2, 9)

@@ -10,7 +10,7 @@ from reference_impl.integrate import integrate_dop853
 from reference_impl.joints import constraint_rows
 from reference_impl.mechanism import Mechanism
 from reference_impl.singular_system import SingularSystem
-from tests.helpers.notes_test_data import Symbols, state_off_manifold, state_on_manifold
+from tests.helpers.notes_test_data import Symbols, loaded_chain, state_off_manifold, state_on_manifold
 from tests.helpers.random_chains import random_model
 
 
@@ -57,9 +57,7 @@ def test_E1_printed_with_length_0_is_singular_and_names_the_body(n):
 
 def test_E1_a_rod_whose_ends_meet_is_singular_in_the_general_form_too():
     """Also where rounding leaves 1e-17 of d, which would otherwise be solved as a direction."""
-    rng = np.random.default_rng(0)
-    chain = random_model(rng, [False, False, False], loads=True, drag=True)
-    r, p, v, pdot = state_on_manifold(chain, rng)
+    chain, (r, p, v, pdot) = loaded_chain([False, False, False], 0)
     rod = chain.changed(length=np.array([0, 0, 0.4]))
     d = constraint_rows(rod, r, p, v, pdot).d[2]
     assert np.linalg.norm(d) < 1e-15
@@ -68,9 +66,7 @@ def test_E1_a_rod_whose_ends_meet_is_singular_in_the_general_form_too():
 
 
 def test_E1_the_length_changes_neither_jacobians_nor_gamma():
-    rng = np.random.default_rng(1)
-    chain = random_model(rng, [True, True], loads=True, drag=True)
-    state = state_on_manifold(chain, rng)
+    chain, state = loaded_chain([True, True], 1)
     longer = chain.changed(length=chain.length + 1)
     one, other = (DirectSystem(c).assemble(*state) for c in (chain, longer))
     np.testing.assert_array_equal(one[0], other[0])
@@ -146,9 +142,7 @@ def test_E2_off_the_sphere_is_another_constraint():
 
 def test_E3_is_exact_for_a_chain():
     """γ_true − γ = −d_t(C) rows with 2 (pᵀṗ) I added to every Ȧ, the single one −4 (s₁ᵀṙ)(pᵀṗ)."""
-    rng = np.random.default_rng(5)
-    chain = random_model(rng, [True, True, True], loads=True, drag=True)
-    r, p, v, pdot = state_off_manifold(chain, rng)
+    chain, (r, p, v, pdot) = loaded_chain([True, True, True], 5, state_off_manifold)
     h = 1e-30
     joints = constraint_rows(chain, r, p, v, pdot)
     moved = constraint_rows(chain, r + 1j * h * v, p + 1j * h * pdot, v.astype(complex), pdot.astype(complex))
@@ -187,9 +181,7 @@ def test_E5_multipliers_at_rest_carry_the_weight(rods):
 
 
 def test_E5_the_reaction_of_a_rod_is_minus_2_lambda_d():
-    rng = np.random.default_rng(6)
-    chain = random_model(rng, [True, True], loads=True, drag=True)
-    state = state_on_manifold(chain, rng)
+    chain, state = loaded_chain([True, True], 6)
     x, d = DirectSystem(chain).solve(*state), constraint_rows(chain, *state).d
     np.testing.assert_allclose(x.joint_reaction, -2 * x.multiplier[:, None] * d, atol=1e-14)
     np.testing.assert_allclose(np.abs(x.tension), np.linalg.norm(x.joint_reaction, axis=1), rtol=1e-14)
@@ -212,9 +204,7 @@ def test_E6_the_recognised_text_without_transposes_is_not_the_derivative():
 
 
 def test_E7_rank_three_without_the_normalisation_row():
-    rng = np.random.default_rng(7)
-    chain = random_model(rng, [True], loads=True, drag=True)
-    r, p, v, pdot = state_on_manifold(chain, rng)
+    chain, (r, p, v, pdot) = loaded_chain([True], 7)
     block = 4 * L(p[0]).T @ chain.inertia[0] @ L(p[0])
     assert np.linalg.matrix_rank(block) == 3
     np.testing.assert_allclose(block @ p[0], 0, atol=1e-15)
@@ -230,9 +220,7 @@ def test_E7_rank_three_without_the_normalisation_row():
 
 @pytest.mark.parametrize("rods", [[True, True], [False, False], [True, False]], ids=str)
 def test_E7_p_zero_names_the_body(rods):
-    rng = np.random.default_rng(8)
-    chain = random_model(rng, rods, loads=True, drag=True)
-    r, p, v, pdot = state_on_manifold(chain, rng)
+    chain, (r, p, v, pdot) = loaded_chain(rods, 8)
     p[1] = 0
     with pytest.raises(SingularSystem, match=r"p of body 2 is 0.*E7"):
         DirectSystem(chain).solve(r, p, v, pdot)
@@ -251,9 +239,7 @@ def test_E7_singular_inertia_names_the_body():
 
 def test_E1_a_rod_is_as_short_as_its_own_surroundings_allow():
     """A rod of 1e-9 m is a direction beside bodies of decimetres, and rounding 1e7 m from the pivot."""
-    rng = np.random.default_rng(16)
-    chain = random_model(rng, [True, True], loads=True, drag=True)
-    r, p, *_ = state_on_manifold(chain, rng)
+    chain, (r, p, *_) = loaded_chain([True, True], 16)
     far = np.array([[0, 0, 0], [1e7, 0, 0]])
     d, entries = 1e-9 * np.eye(3)[:2], (np.ones(1),)
     check_state_solvable(chain, r, p, d, chain.rods, entries)
