@@ -15,6 +15,7 @@ from plumbline.truth.certified_state import certify_state
 from plumbline.truth.rounding_bound import state_rounding_bound
 from tests.helpers.nightly_tests import SLOW
 from tests.helpers.planting import model_change, number_change, turned_by
+from tests.helpers.random_chains import tree_from_seed
 from tests.helpers.shared_answers import sharing
 from tests.helpers.true_answers import assert_reported, assert_within_bound
 
@@ -69,7 +70,7 @@ def test_bodies_without_inertia_are_right_where_they_are_determinate(engine):
 def test_a_turn_without_inertia_is_found():
     model = without_inertia(1)
     (state,) = random_states(model, 1, 1)
-    alone = random_tree(np.random.default_rng(0), 2, ("ball",))
+    alone = tree_from_seed(0, 2, ("ball",))
     point = replace(alone, inertia=alone.inertia * np.array([1.0, 0.0])[:, None, None])
     (at,) = random_states(point, 1, 0)
     assert motion_without_inertia(point, at) == 1  # it turns about the line to its joint
@@ -130,7 +131,7 @@ def is_fast(elements, kinds, seed):
 def test_states_of_random_trees_are_right_or_refused(engine, elements, kinds, seed):
     adapter, missing = load_adapter(engine), NOT_BUILT.get(engine, ())
     kinds = tuple(kind for kind in kinds if kind not in missing) or missing
-    model = random_tree(np.random.default_rng([seed, 5]), 6, kinds, elements=elements)
+    model = tree_from_seed([seed, 5], 6, kinds, elements=elements)
     states = random_states(model, 2, seed)
     if kinds == missing:
         words = ["advances", *reasons_to_refuse(engine, model, elements)]
@@ -149,7 +150,7 @@ def test_states_of_random_trees_are_right_or_refused(engine, elements, kinds, se
 
 @pytest.mark.parametrize("engine", ["mujoco", "pinocchio", "pinocchio-aba", "exudyn", "exudyn-tree"])
 def test_a_spring_on_a_hinge_that_has_turned_round_twice(engine):
-    model = random_tree(np.random.default_rng(3), 2, ("hinge",)).changed(
+    model = tree_from_seed(3, 2, ("hinge",)).changed(
         stiffness=np.array([[2.0, 0.0], [3.0, 0.0]]), rest=np.array([[0.4, 0.0], [-9.0, 0.0]])
     )
     (state,) = random_states(model, 1, 3)
@@ -159,7 +160,7 @@ def test_a_spring_on_a_hinge_that_has_turned_round_twice(engine):
 
 
 def test_an_engine_that_builds_no_trees_gives_the_reason():
-    model = random_tree(np.random.default_rng(0), 3, ("hinge",))
+    model = tree_from_seed(0, 3, ("hinge",))
     with pytest.raises(Unsupported, match="chains of rods and balls"):
         load_adapter("reference-printed").evaluate(model, random_states(model, 1, 0))
 
@@ -191,7 +192,7 @@ FAULTS = {
 def test_a_fault_in_a_joint_is_reported(engine, fault):
     kind, change = FAULTS[fault]
     model = replace(
-        random_tree(np.random.default_rng(7), 3, ("hinge",)),
+        tree_from_seed(7, 3, ("hinge",)),
         body=np.array([[-1, 0], [0, 1], [1, 2]]), kind=("hinge", kind, "hinge"),
     )  # fmt: skip
     (state,) = random_states(model, 1, 3)

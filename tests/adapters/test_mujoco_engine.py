@@ -13,7 +13,7 @@ from plumbline.model import kinematics
 from plumbline.model.datatypes import EngineFailure, State, Unsupported
 from plumbline.model.equivalent import rotate_body_frames
 from plumbline.model.kinematics import complete_state, rotation_matrix
-from plumbline.model.random_mechanisms import ELEMENTS, random_loop_mechanism, random_tree
+from plumbline.model.random_mechanisms import ELEMENTS, random_loop_mechanism
 from plumbline.model.sampling import random_states
 from plumbline.studies.random_steps import mechanism_of
 from plumbline.truth.certified_state import certify_state
@@ -28,6 +28,7 @@ import mujoco
 
 from adapters.mujoco_engine import STEP_REGULARISATIONS, Mujoco, _Tie
 from adapters.mujoco_variants import MAX_LEFT
+from tests.helpers.random_chains import tree_from_seed
 
 
 def simulate(subject, at, integrator, step, times):
@@ -103,7 +104,7 @@ OTHER_JOINTS = {  # what closes a loop, and the joints of the tree
 def test_equalities_in_place_of_joints_give_the_same_answers(option, seed):
     """Trees and loops; tendons at rest only, since MuJoCo leaves out a term of their acceleration."""
     loop, state = random_loop_mechanism(seed, 4, *OTHER_JOINTS[option])
-    tree = random_tree(np.random.default_rng(seed), 5, OTHER_JOINTS[option][1], elements=ELEMENTS)
+    tree = tree_from_seed(seed, 5, OTHER_JOINTS[option][1], elements=ELEMENTS)
     for model, at in ((loop, state), (tree, *random_states(tree, 1, seed))):
         at = at_rest(model, at) if option == "tendon equalities" else at
         assert worst_ratio(model, at, option) <= 1

@@ -9,12 +9,12 @@ import pytest
 
 from plumbline.model import kinematics
 from plumbline.model.datatypes import Unsupported
-from plumbline.model.random_mechanisms import random_tree
 from plumbline.model.sampling import random_states
 from plumbline.truth.certified_state import certify_state
 from tests.helpers import engine_process as worker
 from tests.helpers import pendulums
 from tests.helpers.catalogue import catalogue_scenario
+from tests.helpers.random_chains import tree_from_seed
 
 pin = pytest.importorskip("pinocchio")
 pinocchio_engine = pytest.importorskip("adapters.pinocchio_engine")
@@ -66,7 +66,7 @@ def test_aba_loses_the_symmetry_of_articulated_inertias():
 @in_engine_process
 def test_derivatives_of_forward_dynamics_lose_digits_by_their_inverse_alone():
     """A rod of 0.1 kg and a ball of 100 kg: ∂v̇/∂v is -∂v̇/∂τ ∂τ/∂v to rounding, and ∂v̇/∂τ is not M⁻¹."""
-    model = random_tree(np.random.default_rng(70), 2, ("ball", "rod"))
+    model = tree_from_seed(70, 2, ("ball", "rod"))
     scale = np.array([0.1, 100.0]) / model.mass
     model = replace(model, mass=model.mass * scale, inertia=model.inertia * scale[:, None, None])
     (state,) = random_states(model, 1, 70)

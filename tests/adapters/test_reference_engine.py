@@ -15,7 +15,7 @@ from tests.helpers.random_chains import random_chain
 
 def model_and_state(rods, seed=0, loads=True):
     """A generic model and a state of it."""
-    return random_chain(np.random.default_rng(seed), rods, rate=1.0, loads=loads, drag=loads)
+    return random_chain(seed, rods, rate=1.0, loads=loads, drag=loads)
 
 
 def generalized_velocity(model, state):

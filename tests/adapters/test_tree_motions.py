@@ -9,10 +9,10 @@ from plumbline.engines.registry import load_adapter
 from plumbline.model.datatypes import Unsupported
 from plumbline.model.invariants import attitude_error, compute_invariants
 from plumbline.model.kinematics import complete_state
-from plumbline.model.random_mechanisms import random_tree
 from plumbline.model.sampling import random_states
 from plumbline.truth.trajectory_truth import simulate_notes_form
 from tests.helpers.nightly_tests import SLOW
+from tests.helpers.random_chains import tree_from_seed
 from tests.helpers.shared_answers import sharing
 from tests.helpers.true_answers import converging_runs
 
@@ -46,7 +46,7 @@ def shared_truths():
 @pytest.mark.parametrize("engine", ENGINES)
 def test_motions_of_random_trees_converge_to_the_truth(engine, mix, seed):
     adapter, compared = load_adapter(engine), 0
-    model = random_tree(np.random.default_rng(seed), 6, MIXES[mix])
+    model = tree_from_seed(seed, 6, MIXES[mix])
     state = calm_state(model, seed)
     true = simulate_notes_form(model, state, TIMES, 1e-12)
     for method in (one for one in adapter.integrators if one.has_motions):
@@ -79,7 +79,7 @@ ELEMENTS = ("armature", "damping", "stiffness", "effort", "springs")
 @pytest.mark.parametrize("engine", ENGINES)
 def test_motions_with_elements_converge_to_the_truth_and_conserve_energy(engine, element, kinds):
     adapter, compared = load_adapter(engine), 0
-    model = random_tree(np.random.default_rng(3), 4, kinds, loads=False, elements=(element,))
+    model = tree_from_seed(3, 4, kinds, loads=False, elements=(element,))
     state, times = calm_state(model, 3), np.arange(17) / 128
     true = simulate_notes_form(model, state, times, 1e-12)
     for method in (one for one in adapter.integrators if one.has_motions):
@@ -106,7 +106,7 @@ def torsional_oscillator():
     """Model, state, times and attitudes of φ = φ₀ + a cos √(k/I) t: beyond half a turn both ways."""
     rest, rate = 0.5, np.sqrt(STIFFNESS / INERTIA)
     model = replace(
-        random_tree(np.random.default_rng(0), 1, ("hinge",), loads=False),
+        tree_from_seed(0, 1, ("hinge",), loads=False),
         inertia=INERTIA * np.eye(3)[None], point=np.zeros((1, 2, 3)), stiffness=np.array([[STIFFNESS, 0.0]]),
         rest=np.array([[rest, 0.0]]), turn=np.tile([1.0, 0, 0, 0], (1, 2, 1)),
     )  # fmt: skip
@@ -148,7 +148,7 @@ def test_a_spring_on_an_angle_counts_full_turns_in_the_truth():
 
 
 def test_an_engine_that_builds_no_trees_refuses_motions():
-    model = random_tree(np.random.default_rng(0), 3, ("hinge",))
+    model = tree_from_seed(0, 3, ("hinge",))
     (state,) = random_states(model, 1, 0)
     with pytest.raises(Unsupported, match="chains of rods and balls"):
         load_adapter("reference-printed").simulate(model, state, np.array([0.0, 0.25]), "dop853", 1e-9)

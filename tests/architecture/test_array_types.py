@@ -10,12 +10,12 @@ from beartype.roar import BeartypeCallHintViolation
 
 from plumbline.model.invariants import position_error
 from plumbline.model.kinematics import quaternion_product
-from plumbline.model.random_mechanisms import random_tree
+from tests.helpers.random_chains import tree_from_seed
 
 
 @pytest.fixture(scope="module")
 def model():
-    return random_tree(np.random.default_rng(0), 3, ("ball",))
+    return tree_from_seed(0, 3, ("ball",))
 
 
 def test_an_argument_of_the_wrong_shape_is_found():

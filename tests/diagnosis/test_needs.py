@@ -10,11 +10,12 @@ from plumbline.diagnosis.diagnose import diagnose
 from plumbline.diagnosis.needs import find_needs
 from plumbline.diagnosis.prediction import Predictor, View
 from plumbline.model.datatypes import KINDS, StateQuantities
-from plumbline.model.random_mechanisms import ELEMENTS, random_loop_mechanism, random_tree
+from plumbline.model.random_mechanisms import ELEMENTS, random_loop_mechanism
 from plumbline.model.sampling import random_loop_states, random_states
 from plumbline.truth.ground_truth import state_truth
 from tests.helpers import pendulums
 from tests.helpers.nightly_tests import SLOW
+from tests.helpers.random_chains import tree_from_seed
 from tests.helpers.tables import table
 
 FIELDS = {
@@ -43,7 +44,7 @@ def mechanism(family, conditions):
         if family == "chain":
             model = pendulums.make_model("rbrb", loads=True, drag=True, seed=seed)
         elif family == "tree":
-            model = random_tree(np.random.default_rng([3, seed]), 5, elements=ELEMENTS)
+            model = tree_from_seed([3, seed], 5, elements=ELEMENTS)
         else:
             model, start = random_loop_mechanism(seed, 5, [("ball", "hinge")[seed % 2]], elements=ELEMENTS)
             states = [start]

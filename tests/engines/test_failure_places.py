@@ -8,9 +8,9 @@ from plumbline.judging.findings import find_findings
 from plumbline.judging.rows import RowContext
 from plumbline.judging.state_level import judge_states
 from plumbline.model.kinematics import complete_state
-from plumbline.model.random_mechanisms import random_tree
 from plumbline.model.sampling import random_states
 from plumbline.truth.ground_truth import state_truth
+from tests.helpers.random_chains import tree_from_seed
 
 ENGINE = """
 import numpy as np
@@ -41,7 +41,7 @@ def engine(tmp_path):
 
 
 def mechanism(bodies):
-    model = random_tree(np.random.default_rng(bodies), bodies, ("hinge",))
+    model = tree_from_seed(bodies, bodies, ("hinge",))
     return model, [complete_state(model, state) for state in random_states(model, 2, 1)]
 
 

@@ -8,15 +8,16 @@ import pytest
 from plumbline.equations.arithmetic import balls, objects
 from plumbline.equations.tree import Tree
 from plumbline.model.datatypes import KINDS
-from plumbline.model.random_mechanisms import ELEMENTS, random_tree
+from plumbline.model.random_mechanisms import ELEMENTS
 from plumbline.model.sampling import random_states
+from tests.helpers.random_chains import tree_from_seed
 
 DIGITS, BITS = 60, 400
 
 
 @pytest.mark.parametrize("kinds", [("rod", "ball"), tuple(KINDS)], ids=len)
 def test_numbers_of_many_digits_lie_in_the_balls(kinds):
-    model = random_tree(np.random.default_rng(3), 8, kinds, elements=ELEMENTS)
+    model = tree_from_seed(3, 8, kinds, elements=ELEMENTS)
     (state,) = random_states(model, 1, 2)
     wrench = {3: (np.arange(3.0), np.ones(3)), 5: (np.ones(3), np.arange(3.0))}
     with mpmath.workdps(DIGITS), flint.ctx.workprec(BITS):

@@ -21,6 +21,7 @@ from plumbline.model.sampling import compared_states, random_states
 from plumbline.truth.certified_state import certify_state
 from plumbline.truth.rounding_bound import EPS, ROUNDING_FACTOR, state_rounding_bound
 from tests.helpers.catalogue import catalogue_scenario, states_of
+from tests.helpers.random_chains import tree_from_seed
 
 NAMES = (
     "chain-5-mixed", "tree-of-seven-sprung", "free-body-with-rotors", "point-mass-arm", "flyball-governor",
@@ -233,7 +234,7 @@ def test_errors_of_an_inverse_are_those_of_one_in_single_precision():
 def test_ends_without_the_velocity_terms_of_rods_as_bodies(far):
     """Of a body on a rod, below another or the world, joined to a free one; with a light body as the rod."""
     tree = replace(
-        random_tree(np.random.default_rng(5), 3, kinds=("ball",)), kind=("universal", "rod", "free"),
+        tree_from_seed(5, 3, kinds=("ball",)), kind=("universal", "rod", "free"),
         body=np.array([[-1, 0], [far, 1], [-1, 2]]), length=np.array([0.0, 0.7, 0.0]),
     )  # fmt: skip
     (state,) = random_states(tree, 1, 3)
@@ -272,7 +273,7 @@ def test_ends_without_the_velocity_terms_of_rods_as_bodies(far):
 
 def test_an_inverse_loses_nothing_of_a_body_that_an_effort_holds():
     """As nothing is multiplied by it then."""
-    tree = random_tree(np.random.default_rng(2), 1, kinds=("slide",), loads=False)
+    tree = tree_from_seed(2, 1, kinds=("slide",), loads=False)
     at_rest = State(np.array([[1.0, 0, 0, 0]]), np.zeros((1, 3)))
     state = complete_state(tree, at_rest)
     falls = Responses(tree, [state])

@@ -34,7 +34,7 @@ def make_model(joints: str, loads: bool = False, drag: bool = False, seed: int =
 
 def state_from_seed(model: Model, seed: int = 0, rate: float = 3.0) -> State:
     """A random state on the manifold; ``rate`` (rad/s) is the standard deviation of every angular rate."""
-    return random_state(np.random.default_rng(seed), model, rate)
+    return random_state(seed, model, rate)
 
 
 def reference_trajectory(model: Model, state: State, times: Array) -> Trajectory:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from plumbline.model.datatypes import Array, Model, State
 from plumbline.model.kinematics import complete_state
-from plumbline.model.random_mechanisms import random_inertias
+from plumbline.model.random_mechanisms import random_inertias, random_tree
+
+Source = np.random.Generator | int | Sequence[int]  # of random numbers: a generator, or the seed of one
 
 
 def random_model(
-    rng: np.random.Generator,
+    rng: Source,
     rods: Sequence[bool | int],
     mass_decades: float = 0.0,
     loads: bool = False,
@@ -24,7 +27,7 @@ def random_model(
     A ``moderate`` one has masses of 0.5 … 2 kg, joints 0.25 m from the centres of mass, rods of 0.4 m, loads
     of a third and gravity along no axis, so that motions of some seconds are smooth.
     """
-    n = len(rods)
+    rng, n = np.random.default_rng(rng), len(rods)
     decades = np.log10(2) if moderate else mass_decades
     mass = 10 ** rng.uniform(-decades, decades, n)
     inertia = random_inertias(rng, mass)
@@ -46,9 +49,9 @@ def random_model(
     )
 
 
-def random_state(rng: np.random.Generator, model: Model, rate: float = 2.0) -> State:
+def random_state(rng: Source, model: Model, rate: float = 2.0) -> State:
     """A state on the manifold; ``rate`` (rad/s) is the standard deviation of every angular rate."""
-    n, rod = model.n, model.rods[:, None]
+    rng, n, rod = np.random.default_rng(rng), model.n, model.rods[:, None]
     p = rng.normal(size=(n, 4))
     p /= np.linalg.norm(p, axis=1, keepdims=True)
     u = rng.normal(size=(n, 3))
@@ -59,11 +62,17 @@ def random_state(rng: np.random.Generator, model: Model, rate: float = 2.0) -> S
 
 
 def random_chain(
-    rng: np.random.Generator, rods: Sequence[bool | int], rate: float = 2.0, **options: float | bool
+    rng: Source, rods: Sequence[bool | int], rate: float = 2.0, **options: float | bool
 ) -> tuple[Model, State]:
     """A random model, ``options`` as `random_model`, and a random state of it."""
+    rng = np.random.default_rng(rng)
     model = random_model(rng, rods, **options)  # type: ignore[arg-type]
     return model, random_state(rng, model, rate)
+
+
+def tree_from_seed(seed: int | Sequence[int], *arguments: Any, **options: Any) -> Model:
+    """A random tree, arguments as `random_tree`."""
+    return random_tree(np.random.default_rng(seed), *arguments, **options)
 
 
 def in_other_units(

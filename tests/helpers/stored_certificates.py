@@ -17,12 +17,12 @@ from unittest import mock
 import numpy as np
 
 from plumbline.model.datatypes import Model, State
-from plumbline.model.random_mechanisms import ELEMENTS, random_tree
+from plumbline.model.random_mechanisms import ELEMENTS
 from plumbline.model.sampling import random_states
 from plumbline.truth import certificate_proof
 from plumbline.truth.certificate_file import JOINTS, SHAPES, parse_certificate
 from tests.helpers.catalogue import catalogue_scenario
-from tests.helpers.random_chains import random_chain
+from tests.helpers.random_chains import random_chain, tree_from_seed
 
 FOLDER = Path(__file__).parents[1] / "truth" / "certificates"
 QUANTITIES = ("r", "p", "v", "omega")
@@ -42,12 +42,12 @@ NAMES = (*CHAINS, *TREES, *SCENARIOS)
 def stored_mechanism(name: str) -> tuple[Model, State]:
     """Return the mechanism of a stored certificate, and its initial state."""
     if name in CHAINS:
-        return random_chain(np.random.default_rng(1), CHAINS[name], loads=True, drag=True)
+        return random_chain(1, CHAINS[name], loads=True, drag=True)
     if name in SCENARIOS:
         scenario = catalogue_scenario(name)
         return scenario.model, scenario.state
     seed, kinds = TREES[name]
-    model = random_tree(np.random.default_rng(seed), 3, kinds, elements=ELEMENTS)
+    model = tree_from_seed(seed, 3, kinds, elements=ELEMENTS)
     (state,) = random_states(model, 1, 2)
     return model, state
 

@@ -18,7 +18,7 @@ from plumbline.measurements.single_steps import STEP_STATES, run_step_study, ste
 from plumbline.model.datatypes import BALL, FREE, KINDS, ROD, SPRING_FIELDS
 from plumbline.model.kinematics import complete_state, quaternion_exponential, quaternion_product
 from plumbline.model.loops import STABILISATION
-from plumbline.model.random_mechanisms import random_loop_mechanism, random_tree
+from plumbline.model.random_mechanisms import random_loop_mechanism
 from plumbline.model.sampling import random_states
 from plumbline.model.step_methods import TABLEAUS, ConstrainedMethod, JointSpaceMethod, classical_runge_kutta
 from plumbline.scenario.generator import RandomScenarios, random_scenario
@@ -34,6 +34,7 @@ from tests.helpers.pendulums import JOINT_PATTERNS
 from tests.helpers.pinocchio_by_crba import steps_by_crba
 from tests.helpers.planted_steps import STEP_DEFECTS, stale_velocity, step_defect, velocity_verlet
 from tests.helpers.planting import Defect, planted
+from tests.helpers.random_chains import tree_from_seed
 from tests.helpers.requirements import require_engines, require_extended_precision
 from tests.helpers.shared_answers import by_content
 
@@ -121,7 +122,7 @@ def test_honest_engines_take_the_declared_step(engine, joints):
 
 def test_places_are_bounded_by_what_is_lost_where_a_slow_turn_becomes_fast(monkeypatch):
     """Pinocchio divides 1 − cos t by the square of a stage's turn t; a moment makes the next rate larger."""
-    model = replace(random_tree(np.random.default_rng(2), 1, (FREE,)), moment=np.array([[0.3, 0, 0.03]]))
+    model = replace(tree_from_seed(2, 1, (FREE,)), moment=np.array([[0.3, 0, 0.03]]))
     (state,), adapter = random_states(model, 1, seed=3), load_adapter("pinocchio")
     slow = [replace(state, omega=state.omega * share, v=state.v / 60) for share in (0.02, 0.005, 0.0015)]
     rows = judged(adapter, adapter.integrator("rkmk4"), model, slow)
@@ -133,7 +134,7 @@ def test_places_are_bounded_by_what_is_lost_where_a_slow_turn_becomes_fast(monke
 
 
 def test_equations_of_a_branching_tree_of_rods_and_balls_are_compared():
-    model = random_tree(np.random.default_rng(2), 4, (ROD, BALL))
+    model = tree_from_seed(2, 4, (ROD, BALL))
     assert model.body[:, 0].tolist() == [-1, 0, 1, -1]
     states, adapter = random_states(model, 2, seed=3), load_adapter("exudyn")
     for integrator in methods("exudyn"):
@@ -150,7 +151,7 @@ def test_equations_of_a_branching_tree_of_rods_and_balls_are_compared():
 def test_equations_of_trees_on_other_joints_are_compared_where_these_are_together(seed):
     """By constraints on velocities joints part by as much as the step's error, and their forces turn."""
     kinds = [kind for kind in KINDS if kind != "helical"]  # which Exudyn lacks
-    model = random_tree(np.random.default_rng(seed), 4, kinds)
+    model = tree_from_seed(seed, 4, kinds)
     states, adapter = random_states(model, 2, seed=3), load_adapter("exudyn")
     axes = model.turn.copy()
     axes[1, 0] = quaternion_product(axes[1, 0], quaternion_exponential(np.full(3, 1e-7)))
@@ -320,7 +321,7 @@ ELEMENTS = ("armature", "damping", "stiffness", "effort", "springs")
 def tree(seed, elements=ELEMENTS, missing=()):
     """A random tree on every kind of joint but some, with elements on those that take them."""
     kinds = [kind for kind in KINDS if kind not in missing]
-    model = random_tree(np.random.default_rng(seed), 7, kinds, elements=elements)
+    model = tree_from_seed(seed, 7, kinds, elements=elements)
     return model, random_states(model, 2, seed=5)
 
 
@@ -328,7 +329,7 @@ def tree(seed, elements=ELEMENTS, missing=()):
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=SLOW) for seed in range(1, 4))])
 @pytest.mark.parametrize("kinds", [tuple(KINDS), ("slide", "ball", "rod")], ids=["every joint", "slides"])
 def test_accelerations_of_trees_equal_the_certified_ones(seed, free, kinds):
-    model = random_tree(np.random.default_rng(seed), 7, kinds, elements=ELEMENTS)
+    model = tree_from_seed(seed, 7, kinds, elements=ELEMENTS)
     states = random_states(model, 2, seed=5)
     links = checked_charts(model, states, 1e-15, free_coordinates=free)
     start = links.bodies(*links.start())
@@ -356,7 +357,7 @@ def test_honest_engines_take_the_declared_step_on_trees(engine, elements, seed):
 
 def branches():
     """Two hinged branches on a sliding body, a damper between them, and a free body."""
-    model = random_tree(np.random.default_rng(2), 4, ("hinge",), elements=("damping", "stiffness", "springs"))
+    model = tree_from_seed(2, 4, ("hinge",), elements=("damping", "stiffness", "springs"))
     body = np.array([[-1, 0], [0, 1], [0, 2], [-1, 3]])
     springs = {name: getattr(model, name)[:1] for name in SPRING_FIELDS}
     used = np.array([[1, 0], [1, 0], [1, 0], [0, 0]])
@@ -579,7 +580,7 @@ def test_steps_that_have_no_formula_say_why(name, engine, words):
 
 
 def test_forces_that_do_not_depend_on_the_motion_have_the_rate_zero():
-    model = random_tree(np.random.default_rng(0), 2, ("slide",), loads=False)
+    model = tree_from_seed(0, 2, ("slide",), loads=False)
     assert step_formulas.fastest_rates(model, random_states(model, 1, 0)) == 0
 
 

@@ -19,12 +19,12 @@ from plumbline.judging.rows import RowContext, Verdict, most_wrong_call
 from plumbline.judging.state_level import judge_variants
 from plumbline.judging.surface_rows import judge_surface
 from plumbline.model.kinematics import complete_state, quaternion_product, rotation_matrix
-from plumbline.model.random_mechanisms import random_tree
 from plumbline.model.sampling import random_states
 from plumbline.studies.exercised_names import exercised_names
 from plumbline.truth.ground_truth import state_truth
 from plumbline.truth.surface_truth import SURFACE_QUANTITIES
 from tests.helpers.catalogue import catalogue_scenario, states_of
+from tests.helpers.random_chains import tree_from_seed
 
 WHO = RowContext("s", "f", "e", "The engine", "0")
 KINDS = ("rod", "ball", "hinge", "slide", "cylindrical", "free", "weld")
@@ -40,7 +40,7 @@ WRONG = {
 
 
 def mechanism(kinds, seed=5, bodies=4):
-    model = random_tree(np.random.default_rng(seed), bodies, kinds)
+    model = tree_from_seed(seed, bodies, kinds)
     return model, random_states(model, 3, seed)
 
 
@@ -162,7 +162,7 @@ def test_the_velocity_of_a_body_that_turns_about_its_centre_is_zero_within_its_b
 
 
 def test_energies_of_heavy_bodies_on_springs_and_dampers_in_weak_gravity_are_within_their_bounds():
-    model = random_tree(np.random.default_rng(0), 2, ("hinge",), elements=("stiffness", "damping"))
+    model = tree_from_seed(0, 2, ("hinge",), elements=("stiffness", "damping"))
     model = replace(model, mass=1e5 * model.mass, inertia=1e5 * model.inertia, gravity=1e-12 * model.gravity)
     states = random_states(model, 3, 1)
     answers = answers_of("mujoco", model, states)
@@ -211,7 +211,7 @@ def test_exudyns_ways_for_trees_agree_and_its_tree_of_vectors_gives_slides_the_l
 
 @pytest.mark.parametrize("engine", ["mujoco", "exudyn-tree"])
 def test_slow_motions_without_loads_agree_by_steps(engine):
-    model = random_tree(np.random.default_rng(6), 3, ("hinge",), loads=False)
+    model = tree_from_seed(6, 3, ("hinge",), loads=False)
     model = replace(model, gravity=np.zeros(3))
     slow = [
         replace(s, v=1e-6 * s.v, omega=1e-6 * s.omega, xdot=1e-6 * s.xdot) for s in random_states(model, 3, 6)

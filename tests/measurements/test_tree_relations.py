@@ -27,7 +27,7 @@ from plumbline.model.redescription import moved_root
 from plumbline.model.sampling import random_states
 from plumbline.truth.rounding_bound import state_rounding_bound
 from tests.helpers.catalogue import catalogue_scenario
-from tests.helpers.random_chains import random_chain
+from tests.helpers.random_chains import random_chain, tree_from_seed
 from tests.helpers.relation_checks import check_run_relations, check_state_relations
 from tests.helpers.shared_answers import sharing
 
@@ -137,7 +137,7 @@ REDESCRIPTION_DEFECTS = {  # the change, and the relations that see it; no other
 
 def redescribed_tree(elements=("stiffness", "damping", "springs")):
     """Bodies on hinges, a universal joint and a weld, whose root is bare, so that it can move."""
-    tree = random_tree(np.random.default_rng(5), 4, ("hinge",), elements=elements)
+    tree = tree_from_seed(5, 4, ("hinge",), elements=elements)
     bare = np.array([[True], [True], [True], [False]])
     return replace(
         tree,
@@ -184,7 +184,7 @@ def test_redescriptions_hold_on_every_engine_that_closes_loops(engine):
 
 def test_a_slow_ball_without_gravity_has_the_same_moved_root():
     """A stabilisation of 1/s² in MuJoCo's weld pulled a gap of one rounding, 1e-16 m, to zero."""
-    ball = random_chain(np.random.default_rng(0), [False])[0].changed(
+    ball = random_chain(0, [False])[0].changed(
         gravity=np.zeros(3), mass=np.array([0.69]), inertia=np.diag([0.013, 0.006, 0.008])[None],
         proximal=np.array([[-0.506, -0.121, -0.273]]),
     )  # fmt: skip
@@ -206,7 +206,7 @@ def test_relations_hold_on_loops(engine):
 @pytest.mark.parametrize("seed", range(6))
 def test_a_moved_root_is_the_same_mechanism(seed):
     """Every kind of joint reversed: the loop that the root's joint closes is closed, and bodies stay."""
-    model = random_tree(np.random.default_rng(seed), 5, elements=())
+    model = tree_from_seed(seed, 5, elements=())
     (state,) = random_states(model, 1, seed)
     moved = moved_root(model)
     if moved is None:  # a free body alone
@@ -236,9 +236,7 @@ def test_what_tendons_are_off_by_is_the_term_that_they_leave_out(seed, is_loop):
     if is_loop:
         model, state = random_loop_mechanism(seed, 4, ["rod"], kinds[:3])
     else:
-        model = random_tree(
-            np.random.default_rng(seed), 4, kinds[:1] + kinds, elements=("armature", "springs")
-        )
+        model = tree_from_seed(seed, 4, kinds[:1] + kinds, elements=("armature", "springs"))
         (state,) = random_states(model, 1, seed)
     assert "rod" in model.kind
     found = tendons(model, state)
@@ -257,7 +255,7 @@ def tendons(model, state):
 @pytest.mark.parametrize("moved", [0.0, 1e-7])
 def test_an_error_besides_the_recorded_one_of_tendons_is_a_new_disagreement(moved):
     """A tendon that ends 0.1 µm beside its point, in motion, where the recorded error is 1e11 tolerances."""
-    model = random_tree(np.random.default_rng(1), 3, ("rod", "hinge"))
+    model = tree_from_seed(1, 3, ("rod", "hinge"))
     (state,) = random_states(model, 1, 1)
 
     def tie(bodies, points, length, softness):

@@ -24,16 +24,15 @@ from plumbline.model.kinematics import (
     quaternion_product,
     quaternion_rate,
 )
-from plumbline.model.random_mechanisms import random_tree
 from tests.helpers import pendulums
 from tests.helpers.nightly_tests import SLOW
-from tests.helpers.random_chains import random_chain
+from tests.helpers.random_chains import random_chain, tree_from_seed
 
 TIMES = np.linspace(0.0, 1.0, 41)
 
 
 def make_motion(rods, times=TIMES, **options):
-    model, state = random_chain(np.random.default_rng(70), rods, **options)
+    model, state = random_chain(70, rods, **options)
     return model, pendulums.reference_trajectory(model, state, times)
 
 
@@ -101,7 +100,7 @@ def work_about_x(model, run):
 @pytest.mark.parametrize("flipped", [False, True])
 def test_work_of_a_moment_is_the_integral_of_its_power(degree, flipped):
     """Also where quaternions change their sign from sample to sample."""
-    model, _ = random_chain(np.random.default_rng(73), [False, False])
+    model, _ = random_chain(73, [False, False])
     times = np.linspace(0, 2, 65)
     angle = times ** (degree + 1) / (degree + 1)
     run = rotating_trajectory(model, angle, times**degree, times)
@@ -118,7 +117,7 @@ def test_work_of_a_moment_is_the_integral_of_its_power(degree, flipped):
 
 
 def test_work_of_a_force_needs_no_quadrature_and_drag_takes():
-    model, _ = random_chain(np.random.default_rng(74), [False, False])
+    model, _ = random_chain(74, [False, False])
     rng = np.random.default_rng(74)
     r = rng.normal(size=(25, 2, 3))
     times, force = np.linspace(0, 2, 25), rng.normal(size=(2, 3))
@@ -137,7 +136,7 @@ def test_work_of_a_force_needs_no_quadrature_and_drag_takes():
 @pytest.mark.parametrize("count, sharp", [(9, 0.1), (13, 1e-2), (25, 1e-4), (49, 1e-8)])
 def test_the_quadrature_knows_its_error(count, sharp):
     """Of a power that few samples hardly resolve the work is uncertain by at least its error."""
-    model, _ = random_chain(np.random.default_rng(75), [False])
+    model, _ = random_chain(75, [False])
     times = np.linspace(0, 2, count)
     run = rotating_trajectory(model, np.sin(9 * times) / 9, np.cos(9 * times), times)
     done, uncertainty = work_about_x(model, run)
@@ -166,7 +165,7 @@ def random_rate(rng, times):
 def test_the_work_of_random_motions_is_as_uncertain_as_it_is_wrong(seed):
     """Of a moment and of a drag, in motions that their samples resolve and in some that they do not."""
     rng = np.random.default_rng((1407, seed))
-    model, _ = random_chain(np.random.default_rng(73), [False, False])
+    model, _ = random_chain(73, [False, False])
     times = np.linspace(0, 2, int(rng.integers(3, 66)))
     rate, angle = random_rate(rng, times)
     turned = angle(times) - angle(times[:1])
@@ -184,7 +183,7 @@ def test_the_work_of_random_motions_is_as_uncertain_as_it_is_wrong(seed):
 @pytest.mark.parametrize(("width", "least"), [(0.5, 1e-4), (1.0, 1e-6), (4.0, 0.0)])
 def test_a_peak_between_samples_is_not_passed_by_wider_polynomials(width, least):
     """Six samples and eight differ by less than the error; what every second sample makes does not."""
-    model, _ = random_chain(np.random.default_rng(73), [False])
+    model, _ = random_chain(73, [False])
     times, dragged = np.linspace(0, 2, 33), model.changed(drag_moment=np.array([0.5]))
     peak = width * times[1]
     rate, angle = 1 / (1 + ((times - 1) / peak) ** 2), peak * np.arctan((times - 1) / peak)
@@ -196,7 +195,7 @@ def test_a_peak_between_samples_is_not_passed_by_wider_polynomials(width, least)
 
 
 def test_two_samples_are_integrated_and_one_is_not():
-    model, _ = random_chain(np.random.default_rng(76), [False])
+    model, _ = random_chain(76, [False])
     for times in (np.array([0.0, 0.5]), np.zeros(1)):
         done, _ = work_about_x(model, rotating_trajectory(model, times + times**2 / 2, 1 + times, times))
         np.testing.assert_allclose(done, times + times**2 / 2, atol=1e-3)
@@ -205,7 +204,7 @@ def test_two_samples_are_integrated_and_one_is_not():
 def test_the_energy_of_a_spring_counts_full_turns():
     """Also where an angle moves by more than half a turn from sample to sample: its rate chooses the turn."""
     model = replace(
-        random_tree(np.random.default_rng(0), 1, ("hinge",), loads=False),
+        tree_from_seed(0, 1, ("hinge",), loads=False),
         point=np.zeros((1, 2, 3)), turn=np.tile([1.0, 0, 0, 0], (1, 2, 1)), gravity=np.zeros(3),
         inertia=0.1 * np.eye(3)[None], stiffness=np.array([[2.5, 0.0]]), rest=np.array([[1.0, 0.0]]),
     )  # fmt: skip
@@ -274,7 +273,7 @@ def test_a_gap_is_the_vector_of_a_ball_and_the_stretch_of_a_rod():
 
 
 def test_the_ends_of_a_rod_in_one_place_are_its_length_off():
-    model, _ = random_chain(np.random.default_rng(78), [True])
+    model, _ = random_chain(78, [True])
     model = model.changed(proximal=np.zeros((1, 3)))
     found = compute_invariants(model, rotating_trajectory(model, TIMES**2 / 2, TIMES, TIMES))
     np.testing.assert_array_equal(found.joint_gap[:, 0, 0], -model.length[0])

@@ -214,7 +214,7 @@ def test_a_pendulum_of_any_size_is_solved_alike(mix):
 
 @pytest.mark.parametrize("scale", [1.0, 1e6, 1e-6])
 def test_a_collapsed_rod_is_one_of_its_own_rounding(scale):
-    model, state = random_chain(np.random.default_rng(24), [False, False, True])
+    model, state = random_chain(24, [False, False, True])
     model, state = in_other_units(model, state, scale, 1.0, 1.0)
     r, *rest = maximal_coordinates(state)
     r[2] -= state.u[2] * model.length[2]
@@ -233,7 +233,7 @@ def test_a_rod_short_beside_another_chain_s_is_no_collapsed_one():
 
 
 def test_a_collapsed_rod_on_a_body_that_is_not_turned_is_named_too():
-    model, state = random_chain(np.random.default_rng(24), [True])
+    model, state = random_chain(24, [True])
     at = complete_state(model, State(np.array([[1.0, 0, 0, 0]]), state.omega, state.u, state.udot))
     r, *rest = maximal_coordinates(at)
     with pytest.raises(SingularSystem, match="rod above body 1 has length 0"):
@@ -242,7 +242,7 @@ def test_a_collapsed_rod_on_a_body_that_is_not_turned_is_named_too():
 
 def test_losses_to_rounding_or_overflow_are_reported():
     """Bodies of 1 and 1e20 kg hold each other by rows that double precision cannot tell apart."""
-    model, state = random_chain(np.random.default_rng(24), [False] * 3)
+    model, state = random_chain(24, [False] * 3)
     heavy = np.array([1.0, 1e20, 1.0])
     uneven = model.changed(mass=heavy * model.mass, inertia=heavy[:, None, None] * model.inertia)
     with pytest.raises(SingularSystem, match="joint rows are not independent"):
@@ -254,7 +254,7 @@ def test_losses_to_rounding_or_overflow_are_reported():
 
 
 def test_the_copies_of_a_tiled_forest_have_names_too():
-    model, state = random_chain(np.random.default_rng(29), [False, False, False])
+    model, state = random_chain(29, [False, False, False])
     forest = StructuredSystem([model]).repeated(2)
     q, v = (np.tile(x, 2) for x in components(*maximal_coordinates(state)))
     q[3:, 4] = 0.0
@@ -265,7 +265,7 @@ def test_the_copies_of_a_tiled_forest_have_names_too():
 
 def test_a_body_without_thickness_is_named_beside_a_tiny_one():
     """A needle has no inertia about its axis; a body of 1e-20 kg m² has, however small."""
-    model, _ = random_chain(np.random.default_rng(30), [False, False])
+    model, _ = random_chain(30, [False, False])
     needle = model.changed(inertia=np.stack([1e-20 * np.eye(3), np.diag([1.0, 1.0, 0.0])]))
     with pytest.raises(SingularSystem, match="inertia of body 2 is singular"):
         StructuredSystem([needle])

@@ -48,7 +48,7 @@ def test_tables_integrate_polynomials_exactly(S):
 @pytest.mark.parametrize("rods", [[False], [False, False], [True], [True, False], [False, True, False]])
 def test_two_methods_share_their_digits(rods):
     """Direct form with DOP853, structured form with collocation: nothing in common but the notes."""
-    model, state = random_chain(np.random.default_rng(31), rods, loads=True, drag=True)
+    model, state = random_chain(31, rods, loads=True, drag=True)
     dop = raw.integrate_dop853(model, *maximal_coordinates(state), TIMES, 1e-13)
     ours = run(model, state, 1e-13)
     assert np.max(np.abs(ours.r - dop.r)) < (2e-11 if any(rods) else 1e-12)
@@ -59,7 +59,7 @@ def test_two_methods_share_their_digits(rods):
 
 @pytest.mark.parametrize("dense", [True, False])
 def test_the_error_follows_the_tolerance(dense):
-    model, state = random_chain(np.random.default_rng(32), [False, False])
+    model, state = random_chain(32, [False, False])
     truth = run(model, state, 1e-14)
     growth = 1e3  # of a local error by t = 1 s, at most (a perturbation of this motion grows 1e2-fold)
     for rtol in (1e-5, 1e-7, 1e-9, 1e-11):
@@ -69,7 +69,7 @@ def test_the_error_follows_the_tolerance(dense):
 
 def test_dense_output_inside_the_steps():
     """Samples between the ends of steps are as good as those at the ends."""
-    model, state = random_chain(np.random.default_rng(33), [False, True])
+    model, state = random_chain(33, [False, True])
     fine = np.linspace(0, 0.5, 83)
     inside, ends = run(model, state, 1e-10, fine), run(model, state, 1e-13, fine, dense=False)
     assert inside.steps < 40 < ends.steps
@@ -80,7 +80,7 @@ def test_dense_output_inside_the_steps():
 def test_order_is_twice_the_nodes(monkeypatch):
     """S = 2 nodes with fixed steps: order 4 at the ends of steps."""
     monkeypatch.setattr(collocation, "USUAL_SWEEPS", 1e6)  # no step is cut for its sweeps
-    model, state = random_chain(np.random.default_rng(34), [False], rate=2.0)
+    model, state = random_chain(34, [False], rate=2.0)
     truth = run(model, state, 1e-14, TIMES[[0, -1]])
     error = []
     for count in (40, 80, 160):
@@ -106,14 +106,14 @@ def test_a_batch_is_every_chain_alone():
 
 
 def test_stiffness_is_reported():
-    model, state = random_chain(np.random.default_rng(36), [False, False])
+    model, state = random_chain(36, [False, False])
     stiff = model.changed(drag_force=model.mass * 3e3)
     assert "stiff" in run(stiff, state, 1e-6, TIMES[:2]).note
     assert run(model, state, 1e-6).note == ""
 
 
 def test_rest_stays_at_rest():
-    model, state = random_chain(np.random.default_rng(37), [False])
+    model, state = random_chain(37, [False])
     still = model.changed(gravity=np.zeros(3))
     resting = replace(state, omega=np.zeros((1, 3)), v=np.zeros((1, 3)))
     moved = run(still, resting, 1e-10)
@@ -133,7 +133,7 @@ def test_other_units_take_the_same_steps(rods, dense, nodes):
 
     Of 4 nodes the tail sets the steps, of 16 the sweeps.
     """
-    model, state = random_chain(np.random.default_rng(39), rods, loads=True, drag=True)
+    model, state = random_chain(39, rods, loads=True, drag=True)
     times = TIMES[:4]
     here = run(model, state, 1e-6, times, dense=dense, nodes=nodes)
     for length, mass, second in (
@@ -180,7 +180,7 @@ class StepRecorder:
 def test_a_step_begins_with_the_last_one_s_polynomial_up_to_its_smallest_term(
     monkeypatch,
 ):
-    model, state = random_chain(np.random.default_rng(40), [False, True], rate=4.0)
+    model, state = random_chain(40, [False, True], rate=4.0)
     guess, cuts = collocation._Stepper._extrapolated_acceleration, []
 
     def checked(stepper, ratio):
@@ -206,7 +206,7 @@ def test_a_step_begins_with_the_last_one_s_polynomial_up_to_its_smallest_term(
 
 @pytest.mark.parametrize("rods, rtol", [([False, False], 1e-3), ([False, False], 1e-12), ([True], 1e-8)])
 def test_a_run_reports_its_steps(rods, rtol, monkeypatch):
-    model, state = random_chain(np.random.default_rng(40), rods, rate=4.0)
+    model, state = random_chain(40, rods, rate=4.0)
     watched = StepRecorder(monkeypatch)
     done = run(model, state, rtol, np.array([0.0, 0.7, 2.1]))
     made = np.array([h for h, _, ok, _ in watched.steps if ok])
@@ -221,7 +221,7 @@ def test_a_run_reports_its_steps(rods, rtol, monkeypatch):
 
 def test_steps_that_take_many_sweeps_are_followed_by_shorter_ones(monkeypatch):
     """Strong drag: the sweeps decide, so the step is cut before it would have to be repeated."""
-    model, state = random_chain(np.random.default_rng(36), [False, False])
+    model, state = random_chain(36, [False, False])
     watched = StepRecorder(monkeypatch)
     done = run(model.changed(drag_force=model.mass * 3e3), state, 1e-6, TIMES[:2])
     pairs = zip(watched.steps[:-2], watched.steps[1:-1], strict=True)
@@ -242,7 +242,7 @@ def test_steps_that_take_many_sweeps_are_followed_by_shorter_ones(monkeypatch):
 @pytest.mark.parametrize("dense", [True, False])
 def test_the_last_step_ends_where_it_should(dense):
     """t + (end − t) is not always the end in double precision; what is missing is no step of its own."""
-    model, state = random_chain(np.random.default_rng(41), [False])
+    model, state = random_chain(41, [False])
     drawn = np.random.default_rng(41).uniform([1e-4, 1e-3], [5e-4, 2e-3], (2000, 2))
     missed = [pair for pair in drawn if pair[0] + (pair[1] - pair[0]) != pair[1]]
     assert len(missed) > 5
@@ -252,7 +252,7 @@ def test_the_last_step_ends_where_it_should(dense):
 
 def test_a_step_that_vanishes_is_an_error():
     """Drag of 1e13/s holds the sweeps to steps of 1e-13 s: nothing beside 1000 s, but much of 1e-12 s."""
-    model, state = random_chain(np.random.default_rng(42), [False])
+    model, state = random_chain(42, [False])
     model = model.changed(drag_force=1e13 * model.mass)
     with pytest.raises(ArithmeticError, match=r"stopped at t = 0\.0 s: the step vanishes"):
         run(model, state, 1e-6, np.array([0.0, 1e3]))
@@ -271,7 +271,7 @@ def test_the_last_steps_polynomial_goes_on_in_the_next(ratio):
 
 def test_a_batch_has_every_chains_own_sizes():
     """A pendulum of a millimetre beside one of a metre keeps its own scales, and sets the first step."""
-    drawn = [random_chain(np.random.default_rng(43), [False] * n) for n in (2, 3, 1)]
+    drawn = [random_chain(43, [False] * n) for n in (2, 3, 1)]
     drawn[1] = in_other_units(*drawn[1], 1e-3, 1e-6, 1e-2)
 
     def sized(models):
@@ -290,7 +290,7 @@ def test_a_batch_has_every_chains_own_sizes():
 @pytest.mark.parametrize("rods", [[False, False], [True, False]], ids=str)
 def test_open_joints_close_at_the_stabilisation_rate(rods):
     """C̈ + 2 a Ċ + a² C = 0 has (C + (Ċ + a C) t) e^{−a t}; a projection leaves nothing at all."""
-    model, state = random_chain(np.random.default_rng(44), rods)
+    model, state = random_chain(44, rods)
     opened = replace(state, r=state.r + np.array([[0.01, 0, -0.02], [0.03, 0.01, 0]]))
     forest, times, a = StructuredSystem([model]), np.array([0.0, 0.3, 2.0]), 3.0
 
@@ -309,7 +309,7 @@ def test_open_joints_close_at_the_stabilisation_rate(rods):
 
 
 def test_close_times_are_no_vanishing_steps():
-    model, state = random_chain(np.random.default_rng(44), [False])
+    model, state = random_chain(44, [False])
     times = np.array([0.0, 0.1, 0.1 + 5e-15])
     done = run(model, state, 1e-6, times, dense=False)
     assert np.max(np.abs(done.r[2] - done.r[1])) < 1e-13
@@ -317,7 +317,7 @@ def test_close_times_are_no_vanishing_steps():
 
 def test_sweeps_end_at_what_rounding_leaves():
     """No sweep tolerance at all: the sweeps still end, and the motion is as good as double precision."""
-    model, state = random_chain(np.random.default_rng(45), [False, True], loads=True, drag=True)
+    model, state = random_chain(45, [False, True], loads=True, drag=True)
     usual, quiet = run(model, state, 1e-12), run(model, state, 1e-12, sweep_tolerance=0.0)
     assert quiet.rejected_steps <= 1
     assert np.max(np.abs(quiet.r - usual.r)) < 1e-10
@@ -325,7 +325,7 @@ def test_sweeps_end_at_what_rounding_leaves():
 
 def test_a_step_is_made_where_its_error_is_within_the_tolerance(monkeypatch):
     """Longer and longer first steps: good ones, then too long for the tolerance, then for the sweeps."""
-    model, state = random_chain(np.random.default_rng(46), [False])
+    model, state = random_chain(46, [False])
     tails, tail = [], collocation._Stepper._error_over_tolerance
 
     def noted(stepper, a, h):
@@ -347,7 +347,7 @@ def test_a_step_is_made_where_its_error_is_within_the_tolerance(monkeypatch):
 
 def test_the_tolerance_sets_the_steps(monkeypatch):
     """Of few nodes the next step's error is foreseen; of many, what takes the usual sweeps is kept."""
-    model, state = random_chain(np.random.default_rng(47), [False, False])
+    model, state = random_chain(47, [False, False])
     done = run(model, state, 1e-6, np.array([0.0, 1.0]), nodes=4)
     assert done.rejected_steps < 0.1 * done.steps and done.stiff_steps == 0
     watched = StepRecorder(monkeypatch)
@@ -358,7 +358,7 @@ def test_the_tolerance_sets_the_steps(monkeypatch):
 
 def test_no_crumb_before_a_time(monkeypatch):
     """Steps that end on the times asked for share the way to each."""
-    model, state = random_chain(np.random.default_rng(48), [False])
+    model, state = random_chain(48, [False])
     watched, times = StepRecorder(monkeypatch), np.linspace(0, 1.5, 8)
     run(model, state, 1e-9, times, dense=False)
     h = np.array([h for h, _, made, _ in watched.steps if made])
@@ -368,7 +368,7 @@ def test_no_crumb_before_a_time(monkeypatch):
 
 def test_a_thousand_steps_add_up_to_the_last_digit():
     """Constant parts: the compensated sums are the exact ones but for one rounding."""
-    model, state = random_chain(np.random.default_rng(49), [False])
+    model, state = random_chain(49, [False])
     forest, table = StructuredSystem([model]), gauss_tables(4)
     for push in (0.0, 0.3):
         stepper = make_stepper(forest, maximal_coordinates(state), table)

@@ -11,6 +11,7 @@ from plumbline.model.random_mechanisms import random_tree
 from plumbline.model.sampling import random_states
 from reference_impl.fast.chain_elimination import StructuredSystem
 from reference_impl.joints import constraint_rows
+from tests.helpers.random_chains import tree_from_seed
 
 # the rod's row is the notes' own, and an angle is no polynomial
 TESTED_KINDS = [name for name, kind in KINDS.items() if kind.rows and not kind.own_number]
@@ -69,4 +70,4 @@ def test_states_of_trees_are_on_the_manifold_and_rows_differentiate_off_it(seed)
 
 def test_the_structured_form_refuses_trees():
     with pytest.raises(ValueError, match="chains of rods and balls"):
-        StructuredSystem([random_tree(np.random.default_rng(0), 3, ("hinge",))])
+        StructuredSystem([tree_from_seed(0, 3, ("hinge",))])

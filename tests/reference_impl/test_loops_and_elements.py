@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from plumbline.model.kinematics import maximal_coordinates
-from plumbline.model.random_mechanisms import random_tree
 from plumbline.model.sampling import random_states
 from reference_impl.direct import DirectSystem
 from reference_impl.elements import Elements
@@ -19,6 +18,7 @@ from reference_impl.integrate import (
 )
 from reference_impl.mechanism import JOINT_ELEMENTS, SPRING_FIELDS, Mechanism
 from tests.helpers.catalogue import catalogue_scenario
+from tests.helpers.random_chains import tree_from_seed
 
 LOOPS = ("four-bar", "slider-crank", "bricard")  # the last is overconstrained: one row depends on the others
 
@@ -96,7 +96,7 @@ def test_whole_numbers_of_fields_are_read_as_decimals():
 
 
 def test_fields_that_a_mechanism_lacks_are_left_out():
-    bare = random_tree(np.random.default_rng(1), 3, ("hinge", "slide"), loads=False)
+    bare = tree_from_seed(1, 3, ("hinge", "slide"), loads=False)
     assert not {*JOINT_ELEMENTS, *SPRING_FIELDS} & bare.fields.keys()
     assert {"spring_body", "spring_point", "spring_stiffness", "spring_damping", "spring_length"} == {
         *SPRING_FIELDS
@@ -109,7 +109,7 @@ def test_fields_that_a_mechanism_lacks_are_left_out():
 def test_without_dampers_nothing_is_lost():
     """Of the elements, only dampers dissipate, and only springs store energy."""
     for elements in (("stiffness",), ("damping",)):
-        model = random_tree(np.random.default_rng(4), 3, ("hinge", "slide"), elements=elements)
+        model = tree_from_seed(4, 3, ("hinge", "slide"), elements=elements)
         (state,) = random_states(model, 1, 5)
         parts = maximal_coordinates(state)
         own = Elements(model)
@@ -121,7 +121,7 @@ def test_without_dampers_nothing_is_lost():
 
 def test_angles_go_on_beyond_half_a_turn():
     """A coordinate is taken near the given one, not as its principal value."""
-    model = random_tree(np.random.default_rng(2), 3, ("hinge", "cylindrical"), elements=("stiffness",))
+    model = tree_from_seed(2, 3, ("hinge", "cylindrical"), elements=("stiffness",))
     elements, (state,) = Elements(model), random_states(model, 1, 5)
     assert elements.has_winding_angles
     parts = maximal_coordinates(state)
@@ -136,7 +136,7 @@ def test_angles_go_on_beyond_half_a_turn():
 
 def test_a_spring_that_is_wound_up_pulls_by_all_its_turns():
     """A hinge alone, I φ̈ = −k φ: the pendulum is turned by 1.3 turns and let go, by both integrators."""
-    model = random_tree(np.random.default_rng(2), 1, ("hinge",), loads=False, elements=("stiffness",))
+    model = tree_from_seed(2, 1, ("hinge",), loads=False, elements=("stiffness",))
     model = model.changed(gravity=np.zeros(3), rest=np.zeros((1, 2)))
     (state,) = random_states(model, 1, 5)
     parts = state.r, state.p, 0 * state.v, np.zeros((1, 4))
@@ -158,7 +158,7 @@ def test_a_spring_that_is_wound_up_pulls_by_all_its_turns():
 
 def test_loads_alone_move_a_body_from_rest():
     """No gravity, no rate: the sizes that absolute tolerances need are those that the load reaches."""
-    model = random_tree(np.random.default_rng(2), 1, ("slide",), loads=False)
+    model = tree_from_seed(2, 1, ("slide",), loads=False)
     model = model.changed(gravity=np.zeros(3), force=np.array([[0.3, -0.2, 0.5]]))
     (state,) = random_states(model, 1, 5)
     parts = state.r, state.p, 0 * state.v, np.zeros((1, 4))
@@ -169,7 +169,7 @@ def test_loads_alone_move_a_body_from_rest():
 
 def test_sizes_of_a_motion_are_those_of_the_stretched_mechanism():
     """Points on both sides count, the world's too; rates are those of a fall through the whole length."""
-    model = random_tree(np.random.default_rng(6), 3, ("hinge",), loads=False)
+    model = tree_from_seed(6, 3, ("hinge",), loads=False)
     model = model.changed(gravity=np.array([0.0, 0.0, -9.0]))
     r, p, still, rates = np.zeros((3, 3)), np.tile([1.0, 0, 0, 0], (3, 1)), np.zeros((3, 3)), np.zeros((3, 4))
     span = np.sum(np.linalg.norm(model.point, axis=2))
@@ -187,6 +187,6 @@ def test_the_printed_equations_as_a_right_hand_side():
 
 def test_angles_of_balls_and_coordinates_of_slides_do_not_wind():
     for kind in ("ball", "slide"):
-        model = random_tree(np.random.default_rng(2), 2, (kind,), elements=("stiffness",))
+        model = tree_from_seed(2, 2, (kind,), elements=("stiffness",))
         assert np.any(model.stiffness)
         assert not Elements(model).has_winding_angles

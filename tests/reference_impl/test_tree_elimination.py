@@ -20,7 +20,7 @@ from reference_impl.joints import constraint_rows
 from reference_impl.singular_system import SingularSystem
 from tests.helpers.catalogue import catalogue_scenario
 from tests.helpers.notes_test_data import body_first, components
-from tests.helpers.random_chains import random_model
+from tests.helpers.random_chains import random_model, tree_from_seed
 
 
 def off_manifold(model, seed, size):
@@ -38,7 +38,7 @@ def accelerations(system, parts):
 @pytest.mark.parametrize("size", [0.0, 0.1])
 @pytest.mark.parametrize("seed", range(12))
 def test_accelerations_are_those_of_the_direct_form(seed, size):
-    model = random_tree(np.random.default_rng(seed), 7)
+    model = tree_from_seed(seed, 7)
     parts = off_manifold(model, seed, size)
     expected = DirectSystem(model).solve_unknowns(*parts)[0][: 7 * model.n]
     found = accelerations(TreeSystem([model]), parts)
@@ -46,7 +46,7 @@ def test_accelerations_are_those_of_the_direct_form(seed, size):
 
 
 def test_trees_side_by_side_do_not_touch_each_other():
-    models = [random_tree(np.random.default_rng(seed), n) for seed, n in enumerate((3, 1, 5))]
+    models = [tree_from_seed(seed, n) for seed, n in enumerate((3, 1, 5))]
     models[1] = models[1].changed(gravity=np.array([1.0, 2.0, 3.0]))
     parts = [off_manifold(model, 1, 0.05) for model in models]
     together = components(*(np.concatenate(part) for part in zip(*parts, strict=True)))
@@ -104,7 +104,7 @@ def test_projection_ends_on_the_constraints(what):
 
 def test_baumgarte_damps_constraint_errors():
     """C̈ + 2 a Ċ + a² C = 0, row by row, by differences along the motion."""
-    model, a, h = random_tree(np.random.default_rng(8), 5), 3.0, 1e-5
+    model, a, h = tree_from_seed(8, 5), 3.0, 1e-5
     q, v = components(*off_manifold(model, 2, 1e-3))
     acceleration = TreeSystem([model]).acceleration(q, v, baumgarte=a)
 
@@ -119,7 +119,7 @@ def test_baumgarte_damps_constraint_errors():
 
 @pytest.mark.parametrize("joints", [[0, 0, 0], [1, 0, 1], [1, 1]])
 def test_chains_from_any_point_move_as_trees_do(joints):
-    chain = random_model(np.random.default_rng(3), joints)
+    chain = random_model(3, joints)
     point = chain.point.copy()
     point[0, 0] = 0.3, -0.2, 0.5
     moved = chain.changed(point=point)
@@ -136,14 +136,14 @@ def test_chains_from_any_point_move_as_trees_do(joints):
 
 
 def test_chains_keep_their_own_form():
-    chain = random_model(np.random.default_rng(0), [1, 0])
-    tree = random_tree(np.random.default_rng(0), 2, ("hinge",))
+    chain = random_model(0, [1, 0])
+    tree = tree_from_seed(0, 2, ("hinge",))
     assert isinstance(eliminated_system([chain]), StructuredSystem)
     assert isinstance(eliminated_system([chain, tree]), TreeSystem)
 
 
 def test_a_singular_body_is_an_error():
-    model = random_tree(np.random.default_rng(0), 3, ("hinge",))
+    model = tree_from_seed(0, 3, ("hinge",))
     flat = model.changed(mass=0 * model.mass, inertia=0 * model.inertia)
     with pytest.raises(SingularSystem):
         accelerations(TreeSystem([flat]), off_manifold(model, 0, 0.0))
@@ -178,7 +178,7 @@ def test_elements_act_as_in_the_direct_form_on_and_off_the_manifold(seed):
 
 def test_projection_normalises_far_from_the_constraints():
     """A free body has no constraint but pᵀp = 1, which one division meets however far p is off."""
-    model = random_tree(np.random.default_rng(3), 2, ("free",))
+    model = tree_from_seed(3, 2, ("free",))
     r, p, v, pdot = off_manifold(model, 4, 0.0)
     q, _ = TreeSystem([model]).project(*components(r, 3.0 * p, v, pdot))
     np.testing.assert_allclose(q, components(r, p, v, pdot)[0], rtol=1e-15, atol=1e-15)
@@ -199,7 +199,7 @@ def test_projection_far_off_ends_on_unit_quaternions(what, size):
 @pytest.mark.parametrize("a", [0.0, 3.0])
 def test_baumgarte_damps_the_length_of_quaternions(a):
     """c = (pᵀp − 1) / 2 of every body: c̈ + 2 a ċ + a² c = 0."""
-    model = random_tree(np.random.default_rng(8), 4)
+    model = tree_from_seed(8, 4)
     _, p, _, pdot = parts = off_manifold(model, 2, 0.05)
     pddot = TreeSystem([model]).acceleration(*components(*parts), baumgarte=a)[3:].T
     left = dot(p, pddot) + dot(pdot, pdot) + 2 * a * dot(p, pdot) + a * a * (dot(p, p) - 1) / 2

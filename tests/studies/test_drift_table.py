@@ -72,7 +72,7 @@ def test_the_command_writes_the_table(tmp_path, monkeypatch):
 
 def start_of(rng, rods, **options):
     """A random chain and its initial state as the integration takes it."""
-    model, state = random_chain(np.random.default_rng(rng), rods, **options)
+    model, state = random_chain(rng, rods, **options)
     return model, maximal_coordinates(state)
 
 
@@ -83,7 +83,7 @@ def table_of(model, state, **options):
 
 
 def test_raw_drifts_and_the_others_do_not():
-    table = table_of(*random_chain(np.random.default_rng(62), [False]), rtols=(1e-6,), times=(3.0, 30.0))
+    table = table_of(*random_chain(62, [False]), rtols=(1e-6,), times=(3.0, 30.0))
     held = {(row["variant"], row["time"]): row for row in table}
     assert held["raw", 30.0]["gap"] > 3 * held["raw", 3.0]["gap"]
     assert held["baumgarte", 30.0]["gap"] < 0.05 * held["raw", 30.0]["gap"]
@@ -161,7 +161,7 @@ def test_energy_is_over_the_weight_and_reach_of_the_stretched_chain():
 
 def test_a_table_has_a_row_for_each_variant_tolerance_and_time():
     """The maxima up to a time, and the share of the steps that falls to it."""
-    model, state = random_chain(np.random.default_rng(67), [False])
+    model, state = random_chain(67, [False])
     rtols, times = (1e-4, 1e-6), (0.5, 2.0, 4.0)
     table = table_of(model, state, rtols=rtols, times=times)
     assert [(row["variant"], row["rtol"], row["time"]) for row in table] == [

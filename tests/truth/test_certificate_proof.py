@@ -51,7 +51,7 @@ PUBLISHED = json.loads((ROOT / "docs" / "reference-solutions.json").read_text("u
 
 
 def chain(rods, seed=1):
-    return random_chain(np.random.default_rng(seed), rods, loads=True, drag=True)
+    return random_chain(seed, rods, loads=True, drag=True)
 
 
 class Proofs(dict):

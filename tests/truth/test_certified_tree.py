@@ -14,6 +14,7 @@ from plumbline.model.random_mechanisms import ELEMENTS, random_loop_mechanism, r
 from plumbline.model.sampling import compared_states, random_states
 from plumbline.truth.certified_state import certify_state, enclose_quantities
 from plumbline.truth.rounding_bound import state_rounding_bound
+from tests.helpers.random_chains import tree_from_seed
 from tests.helpers.true_answers import assert_within_bound
 
 
@@ -40,7 +41,7 @@ def compared(truth, found):
 
 @pytest.mark.parametrize("seed", range(10))
 def test_the_reference_agrees_on_random_trees(seed):
-    model = random_tree(np.random.default_rng(seed), 8)
+    model = tree_from_seed(seed, 8)
     states = random_states(model, 2, seed)
     for state, found in zip(states, Reference().evaluate(model, states), strict=True):
         truth = certify_state(model, state, mass_matrix=True)
@@ -56,7 +57,7 @@ def test_the_reference_agrees_on_random_trees(seed):
 @pytest.mark.parametrize("element", [*((name,) for name in ELEMENTS), ELEMENTS])
 def test_the_reference_agrees_on_trees_with_elements(element, kinds):
     for seed in range(2):
-        model = random_tree(np.random.default_rng([seed, 7]), 5, kinds, elements=element)
+        model = tree_from_seed([seed, 7], 5, kinds, elements=element)
         (state,) = random_states(model, 1, seed)
         (found,) = Reference().evaluate(model, [state])
         truth = certify_state(model, state, mass_matrix=True)
@@ -67,7 +68,7 @@ def test_the_reference_agrees_on_trees_with_elements(element, kinds):
 
 
 def one_body(kind, **elements):
-    tree = random_tree(np.random.default_rng(3), 1, (kind,), loads=False)
+    tree = tree_from_seed(3, 1, (kind,), loads=False)
     tree = replace(tree, gravity=np.zeros(3))
     return tree.changed(**{name: np.array([[value, 0.0]]) for name, value in elements.items()})
 
@@ -89,9 +90,7 @@ def test_a_sprung_hinge_counts_whole_turns(turns):
 
 def test_springs_at_exactly_their_rest_length_are_certified():
     """A ball around 0, squared by `**`, is NaN in python-flint."""
-    model = random_tree(
-        np.random.default_rng(8), 2, ("slide", "hinge"), loads=False, elements=("stiffness", "springs")
-    )
+    model = tree_from_seed(8, 2, ("slide", "hinge"), loads=False, elements=("stiffness", "springs"))
     (state,) = random_states(model, 1, 3)
     length = np.linalg.norm(spring_vectors(model, state.r, state.p), axis=-1)
     at_rest = replace(model, rest=state.x, spring_length=length)

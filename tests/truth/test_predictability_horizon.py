@@ -58,7 +58,7 @@ UNSTABLE_SCENARIOS = [
 
 def unstable_pendulum():
     """A body standing on its pivot, and the rate λ at which it leaves there."""
-    model, _ = random_chain(np.random.default_rng(0), [0])
+    model, _ = random_chain(0, [0])
     model = model.changed(inertia=np.diag([0.02, 0.02, 0.01])[None], proximal=np.array([[0, 0, -0.3]]))
     state = complete_state(model, State(np.array([[1.0, 0, 0, 0]]), *np.zeros((3, 1, 3))))
     return model, state, float(np.sqrt(model.mass[0] * 9.81 * 0.3 / (0.02 + model.mass[0] * 0.09)))
@@ -103,7 +103,7 @@ def test_perturbations_of_a_damped_hanging_body_do_not_grow():
 
 @pytest.mark.parametrize("rods", [[0], [1], [0, 1, 1]], ids=str)
 def test_neighbours_are_on_the_manifold_and_close(rods):
-    model, state = random_chain(np.random.default_rng(3), rods)
+    model, state = random_chain(3, rods)
     # Numbers of size 1 … 5, each some dozen roundings of 1e-16; a middle on the sphere is off the chord's
     # by the square of the distance, (3e-7)², times them.
     for neighbour in perturbed_states(model, state):
@@ -142,7 +142,7 @@ def second_order(growth):
 @pytest.mark.parametrize("rods", [[0, 0], [1], [0, 1]], ids=str)
 def test_growth_is_the_largest_distance_of_a_neighbour(rods):
     """Over the size it was turned by; positions over the largest distance from the pivot."""
-    model, state = random_chain(np.random.default_rng(5), rods)
+    model, state = random_chain(5, rods)
     times = np.linspace(0, 0.6, 13)
     base, *others = (
         pendulums.reference_trajectory(model, s, times) for s in (state, *perturbed_states(model, state))
@@ -174,7 +174,7 @@ def test_position_distances_are_relative_to_the_distance_from_the_pivot():
 
 
 def test_interpolation_between_distant_states():
-    model, state = random_chain(np.random.default_rng(3), [0, 1, 1])
+    model, state = random_chain(3, [0, 1, 1])
     neighbour = perturbed_states(model, state, perturbation_size=0.3, count=1)[0]
     other = replace(neighbour, p=-neighbour.p)  # the same attitude
     for far in (neighbour, other):
@@ -187,7 +187,7 @@ def test_interpolation_between_distant_states():
 
 def test_projection_normalises_quaternions():
     """To a few roundings; of ω′, which comes from a rate of p, a few more."""
-    model, state = random_chain(np.random.default_rng(3), [0, 1])
+    model, state = random_chain(3, [0, 1])
     pdot = 0.5 * quaternion_rate(state.p, state.omega)
     raw = with_joint_coordinates(model, project_to_manifold(model, state.r, 2 * state.p, state.v / 2, pdot))
     for name in ("p", "u", "r"):
@@ -197,7 +197,7 @@ def test_projection_normalises_quaternions():
 
 @pytest.mark.parametrize(("rate_", "unit"), [(0.0, 1.0), (30.0, 30.0)])
 def test_perturbations_have_the_specified_size(rate_, unit):
-    model, state = random_chain(np.random.default_rng(6), [0, 1, 0], rate=rate_)
+    model, state = random_chain(6, [0, 1, 0], rate=rate_)
     found = perturbed_states(model, state, 1e-6, 40)
     assert len(found) == 40 and len(perturbed_states(model, state)) == PERTURBATION_COUNT
     angles = [attitude_error(x.p[:, None], state.p[:, None]) for x in found]

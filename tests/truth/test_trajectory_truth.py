@@ -54,7 +54,7 @@ def test_extended_precision_agrees_with_quad_on_longer_chains(rods):
 
 def check_precisions(rods):
     """Each precision from quad, and the notes' form on its manifold, which shares no equation with them."""
-    model, state = random_chain(np.random.default_rng(1), rods, loads=True, drag=True)
+    model, state = random_chain(1, rods, loads=True, drag=True)
     quad, extended, double = (
         simulate_taylor(model, state, TIMES, kind)[0] for kind in ("quad", "extended", "double")
     )
@@ -135,7 +135,7 @@ def test_the_truth_agrees_with_the_closed_forms(scenario):
 
 def test_accelerations_along_a_run_agree_with_the_certified_ones():
     """ω′ and v of a mixed chain, differenced over a microsecond, against ball arithmetic at one state."""
-    model, state = random_chain(np.random.default_rng(4), [1, 0], loads=True, drag=True)
+    model, state = random_chain(4, [1, 0], loads=True, drag=True)
     h = 1e-4
     run, _ = simulate_taylor(model, state, np.array([0.0, h, 2 * h]), "extended")
     reported = certify_state(model, state).quantities

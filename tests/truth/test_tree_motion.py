@@ -9,7 +9,7 @@ import pytest
 from plumbline.model.datatypes import KINDS
 from plumbline.model.invariants import attitude_error, position_error
 from plumbline.model.kinematics import ball_spring_rest, complete_state, quaternion_rate
-from plumbline.model.random_mechanisms import ELEMENTS, random_tree
+from plumbline.model.random_mechanisms import ELEMENTS
 from plumbline.model.sampling import random_states
 from plumbline.truth import ground_truth
 from plumbline.truth import trajectory_truth as trajectory
@@ -20,6 +20,7 @@ from plumbline.truth.trajectory_truth import NOTES_RTOL, simulate_notes_form, tr
 from reference_impl.joints import constraint_rows
 from tests.helpers.catalogue import catalogue_scenario
 from tests.helpers.nightly_tests import SLOW
+from tests.helpers.random_chains import tree_from_seed
 
 TIMES = np.arange(9) * 0.125
 UNIT = np.array([1.0, 0.0, 0.0, 0.0])
@@ -39,7 +40,7 @@ FAST_KINDS = ("universal", "cylindrical", "free")  # compiled in a second each; 
 
 @pytest.mark.parametrize("kind", [pytest.param(x, marks=[] if x in FAST_KINDS else SLOW) for x in KINDS])
 def test_both_methods_agree_on_every_kind_of_joint(kind):
-    model = random_tree(np.random.default_rng(5), 3, (kind, "hinge", "ball"))
+    model = tree_from_seed(5, 3, (kind, "hinge", "ball"))
     (state,) = random_states(model, 1, 2)
     other = simulate_notes_form(model, state, TIMES, NOTES_RTOL)
     r, p, run = taylor(model, state)
@@ -50,7 +51,7 @@ def test_both_methods_agree_on_every_kind_of_joint(kind):
 
 def test_both_methods_agree_on_mixed_trees():
     for seed in range(3):
-        model = random_tree(np.random.default_rng(seed), 6)
+        model = tree_from_seed(seed, 6)
         (state,) = random_states(model, 1, seed)
         truth = trajectory_truth(model, state, TIMES)
         assert "Taylor's method" in truth.method
@@ -73,7 +74,7 @@ def test_both_methods_agree_on_mixed_trees():
     ],
 )
 def test_both_methods_agree_on_every_element(kinds, element):
-    model = random_tree(np.random.default_rng(3), 3, kinds, elements=(element,))
+    model = tree_from_seed(3, 3, kinds, elements=(element,))
     (state,) = random_states(model, 1, 2)
     times = TIMES[:3]
     other = simulate_notes_form(model, state, times, NOTES_RTOL)
@@ -84,7 +85,7 @@ def test_both_methods_agree_on_every_element(kinds, element):
 
 @pytest.mark.parametrize("kinds", [("ball",), ("ball", "universal", "rod")], ids=str)
 def test_both_methods_agree_on_springs_of_balls(kinds):
-    model = random_tree(np.random.default_rng(3), 3, kinds, elements=("stiffness",))
+    model = tree_from_seed(3, 3, kinds, elements=("stiffness",))
     (state,) = random_states(model, 1, 2)
     truth = trajectory_truth(model, state, TIMES[:3])
     assert "ball" in model.kind and truth.method.startswith("Taylor's method")
@@ -93,7 +94,7 @@ def test_both_methods_agree_on_springs_of_balls(kinds):
 
 def test_a_spring_of_a_ball_at_rest_has_a_taylor_series():
     """θ/sin θ is 0/0 where the spring is unloaded."""
-    model = random_tree(np.random.default_rng(3), 1, ("ball",), elements=("stiffness",))
+    model = tree_from_seed(3, 1, ("ball",), elements=("stiffness",))
     (state,) = random_states(model, 1, 2)
     unloaded = complete_state(model, replace(state, p=np.array([ball_spring_rest(model, 0)])))
     truth = trajectory_truth(model, unloaded, TIMES[:3])
@@ -101,7 +102,7 @@ def test_a_spring_of_a_ball_at_rest_has_a_taylor_series():
 
 
 def test_precisions_agree():
-    model = random_tree(np.random.default_rng(3), 3, ("rod", "universal", "cylindrical"))
+    model = tree_from_seed(3, 3, ("rod", "universal", "cylindrical"))
     (state,) = random_states(model, 1, 1)
     quad, extended, double = (taylor(model, state, TIMES, name)[2] for name in ("quad", "extended", "double"))
     assert extended.r.dtype == quad.r.dtype == np.longdouble
@@ -136,7 +137,7 @@ def test_a_parameter_error_of_1e_10_in_one_method_is_detected(monkeypatch, side,
 
 
 def test_perturbed_states_are_on_the_manifold_and_near():
-    model = random_tree(np.random.default_rng(4), 7)
+    model = tree_from_seed(4, 7)
     (state,) = random_states(model, 1, 3)
     for near in perturbed_states(model, state, 1e-6, 5):
         pdot = quaternion_rate(near.p, near.omega)
