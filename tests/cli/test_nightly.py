@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from importlib.util import find_spec
 from unittest.mock import patch
 
 import numpy as np
@@ -11,7 +10,6 @@ import pytest
 
 from plumbline.cli import nightly
 from plumbline.cli.nightly import NightPlan
-from plumbline.execution.proofs import TRUTH_TOOLS
 from plumbline.execution.random_batch import RandomBatch
 from plumbline.execution.runner import RunResult
 from plumbline.judging.rows import RowContext
@@ -36,6 +34,7 @@ from plumbline.storage.results_store import ResultTables, read_table
 from plumbline.studies.coverage_study import CoverageFailure
 from tests.helpers.nightly_tests import slow
 from tests.helpers.nights import run_night
+from tests.helpers.requirements import needs_truth_tools
 from tests.reports.test_report import decoded_chunks
 
 
@@ -133,7 +132,7 @@ def run_nightly(out, **more):
     return run_night(out, more.pop("engine", "mujoco"), **({"random_count": 3} | more))
 
 
-@pytest.mark.skipif(not all(map(find_spec, TRUTH_TOOLS)), reason="the truth tools are not installed")
+@needs_truth_tools
 def test_a_night_proves_motions_and_uses_them(tmp_path):
     result, place = run_nightly(tmp_path, random_count=0, proof_cpu_seconds=10.0)
     assert result.metadata["proofs"]["proved"] == ["rest"]

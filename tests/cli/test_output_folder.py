@@ -12,6 +12,7 @@ from plumbline.execution.exit_codes import ExitCode
 from plumbline.processes.isolation import FileLock
 from tests.helpers import ROOT, example_results
 from tests.helpers.commands import invoke, run_plumbline
+from tests.helpers.requirements import needs_pipes
 
 SWEEP = (
     "schema_version: 1\nscenario: tumbling-rod\nvary: {'bodies[0].mass': {values: [1, 2]}}\nduration: 0.25\n"
@@ -93,7 +94,7 @@ def test_a_damaged_file_leaves_the_report_as_it_was(results, name, damage, words
 
 
 @pytest.mark.timeout(60)  # opening a pipe that nobody writes to blocks
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with names here")
+@needs_pipes
 @pytest.mark.parametrize("make", ["mkdir", "mkfifo"])
 def test_a_folder_or_a_pipe_in_the_place_of_a_file_is_a_bad_file(results, make):
     files = {"results.json": ["report", "reproduce"], "scripts/index.json": ["report"]}

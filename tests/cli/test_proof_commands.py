@@ -3,7 +3,6 @@
 import gzip
 import json
 import zlib
-from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -15,11 +14,9 @@ from plumbline.truth import certificate_proof
 from plumbline.truth.trajectory_truth import trajectory_truth
 from tests.helpers.catalogue import catalogue_scenario
 from tests.helpers.commands import invoke
+from tests.helpers.requirements import needs_truth_tools
 
-pytestmark = pytest.mark.skipif(
-    not all(find_spec(module) for module in ("heyoka", "mpmath", "flint")),
-    reason="the truth tools are not installed",
-)
+pytestmark = needs_truth_tools
 
 
 @pytest.fixture(autouse=True)

@@ -1,18 +1,15 @@
 """docs/benchmarks.md is made from the stored figures; its values are computed again where that is cheap."""
 
 import json
-from importlib.util import find_spec
 
 import pytest
 
 from tests.helpers import ROOT
+from tests.helpers.requirements import needs_truth_tools
 
 STORED = json.loads((ROOT / "bench" / "results" / "classics.json").read_text(encoding="utf-8"))
 GOALS = {("A01", "reference"): 1e-6, ("A01", "mujoco"): 1e-6, ("A01", "pinocchio"): 1e-6,
          ("A01", "exudyn-tree"): 1e-6, ("cart-pole", "reference"): 1e-9}  # fmt: skip
-needs_truth = pytest.mark.skipif(
-    not (find_spec("heyoka") and find_spec("flint")), reason="the truth tools are not installed"
-)
 
 
 def test_the_page_is_made_from_the_stored_figures():
@@ -21,7 +18,7 @@ def test_the_page_is_made_from_the_stored_figures():
     assert (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8") == write_page(STORED)
 
 
-@needs_truth
+@needs_truth_tools
 @pytest.mark.parametrize("name", ["A01", "A02", "A03", "cart-pole", "NESC-2"])
 def test_stored_values_are_computed_again(name):
     from bench.classics_values import VALUES
@@ -49,7 +46,7 @@ def test_the_goals_are_reached(problem, engine):
     assert smallest_error(problem, engine) <= GOALS[problem, engine]
 
 
-@needs_truth
+@needs_truth_tools
 @pytest.mark.parametrize("engine", ["mujoco", "exudyn-tree"])
 def test_a_stored_limit_is_measured_again(engine):
     """The tumbling brick takes a tenth of a second of each engine."""

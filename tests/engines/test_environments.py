@@ -4,7 +4,6 @@ import ctypes
 import operator
 import os
 import re
-import shutil
 import subprocess
 import sys
 import time
@@ -29,6 +28,7 @@ from plumbline.scenario import loader
 from plumbline.truth.certified_state import certify_state
 from tests.helpers.catalogue import catalogue_scenario
 from tests.helpers.exudyn_initial_accelerations import initial_accelerations
+from tests.helpers.requirements import needs_uv
 
 PYTHON = (
     sys.executable
@@ -302,13 +302,6 @@ def test_a_version_that_cannot_be_had_is_a_verdict():
 
 
 # --- what is no version, no wheel, or cannot be fetched ------------------------------------------
-
-
-def is_uv_installed():
-    return shutil.which("uv") or (environments.ROOT / ".uv" / "bin" / "uv").exists()
-
-
-needs_uv = pytest.mark.skipif(not is_uv_installed(), reason="uv is not installed here")
 
 
 @pytest.fixture

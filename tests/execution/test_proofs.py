@@ -1,7 +1,6 @@
 """What a night proves: motions without a proof, in bounded time; the usual truth is judged by them."""
 
 from dataclasses import replace
-from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -13,10 +12,9 @@ from plumbline.truth import trajectory_truth
 from plumbline.truth.certificate_proof import find_proof
 from plumbline.truth.closed_form import exact_samples
 from tests.helpers.catalogue import catalogue_scenario
+from tests.helpers.requirements import needs_truth_tools
 
-pytestmark = pytest.mark.skipif(
-    not all(map(find_spec, proofs.TRUTH_TOOLS)), reason="the truth tools are not installed"
-)
+pytestmark = needs_truth_tools
 LIMITS = Limits(120.0)
 
 

@@ -27,6 +27,7 @@ from plumbline.scenario.schema import Document
 from plumbline.scenario.validation_messages import problems_from_validation
 from plumbline.scenario.yaml_source import YamlSource
 from plumbline.studies.sweep_file import Sweep
+from tests.helpers.requirements import needs_pipes
 from tests.helpers.tables import table
 
 VALID_SCENARIO = """\
@@ -253,7 +254,7 @@ def test_a_file_without_permission(tmp_path):
         load_scenario(path)
 
 
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with names here")
+@needs_pipes
 @pytest.mark.timeout(20)
 def test_a_pipe_does_not_hang(tmp_path):
     os.mkfifo(tmp_path / "pipe.yaml")

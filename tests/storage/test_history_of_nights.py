@@ -16,6 +16,7 @@ from plumbline.storage.history_of_nights import History, last_findings, next_nig
 from reports.earlier_runs import History as ReportHistory
 from reports.stored_results import Results
 from tests.helpers.commands import invoke
+from tests.helpers.requirements import needs_pipes
 
 KEY = "s/mujoco/state/-/acceleration"
 
@@ -161,7 +162,7 @@ SPOILED = {
 }
 
 
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with names here")
+@needs_pipes
 @pytest.mark.parametrize("spoil", SPOILED)
 def test_a_damaged_night_is_named_and_left_out(tmp_path, spoil):
     for day in (1, 2, 3):

@@ -1,7 +1,6 @@
 """The search for the version that changed an answer: halving, versions that cannot be used, real versions."""
 
 import json
-import shutil
 from importlib import metadata
 from itertools import pairwise
 from pathlib import Path
@@ -19,6 +18,7 @@ from plumbline.studies.version_search import (
     find_change,
 )
 from tests.helpers.commands import invoke
+from tests.helpers.requirements import needs_uv
 
 VERSIONS = [f"1.{k}" for k in range(40)]
 INSTALLED = metadata.version("mujoco")
@@ -148,10 +148,7 @@ def test_a_bad_model_file_exits_with_2_and_its_line(arm, monkeypatch):
     assert result.exit_code == 2 and "arm.urdf:2:" in result.stderr
 
 
-@pytest.mark.skipif(
-    not (shutil.which("uv") or (environments.ROOT / ".uv" / "bin" / "uv").exists()),
-    reason="uv is not installed here",
-)
+@needs_uv
 def test_without_network_the_reason_is_reported(arm, monkeypatch, tmp_path):
     for name in ("UV_INDEX_URL", "UV_EXTRA_INDEX_URL", "UV_INDEX", "UV_FIND_LINKS", "PIP_FIND_LINKS"):
         monkeypatch.delenv(name, raising=False)

@@ -1,7 +1,6 @@
 """Benchmark mechanisms: quadratures against certified accelerations and published figures."""
 
 from dataclasses import replace
-from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -9,10 +8,9 @@ import pytest
 from plumbline.model.kinematics import complete_state
 from plumbline.model.loops import assembled
 from tests.helpers.catalogue import catalogue_scenario
+from tests.helpers.requirements import needs_truth_tools
 
-pytestmark = pytest.mark.skipif(
-    not (find_spec("heyoka") and find_spec("flint")), reason="the truth tools are not installed"
-)
+pytestmark = needs_truth_tools
 
 
 @pytest.fixture(scope="module")

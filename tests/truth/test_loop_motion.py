@@ -1,7 +1,6 @@
 """Motions of mechanisms with loops: two formulations against each other and against closed forms."""
 
 from dataclasses import replace
-from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -21,10 +20,9 @@ from plumbline.truth.trajectory_truth import (
     trajectory_truth,
 )
 from tests.helpers.catalogue import catalogue_scenario
+from tests.helpers.requirements import needs_truth_tools
 
-pytestmark = pytest.mark.skipif(
-    not (find_spec("heyoka") and find_spec("flint")), reason="the truth tools are not installed"
-)
+pytestmark = needs_truth_tools
 
 
 EPS = np.finfo(float).eps

@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -24,6 +23,7 @@ from plumbline.truth.trajectory_truth import (
 from tests.helpers.catalogue import catalogue_scenario, catalogue_scenarios
 from tests.helpers.nightly_tests import fast_are
 from tests.helpers.random_chains import random_chain
+from tests.helpers.requirements import needs_truth_tools
 
 TIMES = np.arange(41) * 0.05
 CATALOGUE = [s for s in catalogue_scenarios().values() if s.model.has_chain_joints]
@@ -33,9 +33,7 @@ FAST_CLOSED_FORMS = ("planar-170", "lagrange-top", "spherical", "double-conical"
 CLOSED_FORM_SCENARIOS = [s for s in CATALOGUE if (closed := closed_form_motion(s)) and closed.amplitude == 0]
 
 
-pytestmark = pytest.mark.skipif(
-    not (find_spec("heyoka") and find_spec("mpmath")), reason="the truth tools are not installed"
-)
+pytestmark = needs_truth_tools
 
 
 # the yardstick

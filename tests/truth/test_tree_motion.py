@@ -1,7 +1,6 @@
 """Motions of trees: Taylor's method in joint coordinates, the notes' form, closed forms, the horizon."""
 
 from dataclasses import replace
-from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -21,13 +20,12 @@ from reference_impl.joints import constraint_rows
 from tests.helpers.catalogue import catalogue_scenario
 from tests.helpers.nightly_tests import SLOW
 from tests.helpers.random_chains import tree_from_seed
+from tests.helpers.requirements import needs_truth_tools
 
 TIMES = np.arange(9) * 0.125
 UNIT = np.array([1.0, 0.0, 0.0, 0.0])
 
-pytestmark = pytest.mark.skipif(
-    not (find_spec("heyoka") and find_spec("mpmath")), reason="the truth tools are not installed"
-)
+pytestmark = needs_truth_tools
 
 
 def taylor(model, state, times=TIMES, precision="extended"):
