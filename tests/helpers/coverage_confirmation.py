@@ -6,15 +6,12 @@ state, is changed. The truth and all bounds are those of the unchanged scenario.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from functools import cache
 from unittest.mock import patch
 
 import numpy as np
 
-from plumbline.engines.adapter import Adapter
 from plumbline.engines.engine_calls import Evaluation
-from plumbline.engines.registry import load_adapter
 from plumbline.judging.rows import Level, Row, RowContext
 from plumbline.judging.smallest_detectable_mistake import CoverageEntry, scenario_coverage
 from plumbline.judging.state_level import judge_states
@@ -23,16 +20,16 @@ from plumbline.judging.trajectory_level import judge_trajectory
 from plumbline.measurements.order_and_limit import refinement_resolutions
 from plumbline.measurements.refinement_study import run_refinement_study
 from plumbline.measurements.single_steps import STEP_STATES, run_step_study
-from plumbline.model.datatypes import Array, Integrator, Model, State, StateQuantities, StepRun, Trajectory
+from plumbline.model.datatypes import Model, State
 from plumbline.truth.closed_form import closed_form_motion
 from plumbline.truth.ground_truth import MotionTruth, StateTruth, motion_truth, state_truth
 from plumbline.truth.parameters import STATE_KINDS, Parameter, list_parameters, perturb
 from tests.helpers.catalogue import catalogue_scenario, states_of
+from tests.helpers.planting import Defect, Inputs, plant
 
 STATES = 50
 STATE_ENGINE, STEP_ENGINE, STEP_INTEGRATOR = "reference", "pinocchio", "rkmk4"
 MOTION_ENGINE, MOTION_INTEGRATOR = "reference", "collocation"
-Change = Callable[[Model, State], tuple[Model, State]]
 
 
 @cache
@@ -57,35 +54,14 @@ def true_motion(name: str) -> MotionTruth:
     return motion_truth(s.model, s.state, s.times, exact)
 
 
-def with_change(engine: str, change: Change) -> Adapter:
-    """The real engine, given a changed model and state."""
-    real = type(load_adapter(engine))
-
-    class Changed(real):  # type: ignore[misc, valid-type]
-        def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
-            return [super(Changed, self)._evaluate(m, [s])[0] for m, s in (change(model, x) for x in states)]
-
-        def _simulate(
-            self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
-        ) -> Trajectory:
-            changed: Trajectory = super()._simulate(*change(model, state), times, integrator, resolution)
-            return changed
-
-        def _step(
-            self, model: Model, state: State, times: Array, integrator: Integrator, step: float
-        ) -> StepRun:
-            return StepRun(self._simulate(model, state, times, integrator, step))
-
-    return Changed()
-
-
-def judged_rows(name: str, level: Level, change: Change) -> list[Row]:
+def judged_rows(name: str, level: Level, change: Inputs) -> list[Row]:
     """The rows of one level of a scenario, of the level's engine with a change."""
     s, context = catalogue_scenario(name), RowContext(name, "", MOTION_ENGINE, MOTION_ENGINE, "0")
     if level == "state":
-        answers = with_change(STATE_ENGINE, change).evaluate(s.model, states(name))
+        answers = plant(Defect("", engine=STATE_ENGINE, inputs=change)).evaluate(s.model, states(name))
         return judge_states(context, true_states(name), Evaluation(answers, None, None, 0.0)).rows
-    adapter = with_change(STEP_ENGINE if level == "step" else MOTION_ENGINE, change)
+    engine = STEP_ENGINE if level == "step" else MOTION_ENGINE
+    adapter = plant(Defect("", engine=engine, inputs=change))
     with patch("plumbline.engines.engine_calls.load_adapter", lambda _: adapter):
         if level == "step":
             integrator, some = adapter.integrator(STEP_INTEGRATOR), states(name)[:STEP_STATES]
@@ -119,7 +95,7 @@ def is_reported(entry: CoverageEntry, factor: float) -> bool:
     return any(row.level == entry.level and row.verdict.needs_attention for row in rows)
 
 
-def change_of(parameter: Parameter, initial: State, size: float) -> Change:
+def change_of(parameter: Parameter, initial: State, size: float) -> Inputs:
     """A mistake in the model, or in the initial state alone."""
 
     def change(model: Model, state: State) -> tuple[Model, State]:

@@ -57,12 +57,12 @@ def on_last_body(change: Callable[[int], Inputs]) -> Inputs:
 
 def on_body(change: Callable[[int], Inputs], k: int) -> Inputs:
     """A change of body k (from 0), where there is one."""
-    return lambda m, s: change(k)(m, s) if m.n > k else (m, s)
+    return when(at_least_bodies(k + 1), change(k))
 
 
 def scaled(name: str, factor: float) -> Callable[[int], Inputs]:
     """A field of one body times a factor."""
-    return lambda k: body_change(k, **{name: lambda m, _: getattr(m, name) * factor})
+    return lambda k: number_change(name, k, times=factor)
 
 
 def mass_ratio(model: Model) -> float:

@@ -16,7 +16,7 @@ import pytest
 from plumbline.processes.isolation import remove_orphaned_folders
 from plumbline.processes.worker_pool import Limits, Outcome, ResultCache, Scheduler, Task, WorkerPool
 from tests.helpers import ROOT, faults
-from tests.helpers.immediate_executor import Immediate
+from tests.helpers.in_process import InProcessWorkers
 
 
 def parent_script(folder, body):
@@ -332,7 +332,7 @@ class Remembering(ResultCache):
 
 
 def test_the_scheduler_takes_submitted_tasks_first_and_cached_answers_at_once():
-    executor, cache, found = Immediate(), Remembering(), []
+    executor, cache, found = InProcessWorkers(), Remembering(), []
     scheduler = Scheduler(executor, cache)
     tasks = [Task(key, double, (1,)) for key in ("a", "known", "b", "c")]
     for outcome in scheduler.run(iter(tasks)):

@@ -7,7 +7,7 @@ import pytest
 from plumbline.judging.rows import RowContext, Verdict
 from plumbline.studies import coverage_study
 from tests.helpers.catalogue import catalogue_scenario
-from tests.helpers.immediate_executor import Immediate
+from tests.helpers.in_process import InProcessWorkers
 
 
 def test_parameters_in_several_tasks_give_the_table_of_one(monkeypatch):
@@ -17,10 +17,10 @@ def test_parameters_in_several_tasks_give_the_table_of_one(monkeypatch):
         figures = {"value": 1e-12, "tolerance": 1e-10, "compared_until": s.duration / 16}
         for level, quantity in (("trajectory", "position_limit"), ("invariants", "energy_drift")):
             rows.append(context.make_row(level, "RK4", quantity, Verdict.AGREES, "", **figures))
-    whole = coverage_study.measure_coverage(Immediate(), scenarios, rows, 1)
+    whole = coverage_study.measure_coverage(InProcessWorkers(), scenarios, rows, 1)
     assert {entry.level for entry in whole} == set(coverage_study.COVERED_LEVELS)
     monkeypatch.setattr(coverage_study, "PARAMETERS_PER_TASK", 20)
-    executor, seen = Immediate(), []
+    executor, seen = InProcessWorkers(), []
     parts = coverage_study.measure_coverage(
         executor, scenarios, rows, 1, progress=lambda *counts: seen.append(counts)
     )

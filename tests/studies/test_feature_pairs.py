@@ -17,7 +17,7 @@ from plumbline.scenario.generator import random_mechanism
 from plumbline.studies import feature_pairs
 from plumbline.truth.ground_truth import state_truth
 from tests.helpers.catalogue import catalogue_scenario, catalogue_scenarios, states_of
-from tests.helpers.immediate_executor import Immediate
+from tests.helpers.in_process import InProcessWorkers
 
 PARTS = [f"crowded-loops-{k}" for k in range(1, 7)]  # together they have all pairs
 GROUP = 14  # places: larger groups make fewer examples of the same pairs
@@ -58,7 +58,7 @@ def test_every_legal_pair_of_places_is_in_the_examples():
 
 
 def test_every_legal_pair_is_covered():
-    shown = feature_pairs.measure_features(Immediate(), [catalogue_scenario(name) for name in PARTS])
+    shown = feature_pairs.measure_features(InProcessWorkers(), [catalogue_scenario(name) for name in PARTS])
     covered = set().union(*map(feature_pairs.all_pairs, shown.values()))
     assert feature_pairs.legal_pairs() <= covered
 
