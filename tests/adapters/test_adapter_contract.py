@@ -156,7 +156,7 @@ def test_a_declared_gap_is_real(engine, kind):
 
 @cache
 def expected_states(joints, loaded):
-    subject = pendulums.make_model(JOINT_PATTERNS[joints], loads=loaded, drag=loaded)
+    subject = pendulums.make_model(joints, loads=loaded, drag=loaded)
     states = [pendulums.state_from_seed(subject, seed) for seed in range(STATES)]
     return subject, states, [certify_state(subject, at, mass_matrix=True).quantities for at in states]
 
@@ -280,7 +280,7 @@ def test_the_first_sample_is_the_initial_state(engine, integrator):
 
 @pytest.mark.parametrize("joints", ["balls", "rods"])
 def test_p_and_minus_p_are_the_same_attitude(engine, joints):
-    subject = pendulums.make_model(JOINT_PATTERNS[joints])
+    subject = pendulums.make_model(joints)
     at = pendulums.state_from_seed(subject)
     one, other = ask(engine, "evaluate", subject, [at, pendulums.with_negated_quaternions(at)]) or (
         None,
@@ -296,7 +296,7 @@ def test_p_and_minus_p_are_the_same_attitude(engine, joints):
 @pytest.mark.parametrize("joints", ["balls", "rods"])
 @every_integrator
 def test_runs_from_p_and_minus_p_are_the_same_motion(engine, integrator, joints):
-    subject = pendulums.make_model(JOINT_PATTERNS[joints])
+    subject = pendulums.make_model(joints)
     at = pendulums.state_from_seed(subject)
     starts = (at, pendulums.with_negated_quaternions(at))
     runs = [ask_run(engine, integrator, subject, start) for start in starts]
@@ -333,7 +333,7 @@ def test_sample_times(engine, integrator):
 def test_evaluation_is_deterministic(engine, joints):
     """The same call gives the same bits, also after another model has been through."""
     subject, other = (
-        pendulums.make_model(JOINT_PATTERNS[joints]),
+        pendulums.make_model(joints),
         pendulums.make_model("rb", loads=True, seed=1),
     )
     first = ask(engine, "evaluate", subject, [pendulums.state_from_seed(subject)])
@@ -346,7 +346,7 @@ def test_evaluation_is_deterministic(engine, joints):
 @pytest.mark.parametrize("joints", ["balls", "rods"])
 @every_integrator
 def test_runs_are_deterministic(engine, integrator, joints):
-    subject = pendulums.make_model(JOINT_PATTERNS[joints])
+    subject = pendulums.make_model(joints)
     at = pendulums.state_from_seed(subject)
     one, other = (ask_run(engine, integrator, subject, at) for _ in range(2))
     assert (one is None) == (other is None)
@@ -385,7 +385,7 @@ def test_converges_to_the_truth_with_its_declared_order(engine, integrator, case
 @cache
 def convergence_case(case):
     joints, _, loaded = case.partition(", ")
-    subject = pendulums.make_model(JOINT_PATTERNS[joints], loads=bool(loaded), drag=bool(loaded))
+    subject = pendulums.make_model(joints, loads=bool(loaded), drag=bool(loaded))
     at = pendulums.state_from_seed(subject, rate=1.0)
     times = np.linspace(0, 0.25, 5)  # short of the singularities of an engine that counts in angles
     return subject, at, times, true_trajectory(subject, at, times)

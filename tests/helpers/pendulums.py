@@ -27,7 +27,8 @@ JOINT_PATTERNS = {  # b: hung by a ball joint, r: by a rod
 
 @cache
 def make_model(joints: str, loads: bool = False, drag: bool = False, seed: int = 0) -> Model:
-    """A moderate random chain with one letter of ``joints`` per body, the same for the same arguments."""
+    """A moderate random chain of a pattern, or with one letter of ``joints`` per body."""
+    joints = JOINT_PATTERNS.get(joints, joints)
     rng = np.random.default_rng([seed, *joints.encode()])
     return random_model(rng, [j == "r" for j in joints], loads=loads, drag=drag, moderate=True)
 

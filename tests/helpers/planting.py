@@ -134,7 +134,7 @@ def planted(defect: Defect) -> Iterator[Adapter]:
 def subject(mechanism: str, loaded: bool = False) -> tuple[Model, StateTruth]:
     """A mechanism, and the certified truth at some states of it."""
     if mechanism in JOINT_PATTERNS:
-        model = pendulums.make_model(JOINT_PATTERNS[mechanism], loads=loaded, drag=loaded)
+        model = pendulums.make_model(mechanism, loads=loaded, drag=loaded)
         states = [*random_states(model, 10, seed=1), *identity_states(model)]
     elif mechanism == EVERY_JOINT:
         model = every_joint()
@@ -212,7 +212,7 @@ def assert_named(defect: Defect) -> None:
 def motion_subject(mechanism: str, loaded: bool = False) -> tuple[Model, State, MotionTruth]:
     """A mechanism with a motion that shows every mistake within a second or two."""
     if mechanism in JOINT_PATTERNS:  # a slow tumble
-        model = pendulums.make_model(JOINT_PATTERNS[mechanism], loads=loaded, drag=loaded)
+        model = pendulums.make_model(mechanism, loads=loaded, drag=loaded)
         state, times = pendulums.state_from_seed(model, seed=2, rate=0.5), np.linspace(0, 2, 17)
     else:  # a quarter as many samples do not resolve the work of a damper
         scenario = catalogue_scenario(mechanism)

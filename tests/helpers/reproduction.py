@@ -23,7 +23,6 @@ from plumbline.reproduce.measure import ConvergenceMeasure, RelationMeasure, Sta
 from plumbline.reproduce.render import no_script_reason, render_script
 from plumbline.reproduce.shrink import ReproductionCase
 from tests.helpers import pendulums
-from tests.helpers.pendulums import JOINT_PATTERNS
 
 HOSTILE = '<img src=x onerror="alert(1)">\n"""\nimport os; os.abort()  # \\ \'\'\' \r ; # ünï'
 DRIFTS = ("energy_drift", "momentum_drift", "joint_gap", "gap_rate", "norm_drift")
@@ -45,7 +44,7 @@ def script_of(evidence, **row) -> str:
 
 
 def state_case(joints: str, loads: bool = False, drag: bool = False, rate: float = 3.0) -> ReproductionCase:
-    model = pendulums.make_model(JOINT_PATTERNS[joints], loads=loads, drag=drag)
+    model = pendulums.make_model(joints, loads=loads, drag=drag)
     return ReproductionCase(model, pendulums.state_from_seed(model, seed=3, rate=rate))
 
 

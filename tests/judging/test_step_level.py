@@ -75,7 +75,7 @@ def test_steps_of_bodies_without_inertia_are_judged(engine, name):
 
 @cache
 def subject(joints, has_drag=False, loads=False):
-    model = pendulums.make_model(JOINT_PATTERNS[joints], loads=loads, drag=has_drag)
+    model = pendulums.make_model(joints, loads=loads, drag=has_drag)
     return model, random_states(model, STEP_STATES, seed=5)
 
 

@@ -32,7 +32,6 @@ from plumbline.model.welding import split_bodies, split_body
 from plumbline.truth.rounding_bound import state_rounding_bound
 from tests.helpers import pendulums
 from tests.helpers.nightly_tests import SLOW
-from tests.helpers.pendulums import JOINT_PATTERNS
 from tests.helpers.planted_defects import STATE_DEFECTS
 from tests.helpers.planting import Defect, answer_change, model_change, number_change, plant
 from tests.helpers.random_chains import random_chain
@@ -52,7 +51,7 @@ def shared_bounds():
 
 def state_relation(engine, relation):
     """One relation of an engine on two balls; the others are not computed after it."""
-    model = pendulums.make_model(JOINT_PATTERNS["balls"])
+    model = pendulums.make_model("balls")
     found = check_state_relations(metamorphic_hooks(engine), model, random_states_of(model))
     return next(result for result in found if result.relation == relation)
 
@@ -64,13 +63,9 @@ def random_states_of(model):
 @pytest.mark.parametrize("joints", ["ball", "rods", "mixed"])
 def test_the_ways_back_are_those_of_the_equations(joints):
     """Each relation on an independent solution, loads and drag included: the algebra of there and back."""
-    model = pendulums.make_model(JOINT_PATTERNS[joints], loads=True, drag=True)
+    model = pendulums.make_model(joints, loads=True, drag=True)
     for relation in STATE_RELATIONS:
-        here = (
-            model
-            if relation.name != "time reversed"
-            else pendulums.make_model(JOINT_PATTERNS[joints], loads=True)
-        )
+        here = model if relation.name != "time reversed" else pendulums.make_model(joints, loads=True)
         for state in random_states_of(here):
             right = Predictor(here, [state], View()).right
             other_model, other_state = relation.transform(here, state)
@@ -92,7 +87,7 @@ def _as_state_quantities(reported):
     + [("reference-printed", "rods")],
 )
 def test_every_engine_keeps_every_relation(engine, joints):
-    model = pendulums.make_model(JOINT_PATTERNS[joints], loads=True)
+    model = pendulums.make_model(joints, loads=True)
     found = check_relations(engine, model, random_states_of(model))
     rows = judge_relations(RowContext("s", "f", engine, engine, "0"), found).rows
     refused = [row.quantity for row in rows if row.verdict == "unsupported"]
@@ -158,7 +153,7 @@ def test_a_refused_state_is_left_out_and_a_refusing_engine_is_reported():
         def _evaluate(self, model, requested):
             raise Unsupported("not on a Monday")
 
-    model = pendulums.make_model(JOINT_PATTERNS["ball"])
+    model = pendulums.make_model("ball")
     with patch("plumbline.measurements.relations.load_adapter", lambda _: Refusing()):
         rows = judge_relations(
             RowContext("s", "f", "e", "E", "0"), check_relations("mujoco", model, random_states_of(model))
@@ -173,7 +168,7 @@ def test_noise_breaks_what_is_not_bitwise():
     noisy = Defect("noise", answers=answer_change(
         "acceleration", lambda _, __, a: a * (1 + 1e-9 * rng.normal(size=a.shape))))  # fmt: skip
     engine = plant(noisy)
-    model = pendulums.make_model(JOINT_PATTERNS["balls"])
+    model = pendulums.make_model("balls")
     with patch("plumbline.measurements.relations.load_adapter", lambda _: engine):
         found = check_relations("mujoco", model, random_states_of(model))
     for result in found:
@@ -249,7 +244,7 @@ def test_two_halves_are_physical_and_make_the_body(shape):
 
 def test_halves_have_roundings_of_their_own():
     """Hung at its centre a body has no potential energy to round; its halves' must cancel."""
-    model = pendulums.make_model(JOINT_PATTERNS["ball"])
+    model = pendulums.make_model("ball")
     model = model.changed(proximal=0 * model.proximal)
     at = pendulums.state_from_seed(model, 1)
     plain, welded = state_rounding_bound(model, at), state_rounding_bound(model, at, split_bodies(model))
@@ -275,7 +270,7 @@ def test_mujoco_s_solvers_have_nothing_to_do(joints):
     """Solver and Jacobian are of active constraints: without any, the answers are the same bit for bit."""
     mujoco = pytest.importorskip("mujoco")
     engine = pytest.importorskip("adapters.mujoco_engine")
-    model = pendulums.make_model(JOINT_PATTERNS[joints], loads=True, drag=True)
+    model = pendulums.make_model(joints, loads=True, drag=True)
     usual = load_adapter("mujoco").evaluate(model, random_states_of(model))
     kinds, jacobians = ("PGS", "CG", "NEWTON"), ("DENSE", "SPARSE")
     for kind, jacobian in product(kinds, jacobians):
@@ -313,7 +308,7 @@ def trapezoidal_integrator():
 
 
 def relation_result(engine, relation, joints="balls", integrator="trapezoidal"):
-    model = pendulums.make_model(JOINT_PATTERNS[joints])
+    model = pendulums.make_model(joints)
     (found,) = (
         held
         for held in check_run_relations(engine, model, pendulums.state_from_seed(model, 1))
@@ -323,7 +318,7 @@ def relation_result(engine, relation, joints="balls", integrator="trapezoidal"):
 
 
 def test_runs_take_sixteen_steps_of_at_most_a_thirtieth_of_a_radian_each_way():
-    model = pendulums.make_model(JOINT_PATTERNS["balls"])
+    model = pendulums.make_model("balls")
     at = pendulums.state_from_seed(model, 1)
     found = list(check_run_relations(exudyn_adapter()(), model, at))
     assert [(held.integrator, held.relation) for held in found] == [
@@ -387,13 +382,13 @@ def test_a_linear_solver_that_solves_something_else_is_seen(engine):
     faulty = plant(replace(defect_named("distal-1e-5"), engine=engine))
     sound.with_option = faulty.with_option
     for held in check_run_relations(
-        sound, model := pendulums.make_model(JOINT_PATTERNS["balls"]), pendulums.state_from_seed(model, 1)
+        sound, model := pendulums.make_model("balls"), pendulums.state_from_seed(model, 1)
     ):
         assert (held.ratio > 1) == held.relation.startswith("by "), held
 
 
 def test_drag_is_not_reversed_and_a_failing_run_is_reported():
-    model = pendulums.make_model(JOINT_PATTERNS["ball"], drag=True)
+    model = pendulums.make_model("ball", drag=True)
     found = list(check_run_relations(exudyn_adapter()(), model, pendulums.state_from_seed(model)))
     assert found and not any(held.relation == "reversed in time" for held in found)
 
@@ -401,7 +396,7 @@ def test_drag_is_not_reversed_and_a_failing_run_is_reported():
         def _run_samples(self, *_, **__):
             raise EngineFailure("it stopped")
 
-    model = pendulums.make_model(JOINT_PATTERNS["ball"])
+    model = pendulums.make_model("ball")
     found = list(check_run_relations(Failing(), model, pendulums.state_from_seed(model)))
     rows = judge_relations(RowContext("s", "f", "e", "E", "0"), found).rows
     assert {(row.verdict, row.reason) for row in rows} == {("failed", "it stopped")}
@@ -419,7 +414,7 @@ def test_a_solver_with_which_a_run_fails_is_reported():
     def failing(*_):
         raise EngineFailure("it stopped")
 
-    model = pendulums.make_model(JOINT_PATTERNS["ball"])
+    model = pendulums.make_model("ball")
     back, *others = check_integrator_relations(
         Half(), trapezoidal_integrator(), model, pendulums.state_from_seed(model), 1 / 512, 1.5
     )
@@ -431,7 +426,7 @@ def test_a_solver_with_which_a_run_fails_is_reported():
 
 def test_two_solvers_may_both_be_off():
     found = relation_result(exudyn_adapter()(), "by EigenDense", "mixed")
-    model = pendulums.make_model(JOINT_PATTERNS["mixed"])
+    model = pendulums.make_model("mixed")
     at = pendulums.state_from_seed(model, 1)
     ends = [
         state_at_sample(
@@ -457,7 +452,7 @@ def test_runs_by_tolerance_have_no_solvers_and_are_not_tried_finer():
             tried.append(1)
             raise EngineFailure("it stopped")
 
-    model = pendulums.make_model(JOINT_PATTERNS["ball"])
+    model = pendulums.make_model("ball")
     (held,) = check_run_relations(Failing(), model, pendulums.state_from_seed(model))
     assert (held.relation, held.refusal, len(tried)) == ("reversed in time", "failed", 1)
 

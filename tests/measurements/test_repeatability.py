@@ -15,13 +15,12 @@ from plumbline.measurements.repeatability import check_repeatability
 from plumbline.model.datatypes import EngineFailure, Unsupported
 from tests.helpers import pendulums
 from tests.helpers.catalogue import catalogue_scenario, states_of
-from tests.helpers.pendulums import JOINT_PATTERNS
 from tests.helpers.relation_checks import check_relations
 
 for name in ("mujoco", "pinocchio", "exudyn"):
     pytest.importorskip(name)
 
-MODEL = pendulums.make_model(JOINT_PATTERNS["rods"], loads=True, drag=True)
+MODEL = pendulums.make_model("rods", loads=True, drag=True)
 STATES = [pendulums.state_from_seed(MODEL, seed=k) for k in range(4)]
 ULP = np.finfo(float).eps
 
