@@ -4,7 +4,6 @@ import ctypes
 import operator
 import os
 import re
-import subprocess
 import sys
 import time
 import zipfile
@@ -18,17 +17,16 @@ from packaging.version import Version
 
 from plumbline.engines import engine_calls, environments
 from plumbline.engines.registry import ENGINES
-from plumbline.execution.plan import Plan
-from plumbline.execution.runner import run_plan
 from plumbline.judging import known_issues
 from plumbline.judging.rows import WRONG_CALL, RowContext
 from plumbline.processes.remote_python import call_remote
 from plumbline.processes.worker_pool import Limits, Task, WorkerPool
-from plumbline.scenario import loader
 from plumbline.truth.certified_state import certify_state
 from tests.helpers.catalogue import catalogue_scenario
+from tests.helpers.commands import invoke
 from tests.helpers.exudyn_initial_accelerations import initial_accelerations
 from tests.helpers.requirements import needs_uv
+from tests.helpers.runs import run_scenarios
 
 PYTHON = (
     sys.executable
@@ -150,8 +148,7 @@ FULL_INERTIA = "MjsBody, mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE"  # its axes
 @pytest.mark.full
 @pytest.mark.timeout(1800)
 def test_the_supported_versions_work_beside_the_installed_ones(tmp_path):
-    chosen = loader.load_scenarios(["tumbling-ball", "tumbling-rod"])
-    result = run_plan(Plan(chosen, ["mujoco", *OLDER_VERSIONS], limits=Limits(600)), quiet)
+    result = run_scenarios(["tumbling-ball", "tumbling-rod"], ["mujoco", *OLDER_VERSIONS], limits=Limits(600))
     for name in OLDER_VERSIONS:
         assert result.engines[name].missing is None
         assert Version(result.engines[name].version) == Version(name.partition("@")[2])
@@ -244,8 +241,7 @@ def test_defects_of_older_versions_are_reported_by_quantity_and_call():
     for scenario in sorted({one[0] for one in MENDED}):
         names = sorted({one[1] for one in MENDED if one[0] == scenario})
         sound = sorted({name.partition("@")[0] for name in names})
-        chosen = loader.load_scenarios([scenario])
-        result = run_plan(Plan(chosen, [*sound, *names], "state", limits=Limits(600)), quiet)
+        result = run_scenarios([scenario], [*sound, *names], "state", limits=Limits(600))
         for r in result.rows:
             if r.verdict in ("disagrees", "failed"):
                 reasons.setdefault((scenario, r.engine), []).append((r.quantity, r.reason))
@@ -260,8 +256,9 @@ def test_defects_of_older_versions_are_reported_by_quantity_and_call():
 @pytest.mark.timeout(900)
 def test_each_cause_in_loops_of_older_versions_is_one_finding_with_its_versions():
     """On rods, in whose coordinates the velocity terms are missing, and in a loop with redundant rows."""
-    chosen = loader.load_scenarios(["bricard", "flyball-governor"])
-    result = run_plan(Plan(chosen, ["mujoco@3.6.0", "mujoco@3.13.0"], "state", limits=Limits(600)), quiet)
+    result = run_scenarios(
+        ["bricard", "flyball-governor"], ["mujoco@3.6.0", "mujoco@3.13.0"], "state", limits=Limits(600)
+    )
     found = {f.title: (f.version_range, f.scenarios) for f in result.findings if f.verdict == "disagrees"}
     assert found == {
         "joint forces with the moments of the welds in cut bodies doubled and in body axes": (
@@ -294,8 +291,7 @@ def test_exudyn_started_from_wrong_accelerations_with_its_sparse_solver(version,
 @pytest.mark.full
 @pytest.mark.timeout(900)
 def test_a_version_that_cannot_be_had_is_a_verdict():
-    chosen = loader.load_scenarios(["rest"])
-    result = run_plan(Plan(chosen, ["mujoco@99.0.0", "mujoco@3.1.6"], "state"), quiet)
+    result = run_scenarios(["rest"], ["mujoco@99.0.0", "mujoco@3.1.6"], "state")
     absent, refused = result.rows
     assert absent.verdict == "failed" and "99.0.0" in absent.reason
     assert refused.verdict == "unsupported" and "supports versions >=3.2" in refused.reason
@@ -329,11 +325,8 @@ def test_a_file_that_is_no_wheel_is_bad_usage(tmp_path):
     path = tmp_path / "mujoco-4.0.0-py3-none-any.whl"
     path.write_text("no zip")
     assert "is not a wheel: it is no zip file" in environments.version_problem(f"mujoco@{path}")
-    done = subprocess.run(
-        [PYTHON, "-m", "plumbline", "run", "rest", "--engine", f"exudyn@{path}"],
-        cwd=environments.ROOT, capture_output=True, text=True,
-    )  # fmt: skip
-    assert done.returncode == 2 and "is a wheel of mujoco, not of exudyn" in " ".join(done.stderr.split())
+    done = invoke("run", "rest", "--engine", f"exudyn@{path}", code=2)
+    assert "is a wheel of mujoco, not of exudyn" in " ".join(done.stderr.split())
 
 
 def test_without_uv_the_reason_names_what_to_install(tmp_path, monkeypatch):
@@ -371,7 +364,7 @@ def test_an_index_that_does_not_answer_is_reported(tmp_path, monkeypatch, versio
     monkeypatch.setenv("UV_HTTP_RETRIES", "0")
     monkeypatch.setenv("UV_CACHE_DIR", str(tmp_path / "uv"))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    result = run_plan(Plan(loader.load_scenarios(["rest"]), [f"mujoco@{version}"], "state"), quiet)
+    result = run_scenarios(["rest"], [f"mujoco@{version}"], "state")
     (row,) = result.rows
     assert row.verdict == "failed" and result.metadata["exit_code"] == 3
     assert "uv cannot make an environment" in row.reason and "http://127.0.0.1:9/simple/mujoco" in row.reason
@@ -383,9 +376,7 @@ def test_an_index_that_does_not_answer_is_reported(tmp_path, monkeypatch, versio
 @pytest.mark.timeout(1800)
 def test_latest_pre_and_a_wheel_run_beside_the_installed_one(tmp_path, package_index):
     names = ["mujoco", "mujoco@latest", "mujoco@pre", f"mujoco@{build_wheel(tmp_path)}"]
-    result = run_plan(
-        Plan(loader.load_scenarios(["tumbling-ball"]), names, "state", limits=Limits(600)), quiet
-    )
+    result = run_scenarios(["tumbling-ball"], names, "state", limits=Limits(600))
     found = {name: result.engines[name] for name in names}
     assert [info.missing for info in found.values()] == [None] * 4
     latest, newest = (Version(found[f"mujoco@{which}"].version) for which in ("latest", "pre"))
@@ -403,17 +394,14 @@ def test_an_empty_wheel_is_reported(tmp_path, package_index):
     path = tmp_path / "mujoco-4.0.0-py3-none-any.whl"
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("mujoco/__init__.py", "")
-    result = run_plan(Plan(loader.load_scenarios(["rest"]), [f"mujoco@{path}"], "state"), quiet)
+    result = run_scenarios(["rest"], [f"mujoco@{path}"], "state")
     (row,) = result.rows
     assert row.verdict == "failed" and "uv cannot make an environment" in row.reason
 
 
 def test_a_bad_version_is_bad_usage():
-    done = subprocess.run(
-        [PYTHON, "-m", "plumbline", "run", "rest", "--engine", "mujoco@three"],
-        cwd=environments.ROOT, capture_output=True, text=True,
-    )  # fmt: skip
-    assert done.returncode == 2 and "'three' is not a version" in done.stderr
+    done = invoke("run", "rest", "--engine", "mujoco@three", code=2)
+    assert "'three' is not a version" in done.stderr
 
 
 def test_importers_of_the_main_environment_and_of_their_own(monkeypatch, tmp_path):

@@ -7,12 +7,11 @@ import psutil
 import pytest
 
 from plumbline.engines import registry
-from plumbline.execution.plan import Plan
-from plumbline.execution.runner import exit_code, run_plan
+from plumbline.execution.runner import exit_code
 from plumbline.processes import worker_process
 from plumbline.processes.worker_pool import Limits
-from plumbline.scenario import loader
 from tests.helpers import misbehaving_engines as engines
+from tests.helpers.runs import run_scenarios
 
 SECONDS = 15.0
 
@@ -24,11 +23,10 @@ def run_engines(monkeypatch):
     monkeypatch.setattr(worker_process, "initialize_worker", engines.prepare_worker)
 
     def run(names):
-        plan = Plan(
-            loader.load_scenarios(["tumbling-ball"]), ["reference", *names], "state", random_state_count=10,
+        return run_scenarios(
+            ["tumbling-ball"], ["reference", *names], "state", random_state_count=10,
             jobs=2, limits=Limits(SECONDS, 4), are_engines_required=True,
         )  # fmt: skip
-        return run_plan(plan, lambda *_: None)
 
     return run
 

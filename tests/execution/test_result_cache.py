@@ -12,17 +12,15 @@ from plumbline.diagnosis.cause import Cause, Diagnosis
 from plumbline.engines.environments import EnvironmentUnavailable, ensure_interpreter
 from plumbline.execution import environment_fingerprint
 from plumbline.execution.environment_fingerprint import installed_files
-from plumbline.execution.plan import Plan
 from plumbline.execution.result_cache import DiskResultCache, task_hash
-from plumbline.execution.runner import run_plan
 from plumbline.judging.rows import JudgingResult, RowContext
 from plumbline.processes.record_encoding import decode_record, encode_record
 from plumbline.processes.user_cache import CheckedFiles, recall, remember
 from plumbline.processes.worker_environment import hashed_environment
 from plumbline.processes.worker_pool import Task, WorkerPool
-from plumbline.scenario import loader
 from tests.helpers.commands import invoke, run_plumbline
 from tests.helpers.in_process import InProcessWorkers
+from tests.helpers.runs import run_scenarios
 
 
 def quiet(*_):
@@ -199,13 +197,10 @@ def run_rest(folder, log=quiet):
             ran.append(task)
             super().start(task)
 
-    plan = Plan(
-        loader.load_scenarios(["rest"]), ["reference"], "state", random_state_count=2,
-        result_cache=DiskResultCache(folder, log),
-    )  # fmt: skip
+    options = {"random_state_count": 2, "result_cache": DiskResultCache(folder, log)}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("plumbline.execution.runner.WorkerPool", Workers)
-        result = run_plan(plan, quiet)
+        result = run_scenarios(["rest"], ["reference"], "state", **options)
     return [replace(row, cpu_time=0.0) for row in result.rows], len(ran)
 
 

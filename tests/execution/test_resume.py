@@ -16,14 +16,12 @@ import pyarrow.parquet as pq
 import pytest
 
 from plumbline.engines import engine_calls
-from plumbline.execution.plan import Plan
 from plumbline.execution.result_cache import DiskResultCache, task_hash
-from plumbline.execution.runner import run_plan
 from plumbline.processes.worker_pool import Outcome, Pickled, Task
-from plumbline.scenario import loader
 from tests.helpers import ROOT
 from tests.helpers.catalogue import catalogue_scenario
 from tests.helpers.commands import invoke, run_plumbline
+from tests.helpers.runs import run_scenarios
 
 TIME_FIELDS = {"cpu_time", "cost"}  # what may differ between two runs
 SCENARIOS = ["rest", "tumbling-ball"]
@@ -153,11 +151,9 @@ def run_and_count(cells, stop_after=None):
         if done == stop_after:
             raise Interrupted
 
-    chosen = loader.load_scenarios(["rest", "conical"])
+    options = {"result_cache": cells, "random_state_count": 3, "progress": progress}
     try:
-        result = run_plan(
-            Plan(chosen, ["mujoco"], "state", result_cache=cells, random_state_count=3), progress
-        )
+        result = run_scenarios(["rest", "conical"], ["mujoco"], "state", **options)
     except Interrupted:
         return None, ran
     return [replace(row, cpu_time=0.0) for row in result.rows], ran

@@ -6,11 +6,12 @@ from dataclasses import replace
 import pytest
 
 from plumbline.execution.plan import Plan, TaskKind, plainest
-from plumbline.execution.runner import describe_engines, run_plan
+from plumbline.execution.runner import describe_engines
 from plumbline.execution.scenario_verdicts import ScenarioRun
 from plumbline.processes.worker_pool import Limits, Outcome, WorkerPool, run_task
 from plumbline.scenario import loader
 from tests.helpers.catalogue import catalogue_scenario
+from tests.helpers.runs import run_scenarios
 from tests.helpers.shared_answers import by_content
 
 pytest.importorskip("mujoco")
@@ -141,8 +142,7 @@ def test_in_a_run_the_second_truth_is_handed_over(monkeypatch):
         return requested[-1] if uncompiled else replace(requested[-1], function=exit_process)
 
     monkeypatch.setattr(ScenarioRun, "truth_task", first_crashes)
-    plan = Plan([catalogue_scenario("rest")], ["mujoco"], "trajectory", limits=Limits(120))
-    result = run_plan(plan, lambda *_: None)
+    result = run_scenarios(["rest"], ["mujoco"], "trajectory", limits=Limits(120))
     assert len(requested) == 2
     assert result.metadata["exit_code"] == 0, result.metadata["sentence"]
 

@@ -7,11 +7,11 @@ import pytest
 from plumbline.engines.adapter import EngineInfo
 from plumbline.engines.registry import load_adapter
 from plumbline.execution.plan import Plan, TaskKind
-from plumbline.execution.runner import run_plan
 from plumbline.execution.scenario_verdicts import ScenarioRun
 from plumbline.judging.rows import Verdict
 from plumbline.judging.state_level import SINGULAR_POSE
 from tests.helpers.catalogue import catalogue_scenario
+from tests.helpers.runs import run_scenarios
 
 
 @pytest.mark.parametrize(
@@ -37,9 +37,8 @@ def test_levels_that_are_left_out_are_reported(name, level, expected):
 
 
 def test_a_singular_initial_pose_is_unresolved_and_the_others_are_compared():
-    scenario = catalogue_scenario("four-bars-2-flat")
     engines = ["reference", "mujoco", "pinocchio-aba"]
-    result = run_plan(Plan([scenario], engines, "state", random_state_count=3), lambda *_: None)
+    result = run_scenarios(["four-bars-2-flat"], engines, "state", random_state_count=3)
     singular = {row.engine: row for row in result.rows if row.quantity == SINGULAR_POSE}
     assert set(singular) == {"reference", "mujoco"}  # the third refuses loops
     for row in singular.values():
@@ -52,8 +51,8 @@ def test_a_singular_initial_pose_is_unresolved_and_the_others_are_compared():
 
 
 def test_a_regular_pose_beside_a_singular_one_is_compared():
-    scenario = catalogue_scenario("slider-crank")  # its dead centres are regular: the crank turns there
-    result = run_plan(Plan([scenario], ["reference"], "state", random_state_count=1), lambda *_: None)
+    """The dead centres of a slider-crank are regular: the crank turns there."""
+    result = run_scenarios(["slider-crank"], ["reference"], "state", random_state_count=1)
     assert {row.extra["states"] for row in result.rows} == {2.0}
 
 
@@ -61,7 +60,7 @@ def test_a_regular_pose_beside_a_singular_one_is_compared():
 def test_a_scenario_that_asks_for_states_is_compared_at_ten_only(level):
     assert catalogue_scenario("crowded-tree").level == "state"
     scenario = replace(catalogue_scenario("damped-hinge"), level="state")
-    result = run_plan(Plan([scenario], ["reference"], level), lambda *_: None)
+    result = run_scenarios([scenario], ["reference"], level)
     assert {(row.level, row.verdict, row.extra["states"]) for row in result.rows} == {
         ("state", Verdict.AGREES, 10.0)
     }

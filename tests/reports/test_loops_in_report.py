@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 import reports
-from plumbline.execution.plan import Plan
-from plumbline.execution.runner import run_plan, save
+from plumbline.execution.runner import save
 from reports.stored_results import Results
 from tests.helpers.catalogue import catalogue_scenario
+from tests.helpers.runs import run_scenarios
 from tests.reports.test_report import decoded_chunks
 
 NAMES = ("bricard", "flyball-governor")
@@ -15,8 +15,7 @@ NAMES = ("bricard", "flyball-governor")
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    scenarios = [catalogue_scenario(name) for name in NAMES]
-    result = run_plan(Plan(scenarios, ["reference"], "state", random_state_count=1), lambda *_: None)
+    result = run_scenarios(NAMES, ["reference"], "state", random_state_count=1)
     place = tmp_path_factory.mktemp("loops") / "run"
     save(result, place, "-")
     reports.write(place)
