@@ -2,11 +2,11 @@
 
 import pytest
 
-from plumbline.engines.importer_calls import read_model_file
 from plumbline.importers.xml_tree import ModelFileError
 from plumbline.judging.rows import Verdict
 from plumbline.model_files.model_run import ModelPlan, run_model_files
 from plumbline.model_files.prepared_file import package_folder, prepare_file
+from tests.helpers.importer_columns import read_by_mujoco
 
 MAIN = """<mujoco model="m">
 <compiler angle="degree"/>
@@ -40,7 +40,7 @@ def model(tmp_path):
     (tmp_path / "robot.xml").write_text(MAIN)
     (tmp_path / "parts" / "arm.xml").write_text(ARM)
     prepared = prepare_file(str(tmp_path / "robot.xml"), tmp_path / "parts")
-    return prepared.neutral_model(read_model_file("mujoco", prepared.file))
+    return read_by_mujoco(prepared)
 
 
 def test_unnamed_bodies_and_joints_are_named_by_their_line(model):
@@ -83,7 +83,7 @@ def test_stripping_keeps_geometry_that_defines_the_mass(tmp_path):
         prepare_file(str(tmp_path / "robot.xml"), tmp_path)
     (tmp_path / "copy").mkdir()
     prepared = prepare_file(str(tmp_path / "robot.xml"), tmp_path / "copy", strip=True)
-    found = prepared.neutral_model(read_model_file("mujoco", prepared.file))
+    found = read_by_mujoco(prepared)
     assert [body.mass for body in found.bodies] == [2.0, 3.0]
 
 
@@ -113,7 +113,7 @@ def test_stripping_leaves_out_each_mesh_that_no_mass_needs(tmp_path):
     path.write_text(STRIPPED.replace('type="mesh" mesh="own"', 'size="0.1" mass="3"'))
     (tmp_path / "copy").mkdir()
     prepared = prepare_file(str(path), tmp_path / "copy", strip=True)
-    found = prepared.neutral_model(read_model_file("mujoco", prepared.file))  # the tendon has its pulley
+    found = read_by_mujoco(prepared)  # the tendon has its pulley
     assert [body.mass for body in found.bodies] == [2.0, 3.0]
 
 

@@ -9,6 +9,7 @@ from plumbline.importers.xml_tree import write_xml
 from plumbline.judging.rows import RowContext
 from plumbline.model_files.model_rows import rewriting_row
 from plumbline.model_files.prepared_file import prepare_file
+from tests.helpers.importer_columns import prepared_file
 from tests.helpers.random_robots import random_mjcf
 
 ROBOT = """<mujoco model="m"><compiler angle="degree" eulerseq="zyX"/>
@@ -40,9 +41,7 @@ CONTEXT = RowContext("robot.xml", "model file", "mujoco", "MuJoCo", "4.0.0")
 
 def judged(folder, text, defect=lambda tree: None):
     """Judge a compiler that is MuJoCo's with a defect: it compiles a changed file."""
-    path = folder / "robot.xml"
-    path.write_text(text)
-    prepared = prepare_file(str(path), folder)
+    _, prepared = prepared_file(folder, text)
 
     def compiled(tree):
         defect(tree)

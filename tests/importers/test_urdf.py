@@ -12,23 +12,21 @@ from plumbline.model_files.model_comparison import (
     model_states,
     permuted,
 )
-from plumbline.model_files.prepared_file import prepare_file
+from tests.helpers.importer_columns import prepared_file
 from tests.helpers.random_robots import random_urdf
 
 
-def prepared_file(tmp_path, text, base="auto"):
-    path = tmp_path / "robot.urdf"
-    path.write_text(text)
-    return prepare_file(str(path), tmp_path, base=base)
+def prepared(tmp_path, text, base="auto"):
+    return prepared_file(tmp_path, text, base=base)[1]
 
 
-def ratios(prepared, importer):
+def ratios(found, importer):
     """Error over tolerance by quantity, in the order of the file's joints."""
-    model = prepared.neutral_model(None)
-    reading = read_model_file(importer, prepared.file).model
+    model = found.neutral_model(None)
+    reading = read_model_file(importer, found.file).model
     order = joint_permutation(model, reading)
     assert order is not None, [(j.name, j.kind) for j in reading.joints]
-    answers = evaluate_model_file(importer, prepared.file, model_states(reading, 3, 1))
+    answers = evaluate_model_file(importer, found.file, model_states(reading, 3, 1))
     if importer == "pinocchio":
         model = without_passive_forces(model)
     truths = certify_states(model, model_states(model, 3, 1))
@@ -40,7 +38,7 @@ def ratios(prepared, importer):
 @pytest.mark.parametrize("kinds", [(), ("revolute", "fixed"), ("prismatic", "continuous")])
 def test_importers_that_read_a_file_alike_agree_with_the_own_reader(tmp_path, importer, base, kinds):
     text = random_urdf(np.random.default_rng(len(kinds)), 5, kinds)
-    found = ratios(prepared_file(tmp_path, text, base), importer)
+    found = ratios(prepared(tmp_path, text, base), importer)
     assert len(found) >= 7
     assert max(found.values()) <= 1, found
 
@@ -48,9 +46,9 @@ def test_importers_that_read_a_file_alike_agree_with_the_own_reader(tmp_path, im
 @pytest.mark.parametrize("importer", ["mujoco", "pinocchio"])
 def test_a_floating_joint_of_the_root_is_a_free_joint(tmp_path, importer):
     text = random_urdf(np.random.default_rng(3), 3, ("revolute",)).replace("revolute", "floating", 1)
-    model = prepared_file(tmp_path, text).urdf_model
+    model = prepared(tmp_path, text).urdf_model
     assert model.joints[0].kind == "free"
-    found = ratios(prepared_file(tmp_path, text), importer)
+    found = ratios(prepared(tmp_path, text), importer)
     assert max(found.values()) <= 1, found
 
 
@@ -61,7 +59,7 @@ def test_planar_and_inner_floating_joints_are_elementary_ones(tmp_path):
     first, second, third = (f'name="joint{k}" type="revolute"' for k in (1, 2, 3))
     text = text.replace(second, second.replace("revolute", "floating"))
     text = text.replace(third, third.replace("revolute", "planar"))
-    model = prepared_file(tmp_path, text).urdf_model
+    model = prepared(tmp_path, text).urdf_model
     assert first in text
     kinds = {body.name: [joint.kind for joint in body.joints] for body in model.bodies}
     assert sorted(map(tuple, kinds.values())) == sorted(
@@ -77,7 +75,7 @@ def test_decimals_are_rounded_once_and_axes_normalised(tmp_path):
     start = text.index("<axis")
     text = text[:start] + '<axis xyz="1e200 0 1e200"/>' + text[text.index("/>", start) + 2 :]
     text = text.replace("<mass value=", '<mass value="0.1000000000000000055511151231257827" x=', 1)
-    model = prepared_file(tmp_path, text).urdf_model
+    model = prepared(tmp_path, text).urdf_model
     assert model.bodies[0].mass == 0.1
     np.testing.assert_array_equal(model.joints[0].axis, np.array([1, 0, 1]) / np.sqrt(2))
 
@@ -91,7 +89,7 @@ MISSPELT = """<robot name="r"><link name="a" colour="red"/>
 
 
 def test_attributes_and_elements_that_are_not_read_are_listed_with_their_lines(tmp_path):
-    model = prepared_file(tmp_path, MISSPELT).urdf_model
+    model = prepared(tmp_path, MISSPELT).urdf_model
     assert {(f.what, f.name, f.source.line) for f in model.not_compared} == {
         ("attribute colour of <link>", "a", 1), ("attribute unit of <inertia>", "b", 3), ("inertail", "b", 3),
         ("orgin", "j", 4), ("attribute xzy of <origin>", "j", 5),

@@ -6,14 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from plumbline.engines.importer_calls import evaluate_model_file, read_model_file
+from plumbline.engines.importer_calls import evaluate_model_file
 from plumbline.importers.lumping import lump_fixed_bodies
 from plumbline.importers.neutral_model import CanonicalState, ElementaryJoint, NeutralBody, NeutralModel
 from plumbline.importers.urdf import read_urdf
 from plumbline.importers.xml_tree import parse_xml
 from plumbline.model_files.certified_model import certify_model, pose_tolerances
 from plumbline.model_files.model_comparison import certify_states, mismatches, model_states
-from plumbline.model_files.prepared_file import prepare_file
+from tests.helpers.importer_columns import prepared_file, read_by_mujoco
 from tests.helpers.random_robots import random_mjcf, random_urdf
 
 FALSE_ALARM_ROBOTS = 500  # of each format, with 10 states
@@ -77,21 +77,19 @@ def test_the_rounding_of_a_balls_damping_is_that_of_a_turned_vector():
     assert limits[1] >= 0.05 * 3 * 2.0**-53
 
 
-def compare(tmp_path, text, suffix, count, importer="mujoco"):
-    path = tmp_path / f"robot{suffix}"
-    path.write_text(text)
-    prepared = prepare_file(str(path), tmp_path)
-    model = prepared.neutral_model(read_model_file("mujoco", prepared.file))
+def compare(tmp_path, text, count):
+    _, prepared = prepared_file(tmp_path, text)
+    model = read_by_mujoco(prepared)
     states = model_states(model, count, 7)
-    answers = evaluate_model_file(importer, prepared.file, states)
+    answers = evaluate_model_file("mujoco", prepared.file, states)
     return {name: m.ratio for name, m in mismatches(model, certify_states(model, states), answers).items()}
 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_mujoco_agrees_at_random_states_of_random_robots(tmp_path, seed):
     rng = np.random.default_rng(seed)
-    for make, suffix in ((random_urdf, ".urdf"), (random_mjcf, ".xml")):
-        found = compare(tmp_path, make(rng, 5), suffix, 3)
+    for make in (random_urdf, random_mjcf):
+        found = compare(tmp_path, make(rng, 5), 3)
         assert {"position", "attitude", "mass_matrix", "bias_force", "acceleration"} <= found.keys()
         assert max(found.values()) <= 1, found
 
@@ -117,8 +115,8 @@ def test_no_false_alarm_in_ten_thousand_states(tmp_path):
     rng = np.random.default_rng(11)
     worst = {}
     for _ in range(FALSE_ALARM_ROBOTS):
-        for make, suffix in ((random_urdf, ".urdf"), (random_mjcf, ".xml")):
-            for name, ratio in compare(tmp_path, make(rng, int(rng.integers(1, 9))), suffix, 10).items():
+        for make in (random_urdf, random_mjcf):
+            for name, ratio in compare(tmp_path, make(rng, int(rng.integers(1, 9))), 10).items():
                 worst[name] = max(ratio, worst.get(name, 0.0))
     print(worst)
     assert max(worst.values()) <= 1

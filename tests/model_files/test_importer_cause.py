@@ -13,21 +13,13 @@ from plumbline.judging.rows import Verdict
 from plumbline.model_files.model_comparison import model_states
 from plumbline.model_files.model_rows import Answer, state_seed
 from plumbline.model_files.model_run import ModelPlan, run_model_files
-from plumbline.model_files.prepared_file import prepare_file
-from tests.helpers.importer_columns import MUJOCO, judge_file
+from tests.helpers.importer_columns import MUJOCO, judge_file, prepared_file, read_by_mujoco
 from tests.helpers.nightly_tests import some_fast
 from tests.helpers.planted_files import MJCF_DEFECTS, URDF_DEFECTS
 from tests.helpers.random_robots import random_mjcf, random_urdf
 
 STATES = 4
 ROBOTS = 10
-
-
-def prepared_file(tmp_path, text):
-    """The path of a file that has the text, and the file as it is prepared for importers."""
-    path = tmp_path / ("robot.urdf" if text.startswith("<robot") else "robot.xml")
-    path.write_text(text)
-    return str(path), prepare_file(str(path), tmp_path)
 
 
 def answer_of(importer, file, path):
@@ -44,7 +36,7 @@ def judged(tmp_path, text, mutated, moved=""):
     path, prepared = prepared_file(tmp_path, text)
     other = Path(path).with_stem("other")
     other.write_text(mutated)
-    model = prepared.neutral_model(read_model_file("mujoco", prepared.file))
+    model = read_by_mujoco(prepared)
     answer = answer_of("mujoco", ModelFile(str(other), prepared.file.format), path)
     if answer is None:
         return None
@@ -179,7 +171,7 @@ ARMATURE = """<mujoco><worldbody><body name="a"><joint name="j" axis="0 1 0" arm
 def pinocchio_judged(tmp_path, text):
     """What Pinocchio makes of a file, judged by what MuJoCo reads in it."""
     path, prepared = prepared_file(tmp_path, text)
-    model = prepared.neutral_model(read_model_file("mujoco", prepared.file))
+    model = read_by_mujoco(prepared)
     answer = answer_of("pinocchio", prepared.file, path)
     return judge_file(path, model, ("pinocchio", describe_importer("pinocchio"), answer), STATES)
 

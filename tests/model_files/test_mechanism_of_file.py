@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from plumbline.engines.importer_calls import read_model_file
 from plumbline.importers.lumping import lump_fixed_bodies
 from plumbline.importers.neutral_model import ElementaryJoint, NeutralBody, NeutralModel
 from plumbline.importers.xml_tree import ModelFileError
@@ -26,21 +25,14 @@ from plumbline.model_files.mechanism_of_file import (
     mechanism_of_model,
 )
 from plumbline.model_files.model_comparison import model_states
-from plumbline.model_files.prepared_file import prepare_file
 from plumbline.scenario.loader import load_scenario, scenario_from_dict
 from plumbline.truth.certified_state import certify_state
 from tests.helpers.commands import invoke
+from tests.helpers.importer_columns import prepared_file, read_by_mujoco
 from tests.helpers.random_robots import random_mjcf, random_urdf
 from tests.helpers.terminal_counts import agreed
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
-
-
-def read(tmp_path, text, suffix):
-    path = tmp_path / f"robot{suffix}"
-    path.write_text(text)
-    prepared = prepare_file(str(path), tmp_path)
-    return prepared.neutral_model(read_model_file("mujoco", prepared.file))
 
 
 def without_free_damping(model):
@@ -106,9 +98,9 @@ def accelerations(model, scenario, at):
 def test_random_robots_accelerate_as_their_mechanisms(tmp_path, seed, monkeypatch):
     monkeypatch.setattr(mechanism_of_file, "SHARE", 2.0**-30)  # parts between joints nearly without mass
     rng = np.random.default_rng(seed)
-    make, suffix = ((random_urdf, ".urdf"), (random_mjcf, ".xml"))[seed % 2]
-    model = without_free_damping(lump_fixed_bodies(read(tmp_path, make(rng, 4), suffix)))
-    scenario = scenario_from_dict(mechanism_of_model(model, (), f"robot{suffix}"), "robot")
+    path, prepared = prepared_file(tmp_path, (random_urdf, random_mjcf)[seed % 2](rng, 4))
+    model = without_free_damping(lump_fixed_bodies(read_by_mujoco(prepared)))
+    scenario = scenario_from_dict(mechanism_of_model(model, (), path), "robot")
     has_parts = scenario.model.n > len(model.bodies)
     for at in model_states(model, 2, seed):
         for own, lifted in zip(*accelerations(model, scenario, at), strict=True):
