@@ -21,7 +21,7 @@ from plumbline.model.sampling import random_states
 from plumbline.truth.ground_truth import state_truth
 from tests.helpers import pendulums
 from tests.helpers.catalogue import catalogue_scenario, states_of
-from tests.helpers.nightly_tests import SLOW
+from tests.helpers.nightly_tests import SLOW, nightly
 
 pytest.importorskip("flint")
 CHAIN, TREE, LOOP = "chain", "double-hinge-skew", "flyball-governor"
@@ -111,7 +111,7 @@ def test_elementary_mistakes_in_outputs_are_named(name, mistake):
         assert cause.amount == {"2 T": (2.0,), "T/2": (0.5,)}.get(mistake, ())
 
 
-@pytest.mark.parametrize("name", [CHAIN, *(pytest.param(name, marks=SLOW) for name in (TREE, LOOP))])
+@pytest.mark.parametrize("name", [CHAIN, *nightly((TREE, LOOP))])
 def test_different_mistakes_in_one_quantity_stay_apart(name):
     of_accelerations = [m for m, (quantity, *_) in TEN.items() if quantity == "acceleration"]
     pairs = list(combinations(of_accelerations, 2))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,11 @@ def slow(test: Any) -> Any:
     for mark in SLOW:
         test = mark(test)
     return test
+
+
+def nightly(cases: Iterable[Any]) -> list[Any]:
+    """Parameters of a test that run nightly."""
+    return [pytest.param(case, marks=SLOW) for case in cases]
 
 
 def some_fast(cases: Sequence[Any], step: int) -> list[Any]:

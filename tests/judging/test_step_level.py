@@ -29,7 +29,7 @@ from plumbline.truth.step_charts import StepCharts
 from plumbline.truth.step_comparison import step_counts
 from tests.helpers import pendulums
 from tests.helpers.catalogue import catalogue_scenario, states_of
-from tests.helpers.nightly_tests import SLOW, some_fast
+from tests.helpers.nightly_tests import SLOW, nightly, some_fast
 from tests.helpers.pendulums import JOINT_PATTERNS
 from tests.helpers.pinocchio_by_crba import steps_by_crba
 from tests.helpers.planted_steps import STEP_DEFECTS, stale_velocity, step_defect, velocity_verlet
@@ -147,7 +147,7 @@ def test_equations_of_a_branching_tree_of_rods_and_balls_are_compared():
         assert wrong["step_equations"] > 1
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=SLOW) for k in range(1, 12))])
+@pytest.mark.parametrize("seed", [0, *nightly(range(1, 12))])
 def test_equations_of_trees_on_other_joints_are_compared_where_these_are_together(seed):
     """By constraints on velocities joints part by as much as the step's error, and their forces turn."""
     kinds = [kind for kind in KINDS if kind != "helical"]  # which Exudyn lacks
@@ -326,7 +326,7 @@ def tree(seed, elements=ELEMENTS, missing=()):
 
 
 @pytest.mark.parametrize("free", ["point and rotation", "rigid motion"])
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=SLOW) for seed in range(1, 4))])
+@pytest.mark.parametrize("seed", [0, *nightly(range(1, 4))])
 @pytest.mark.parametrize("kinds", [tuple(KINDS), ("slide", "ball", "rod")], ids=["every joint", "slides"])
 def test_accelerations_of_trees_equal_the_certified_ones(seed, free, kinds):
     model = tree_from_seed(seed, 7, kinds, elements=ELEMENTS)
@@ -403,9 +403,7 @@ def test_every_other_step_of_a_tree_is_reported(name):
 @pytest.mark.parametrize(
     "field", ["rest", "stiffness", "damping", "spring_length", "spring_damping", "point"]
 )
-@pytest.mark.parametrize(
-    "engine", ["mujoco", *(pytest.param(x, marks=SLOW) for x in ("pinocchio", "exudyn-tree"))]
-)
+@pytest.mark.parametrize("engine", ["mujoco", *nightly(("pinocchio", "exudyn-tree"))])
 def test_a_wrong_number_of_a_tree_is_reported_by_its_steps(engine, field):
     model, states = branches()
     integrator = methods(engine)[-1]
@@ -450,7 +448,7 @@ def loop_subject(name):
     return scenario.model, states_of(scenario, 1)
 
 
-@pytest.mark.parametrize("name", [*LOOPS[:3], *(pytest.param(x, marks=SLOW) for x in LOOPS[3:])])
+@pytest.mark.parametrize("name", [*LOOPS[:3], *nightly(LOOPS[3:])])
 def test_accelerations_of_loops_equal_the_certified_ones(name):
     """At the closed states, where a correction of gaps acts on what rounding leaves open only."""
     checked_charts(*loop_subject(name), 1e-12)
@@ -463,7 +461,7 @@ def test_accelerations_of_generic_loops_equal_the_certified_ones():
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "pinocchio", "exudyn"])
-@pytest.mark.parametrize("name", [LOOPS[0], *(pytest.param(x, marks=SLOW) for x in LOOPS[1:])])
+@pytest.mark.parametrize("name", [LOOPS[0], *nightly(LOOPS[1:])])
 def test_honest_engines_take_the_declared_step_on_loops(name, engine):
     model, states = loop_subject(name)
     for integrator in methods(engine):

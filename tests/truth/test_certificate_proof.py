@@ -26,7 +26,7 @@ from plumbline.truth.taylor import simulate_taylor
 from plumbline.truth.trajectory_truth import judge_claim, trajectory_truth
 from tests.helpers import ROOT
 from tests.helpers.catalogue import catalogue_scenario, catalogue_scenarios
-from tests.helpers.nightly_tests import SLOW
+from tests.helpers.nightly_tests import SLOW, nightly
 from tests.helpers.random_chains import random_chain
 from tests.helpers.stored_certificates import FOLDER as STORED
 from tests.helpers.stored_certificates import stored_mechanism
@@ -372,7 +372,7 @@ def true_enclosure(document, proof):
 
 @pytest.mark.parametrize("name", [*CHAINS, *TREES])
 @pytest.mark.parametrize("bits, expected", [(20, "wider"), (109, "reject")])
-@pytest.mark.parametrize("power", [0, *(pytest.param(k, marks=SLOW) for k in (1, 5))])
+@pytest.mark.parametrize("power", [0, *nightly((1, 5))])
 def test_a_wrong_coefficient_is_rejected_or_covered(proofs, name, bits, expected, power):
     """Also one that opens a gap between steps."""
     document = json.loads(json.dumps(proofs[name][2]))
