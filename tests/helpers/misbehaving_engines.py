@@ -62,19 +62,11 @@ def hang_deaf(*_: Any) -> None:
         time.sleep(1)
 
 
-def fill_memory(*_: Any) -> None:
-    bytearray(2**34)
-
-
 def recurse(*arguments: Any) -> None:
     recurse(*arguments)
 
 
 # -- what is done before the right answer ---------------------------------------------------------
-
-
-def close_standard_descriptors() -> None:
-    os.closerange(0, 3)
 
 
 def flood_without_newline() -> None:
@@ -85,14 +77,6 @@ def flood_without_newline() -> None:
 
 def read_stdin() -> None:
     assert os.read(0, 100) == b""
-
-
-def use_a_gigabyte() -> None:
-    np.ones(2**27)
-
-
-def fork_and_return() -> None:
-    os.fork()
 
 
 def fork_child() -> None:
@@ -108,14 +92,6 @@ def start_daemon() -> None:
             os._exit(0)
         time.sleep(600)
         os._exit(0)
-
-
-def start_program() -> None:
-    subprocess.Popen(["sleep", "600"], start_new_session=True)
-
-
-def leave_thread() -> None:
-    threading.Thread(target=time.sleep, args=(600,), daemon=False).start()
 
 
 def spoil_numpy() -> None:
@@ -140,22 +116,23 @@ def change_process() -> None:
         signal.signal(number, signal.SIG_IGN)
 
 
-def change_folder() -> None:
-    os.chdir("/")
-
-
-def lower_limits() -> None:
-    resource.setrlimit(resource.RLIMIT_NOFILE, (3, 3))
-
-
-BEFORE: dict[str, tuple[Callable[[], None], str]] = {
-    one.__name__: (one, HARMLESS)
-    for one in (
-        close_standard_descriptors, flood_without_newline, read_stdin, use_a_gigabyte, fork_and_return,
-        fork_child, start_daemon, start_program, leave_thread, change_process, change_folder, lower_limits,
-    )
+BEFORE: dict[str, tuple[Callable[[], Any], str]] = {
+    "close_standard_descriptors": (lambda: os.closerange(0, 3), HARMLESS),
+    "flood_without_newline": (flood_without_newline, HARMLESS),
+    "read_stdin": (read_stdin, HARMLESS),
+    "use_a_gigabyte": (lambda: np.ones(2**27), HARMLESS),
+    "fork_and_return": (lambda: os.fork(), HARMLESS),
+    "fork_child": (fork_child, HARMLESS),
+    "start_daemon": (start_daemon, HARMLESS),
+    "start_program": (lambda: subprocess.Popen(["sleep", "600"], start_new_session=True), HARMLESS),
+    "leave_thread": (
+        lambda: threading.Thread(target=time.sleep, args=(600,), daemon=False).start(), HARMLESS,
+    ),
+    "change_process": (change_process, HARMLESS),
+    "change_folder": (lambda: os.chdir("/"), HARMLESS),
+    "lower_limits": (lambda: resource.setrlimit(resource.RLIMIT_NOFILE, (3, 3)), HARMLESS),
+    "spoil_numpy": (spoil_numpy, HARMLESS),
 }  # fmt: skip
-BEFORE["spoil_numpy"] = spoil_numpy, HARMLESS
 
 # -- what is done instead of the answer -----------------------------------------------------------
 
@@ -192,7 +169,7 @@ INSTEAD: dict[str, tuple[Callable[..., Any], str]] = {
     "hang": (faults.hang, TIMEOUT),
     "hang_in_c": (faults.hang_in_c, TIMEOUT),
     "hang_deaf": (hang_deaf, TIMEOUT),
-    "fill_memory": (fill_memory, "out of memory"),
+    "fill_memory": (lambda *_: bytearray(2**34), "out of memory"),
     "recurse": (recurse, "RecursionError"),
     "close_descriptors": (faults.close_descriptors, "crashed: the worker"),
     "write_everywhere": (faults.write_everywhere, "crashed: the worker did not reply"),
@@ -257,13 +234,6 @@ ANSWERS: dict[str, tuple[Callable[[Answers], Any], str]] = {
 }  # fmt: skip
 
 
-def change_arguments(model: Model, states: list[State]) -> None:
-    for array in (*vars(model).values(), *(value for state in states for value in vars(state).values())):
-        if isinstance(array, np.ndarray):
-            array.setflags(write=True)
-            array[...] = 0
-
-
 # -- declarations ---------------------------------------------------------------------------------
 
 VERSION = "version() is {}, must be a line of 1 to 200 characters"
@@ -315,7 +285,10 @@ def _after(change: Callable[[Answers], Any]) -> Callable[..., Any]:
 
 def _spoil_arguments(self: Any, model: Model, states: list[State]) -> Answers:
     right = Reference()._evaluate(model, states)
-    change_arguments(model, states)
+    for array in (*vars(model).values(), *(value for state in states for value in vars(state).values())):
+        if isinstance(array, np.ndarray):
+            array.setflags(write=True)
+            array[...] = 0
     return right
 
 
@@ -325,14 +298,15 @@ EXPECTED: dict[str, str] = {
     "misspelt": "has no attribute 'misspelt'",
 }
 _METHODS: dict[str, dict[str, Any]] = {"arguments_changed": {"_evaluate": _spoil_arguments}}
-for _name, (_act, _words) in BEFORE.items():
-    EXPECTED[f"after_{_name}"], _METHODS[f"after_{_name}"] = _words, {"_evaluate": _before(_act)}
-for _name, (_what, _words) in INSTEAD.items():
-    EXPECTED[f"evaluation_{_name}"], _METHODS[f"evaluation_{_name}"] = _words, {"_evaluate": _what}
-for _name, (_change, _words) in ANSWERS.items():
-    EXPECTED[f"answers_{_name}"], _METHODS[f"answers_{_name}"] = _words, {"_evaluate": _after(_change)}
-for _name, (_members, _words) in DECLARED.items():
-    EXPECTED[f"declared_{_name}"], _METHODS[f"declared_{_name}"] = _words, _members
+_WAYS: dict[str, tuple[dict[str, tuple[Any, str]], Callable[[Any], dict[str, Any]]]] = {
+    "after": (BEFORE, lambda act: {"_evaluate": _before(act)}),
+    "evaluation": (INSTEAD, lambda act: {"_evaluate": act}),
+    "answers": (ANSWERS, lambda change: {"_evaluate": _after(change)}),
+    "declared": (DECLARED, lambda members: members),
+}
+for _way, (_table, _members) in _WAYS.items():
+    for _name, (_what, _words) in _table.items():
+        EXPECTED[f"{_way}_{_name}"], _METHODS[f"{_way}_{_name}"] = _words, _members(_what)
 for _name, (_, _words) in AT_IMPORT.items():
     EXPECTED[f"import_{_name}"] = _words
 
