@@ -2,6 +2,7 @@
 
 import json
 import os
+from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -104,74 +105,42 @@ def test_nights_keep_their_order_when_the_clock_is_set_back(tmp_path):
     assert [n.run["id"] for n in ReportHistory.load(tmp_path, next_one).nights] == ids
 
 
-def truncate_json(folder):
-    (folder / "results.json").write_text("{")
+def with_fields(**fields):
+    return lambda path: path.write_text(json.dumps(json.loads(path.read_text()) | fields))
 
 
-def truncate_parquet(folder):
-    path = folder / "summary.parquet"
-    path.write_bytes(path.read_bytes()[:-8])
-
-
-def delete_parquet(folder):
-    (folder / "summary.parquet").unlink()
-
-
-def change_schema_version(folder):
-    document = json.loads((folder / "results.json").read_text())
-    (folder / "results.json").write_text(json.dumps(document | {"schema_version": 99}))
-
-
-def change_verdict(folder):
-    path = folder / "results.json"
-    path.write_text(path.read_text().replace('"verdict": "agrees"', '"verdict": "accords"'))
-
-
-def change_verdict_of_the_table(folder):
-    path = folder / "summary.parquet"
+def change_verdicts(path):
     table = pq.read_table(path)
     place = table.schema.get_field_index("verdict")
     pq.write_table(table.set_column(place, "verdict", pa.array(["accords"] * len(table))), path)
 
 
-def replace_by_a_pipe(folder):
-    (folder / "results.json").unlink()
-    os.mkfifo(folder / "results.json")
-
-
-def replace_by_a_folder(folder):
-    (folder / "summary.parquet").unlink()
-    (folder / "summary.parquet").mkdir()
-
-
-def remove_rows(folder):
-    document = json.loads((folder / "results.json").read_text())
-    (folder / "results.json").write_text(json.dumps(document | {"rows": []}))
-
-
-SPOILED = {
-    truncate_json: "results.json: not a results file",
-    truncate_parquet: "summary.parquet: is damaged",
-    delete_parquet: "summary.parquet",
-    change_schema_version: "results.json: schema_version 99, this version reads 6",
-    change_verdict: "results.json: rows[0].verdict: is 'accords'; valid would be one of agrees, disagrees",
-    change_verdict_of_the_table: "summary.parquet has the verdict 'accords', which no run gives",
-    replace_by_a_pipe: "results.json: not a results file of plumbline (ValueError: it is not a regular file)",
-    replace_by_a_folder: "summary.parquet: is damaged: it is not a regular file",
-    remove_rows: "summary.parquet has 1 rows, results.json expects 0",
-}
+SPOILED = [  # file of a night, what is done to it, and what is said of it
+    ("results.json", lambda path: path.write_text("{"), "results.json: not a results file"),
+    ("summary.parquet", lambda path: path.write_bytes(path.read_bytes()[:-8]), "summary.parquet: is damaged"),
+    ("summary.parquet", Path.unlink, "summary.parquet"),
+    ("results.json", with_fields(schema_version=99), "results.json: schema_version 99, this version reads 6"),
+    ("results.json", lambda path: path.write_text(path.read_text().replace(': "agrees"', ': "accords"')),
+     "results.json: rows[0].verdict: is 'accords'; valid would be one of agrees, disagrees"),
+    ("summary.parquet", change_verdicts, "summary.parquet has the verdict 'accords', which no run gives"),
+    ("results.json", lambda path: (path.unlink(), os.mkfifo(path)),
+     "results.json: not a results file of plumbline (ValueError: it is not a regular file)"),
+    ("summary.parquet", lambda path: (path.unlink(), path.mkdir()),
+     "summary.parquet: is damaged: it is not a regular file"),
+    ("results.json", with_fields(rows=[]), "summary.parquet has 1 rows, results.json expects 0"),
+]  # fmt: skip
 
 
 @needs_pipes
-@pytest.mark.parametrize("spoil", SPOILED)
-def test_a_damaged_night_is_named_and_left_out(tmp_path, spoil):
+@pytest.mark.parametrize(("name", "spoil", "words"), SPOILED)
+def test_a_damaged_night_is_named_and_left_out(tmp_path, name, spoil, words):
     for day in (1, 2, 3):
         store_run(tmp_path, day, ["agrees"])
-    spoil(tmp_path / "20260102T000000Z")
+    spoil(tmp_path / "20260102T000000Z" / name)
     history = History(tmp_path)
     assert [n.id for n in history.nights] == ["20260101T000000Z", "20260103T000000Z"]
     assert list(history.damaged) == ["20260102T000000Z"]
-    assert SPOILED[spoil] in history.damaged["20260102T000000Z"]
+    assert words in history.damaged["20260102T000000Z"]
     for options in ([], ["--json"]):
         shown = invoke("history", tmp_path, *options, code=ExitCode.BAD_USAGE)
         assert "20260103" in shown.stdout and "damaged, left out: 20260102T000000Z: " in shown.stderr

@@ -183,6 +183,12 @@ def test_temporary_files_of_a_killed_run_are_removed(tmp_path):
     assert not list(tmp_path.glob(".*"))
 
 
+def assert_damaged(path, words, read, *arguments):
+    with pytest.raises(DamagedResults) as caught:
+        read(*arguments)
+    assert str(caught.value).startswith(f"{path}: ") and words in str(caught.value)
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -209,9 +215,7 @@ def test_a_wrong_field_is_named(tmp_path, change, words):
     document = json.loads(path.read_text())
     change(document)
     path.write_text(json.dumps(document))
-    with pytest.raises(DamagedResults) as caught:
-        results_store.read_results(tmp_path)
-    assert str(caught.value).startswith(f"{path}: ") and words in str(caught.value)
+    assert_damaged(path, words, results_store.read_results, tmp_path)
 
 
 def without(name):
@@ -230,9 +234,7 @@ def test_a_table_without_what_readers_need_is_named(tmp_path, change, words):
     write_results(tmp_path)
     path = tmp_path / "states.parquet"
     pq.write_table(change(pq.read_table(path)), path)
-    with pytest.raises(DamagedResults) as caught:
-        results_store.read_table(tmp_path, "states")
-    assert str(caught.value).startswith(f"{path}: ") and words in str(caught.value)
+    assert_damaged(path, words, results_store.read_table, tmp_path, "states")
 
 
 @pytest.mark.parametrize("step", [7, pytest.param(1, marks=SLOW)])
