@@ -8,6 +8,7 @@ import pytest
 from plumbline.importers.xml_tree import ModelFileError, parse_xml, write_xml, write_xml_in_place
 from plumbline.model_files.prepared_file import prepare_file
 from tests.helpers.random_robots import random_mjcf, random_urdf
+from tests.helpers.refusals import refusal
 from tests.helpers.tables import table
 
 INERTIAL = '<inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
@@ -31,19 +32,16 @@ def test_a_bad_file_gets_a_clear_error_with_its_line(tmp_path, name):
     content, message = BAD_FILES[name]
     path = tmp_path / "robot.xml"
     path.write_text(content)
-    with pytest.raises(ModelFileError) as caught:
-        prepare_file(str(path), tmp_path)
-    assert message in str(caught.value)
-    assert all(str(problem).startswith(f"{path}:") for problem in caught.value.problems), caught.value
-    assert all(f"{path}:1:1:" not in problem.message for problem in caught.value.problems), caught.value
+    error = refusal(prepare_file, str(path), tmp_path)
+    assert isinstance(error, ModelFileError) and message in str(error)
+    assert all(str(problem).startswith(f"{path}:") for problem in error.problems), error
+    assert all(f"{path}:1:1:" not in problem.message for problem in error.problems), error
 
 
 def test_every_mistake_of_a_file_is_listed(tmp_path):
     path = tmp_path / "robot.urdf"
     path.write_text(f"<robot>{LINKS}{JOINT}</robot>".replace('value="1"', 'value="-1"').replace("ixx", "IXX"))
-    with pytest.raises(ModelFileError) as caught:
-        prepare_file(str(path), tmp_path)
-    assert len(caught.value.problems) == 4
+    assert len(refusal(prepare_file, str(path), tmp_path).problems) == 4
 
 
 def test_a_header_with_a_wrong_version_and_another_encoding_is_read(tmp_path):

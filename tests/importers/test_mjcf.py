@@ -1,5 +1,7 @@
 """MJCF files: sources through includes and default classes, names, copies, and what stripping keeps."""
 
+from functools import partial
+
 import pytest
 
 from plumbline.importers.xml_tree import ModelFileError
@@ -7,6 +9,7 @@ from plumbline.judging.rows import Verdict
 from plumbline.model_files.model_run import ModelPlan, run_model_files
 from plumbline.model_files.prepared_file import package_folder, prepare_file
 from tests.helpers.importer_columns import read_by_mujoco
+from tests.helpers.refusals import refusal
 
 MAIN = """<mujoco model="m">
 <compiler angle="degree"/>
@@ -105,9 +108,7 @@ STRIPPED = """<mujoco model="m">
 def test_stripping_leaves_out_each_mesh_that_no_mass_needs(tmp_path):
     path = tmp_path / "robot.xml"
     path.write_text(STRIPPED)
-    with pytest.raises(ModelFileError) as error:
-        prepare_file(str(path), tmp_path, strip=True)
-    (problem,) = error.value.problems
+    (problem,) = refusal(partial(prepare_file, strip=True), str(path), tmp_path).problems
     assert problem.line == 2 and problem.column == 8
     assert "'own.stl'" in problem.message and "the mass of a body without <inertial>" in problem.hint
     path.write_text(STRIPPED.replace('type="mesh" mesh="own"', 'size="0.1" mass="3"'))

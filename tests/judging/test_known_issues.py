@@ -17,9 +17,9 @@ from plumbline.execution.runner import RunResult
 from plumbline.judging import known_issues
 from plumbline.judging.rows import FAILED_CALLS, RowContext
 from plumbline.processes.cpu_time import CpuTimes
-from plumbline.scenario.line_and_column_errors import ScenarioError
 from plumbline.storage.results_store import ResultTables
 from tests.helpers import ROOT
+from tests.helpers.refusals import refusal
 from tests.helpers.tables import table
 
 CONTEXT = RowContext("tumbling-ball", "single", "mujoco", "MuJoCo", "4.0.0")
@@ -103,9 +103,7 @@ def loaded(tmp_path, *entries, **more):
 def problems(path, text, *more):
     """The problems for which a file with the text is refused."""
     path.write_text(text)
-    with pytest.raises(ScenarioError) as caught:
-        known_issues.load_known_issues(path, *more)
-    return caught.value.problems
+    return refusal(known_issues.load_known_issues, path, *more).problems
 
 
 @pytest.mark.parametrize(

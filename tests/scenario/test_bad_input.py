@@ -27,6 +27,7 @@ from plumbline.scenario.schema import Document
 from plumbline.scenario.validation_messages import problems_from_validation
 from plumbline.scenario.yaml_source import YamlSource
 from plumbline.studies.sweep_file import Sweep
+from tests.helpers.refusals import refusal
 from tests.helpers.requirements import needs_pipes
 from tests.helpers.tables import table
 
@@ -55,9 +56,8 @@ MARKS = {
 
 
 def errors_in(text):
-    with pytest.raises(ScenarioError) as caught:
-        load_scenario_text(text, "x.yaml")
-    return [str(problem).removeprefix("x.yaml:") for problem in caught.value.problems]
+    found = refusal(load_scenario_text, text, "x.yaml").problems
+    return [str(problem).removeprefix("x.yaml:") for problem in found]
 
 
 def test_the_undamaged_file_is_valid():
@@ -138,10 +138,9 @@ def test_all_mistakes_of_a_file_come_at_once():
 def test_all_mistakes_of_all_files_come_at_once(tmp_path):
     for name in ("a", "b"):
         (tmp_path / f"{name}.yaml").write_text(VALID_SCENARIO.replace("1.5", "-1"))
-    with pytest.raises(ScenarioError) as caught:
-        load_scenarios([tmp_path / "a.yaml", tmp_path / "b.yaml", "no-such-scenario"])
-    assert [Path(p.file).name for p in caught.value.problems] == ["a.yaml", "b.yaml", "no-such-scenario"]
-    assert f"{tmp_path / 'a.yaml'}:5:11: bodies[0].mass: is -1" in str(caught.value)
+    error = refusal(load_scenarios, [tmp_path / "a.yaml", tmp_path / "b.yaml", "no-such-scenario"])
+    assert [Path(p.file).name for p in error.problems] == ["a.yaml", "b.yaml", "no-such-scenario"]
+    assert f"{tmp_path / 'a.yaml'}:5:11: bodies[0].mass: is -1" in str(error)
 
 
 def test_a_body_in_a_run_is_placed_too():
@@ -207,10 +206,9 @@ def test_an_alias_of_itself_ends(loop):
 
 
 def test_many_problems_are_counted_rather_than_listed():
-    with pytest.raises(ScenarioError) as caught:
-        load_scenario_text(VALID_SCENARIO + "".join(f"x{i}: 1\n" for i in range(300)))
-    assert len(caught.value.problems) == 300
-    assert str(caught.value).endswith("… and 200 more problems")
+    error = refusal(load_scenario_text, VALID_SCENARIO + "".join(f"x{i}: 1\n" for i in range(300)))
+    assert len(error.problems) == 300
+    assert str(error).endswith("… and 200 more problems")
 
 
 @pytest.mark.parametrize(
@@ -226,9 +224,7 @@ def test_many_problems_are_counted_rather_than_listed():
 def test_bytes_that_are_no_text(tmp_path, raw, expected):
     path = tmp_path / "bytes.yaml"
     path.write_bytes(raw)
-    with pytest.raises(ScenarioError) as caught:
-        load_scenario(path)
-    assert str(caught.value).startswith(f"{path}{expected}")
+    assert str(refusal(load_scenario, path)).startswith(f"{path}{expected}")
 
 
 def test_files_that_cannot_be_read(tmp_path):
@@ -240,9 +236,7 @@ def test_files_that_cannot_be_read(tmp_path):
     ):
         if path.name == "zero" and not path.exists():
             continue  # not on this system
-        with pytest.raises(ScenarioError) as caught:
-            load_scenario(path)
-        assert expected in str(caught.value)
+        assert expected in str(refusal(load_scenario, path))
 
 
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may read everything")

@@ -13,6 +13,7 @@ from plumbline.scenario.line_and_column_errors import ScenarioError
 from plumbline.scenario.loader import find_scenario_file, load_scenario_text
 from plumbline.truth.certified_state import certify_state
 from tests.helpers.catalogue import catalogue_scenario
+from tests.helpers.refusals import refusal
 from tests.helpers.tables import table
 
 FOUR_BAR = find_scenario_file("four-bar").read_text(encoding="utf-8")
@@ -21,9 +22,7 @@ PUBLISHED_SQUEEZER = [14222.4439199541138706, -10666.8329399655854029]  # β̈(0
 
 def problems(old, new):
     assert old in FOUR_BAR
-    with pytest.raises(ScenarioError) as error:
-        load_scenario_text(FOUR_BAR.replace(old, new, 1))
-    return [str(problem) for problem in error.value.problems]
+    return [str(problem) for problem in refusal(load_scenario_text, FOUR_BAR.replace(old, new, 1)).problems]
 
 
 @pytest.mark.parametrize("name", ["four-bar", "slider-crank", "bricard", "squeezer", "flyball-governor"])

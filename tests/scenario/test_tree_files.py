@@ -10,23 +10,24 @@ from plumbline.scenario.line_and_column_errors import ScenarioError
 from plumbline.scenario.loader import load_scenario_text
 from plumbline.storage.results_schema import _Scenario
 from reference_impl.mechanism import Mechanism
+from tests.helpers.refusals import refusal
 from tests.helpers.tables import table
 
 HEAD = "schema_version: 1\ntitle: t\npurpose: p\nbodies:\n"
 BODY = "mass: 1, inertia: {principal: [1, 1, 1]}, proximal: [0, 0, 1]"
 
 
-def load(*bodies, springs=()):
+def text_of(*bodies, springs=()):
     text = HEAD + "".join(f"  - {{{BODY}, {body}}}\n" for body in bodies)
-    return load_scenario_text(
-        text + "springs:\n" * bool(springs) + "".join(f"  - {{{s}}}\n" for s in springs)
-    )
+    return text + "springs:\n" * bool(springs) + "".join(f"  - {{{s}}}\n" for s in springs)
+
+
+def load(*bodies, springs=()):
+    return load_scenario_text(text_of(*bodies, springs=springs))
 
 
 def problems(*bodies, springs=()):
-    with pytest.raises(ScenarioError) as error:
-        load(*bodies, springs=springs)
-    return [str(problem) for problem in error.value.problems]
+    return map(str, refusal(load_scenario_text, text_of(*bodies, springs=springs)).problems)
 
 
 def test_a_tree_is_built_as_written():
