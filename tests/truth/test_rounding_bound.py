@@ -89,18 +89,9 @@ SOUND_ENGINES = [name for name in ENGINES if name != INACCURATE_ENGINE]
 
 
 @pytest.mark.parametrize("name", SOUND_ENGINES)
-def test_no_sound_engine_exceeds_the_bound(name):
-    check_errors_within_bound(name, 40)
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("name", SOUND_ENGINES)
-def test_no_sound_engine_exceeds_the_bound_in_two_thousand_chains(name):
-    check_errors_within_bound(name, 2000)
-
-
-def check_errors_within_bound(name, count):
-    """Check that the worst error of an engine stays below half of the tolerance, which leaves a margin."""
+@pytest.mark.parametrize("count", [40, pytest.param(2000, marks=pytest.mark.full)])
+def test_no_sound_engine_exceeds_the_bound(name, count):
+    """The worst error in so many chains stays below half of the tolerance, which leaves a margin."""
     try:
         engine = load_adapter(name)
     except ImportError as error:

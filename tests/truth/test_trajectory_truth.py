@@ -39,18 +39,13 @@ pytestmark = needs_truth_tools
 # the yardstick
 
 
-@pytest.mark.parametrize("rods", [[0], [1], [0, 0]], ids=str)
+LONGER = [[1, 1], [0, 1, 0], [1, 0, 1], [0] * 5]
+
+
+@pytest.mark.parametrize(
+    "rods", [[0], [1], [0, 0], *(pytest.param(x, marks=pytest.mark.full) for x in LONGER)], ids=str
+)
 def test_extended_precision_agrees_with_quad(rods):
-    check_precisions(rods)
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("rods", [[1, 1], [0, 1, 0], [1, 0, 1], [0] * 5], ids=str)
-def test_extended_precision_agrees_with_quad_on_longer_chains(rods):
-    check_precisions(rods)
-
-
-def check_precisions(rods):
     """Each precision from quad, and the notes' form on its manifold, which shares no equation with them."""
     model, state = random_chain(1, rods, loads=True, drag=True)
     quad, extended, double = (
@@ -87,7 +82,17 @@ def test_the_uncertainty_covers_the_error_measured_in_higher_precision(scenario)
 # what the truth is, and how sure
 
 
-def check_uncertainty_on_balls(scenario):
+LONG_BALLS = [s for s in BALL_JOINT_SCENARIOS if s.model.n >= 10]
+
+
+@pytest.mark.parametrize(
+    "scenario",
+    [
+        *fast_are(FAST_BALLS, [s for s in BALL_JOINT_SCENARIOS if s.model.n < 10]),
+        *(pytest.param(s, id=s.name, marks=pytest.mark.full) for s in LONG_BALLS),
+    ],
+)
+def test_the_uncertainty_is_below_a_picometre_on_balls(scenario):
     truth = trajectory_truth(scenario.model, scenario.state, TIMES)
     precision = "extended" if scenario.model.n <= MAX_EXTENDED_PRECISION_BODIES else "double"
     print(
@@ -97,21 +102,6 @@ def check_uncertainty_on_balls(scenario):
     assert f"Taylor's method in minimal coordinates and {precision} precision" in truth.method
     assert np.max(truth.uncertainty["position"]) < 1e-12
     assert np.all(np.diff(truth.uncertainty["position"]) >= 0)
-
-
-@pytest.mark.parametrize(
-    "scenario", fast_are(FAST_BALLS, [s for s in BALL_JOINT_SCENARIOS if s.model.n < 10])
-)
-def test_the_uncertainty_is_below_a_picometre_on_balls(scenario):
-    check_uncertainty_on_balls(scenario)
-
-
-@pytest.mark.full
-@pytest.mark.parametrize(
-    "scenario", [s for s in BALL_JOINT_SCENARIOS if s.model.n >= 10], ids=lambda s: s.name
-)
-def test_the_uncertainty_is_below_a_picometre_on_long_chains_of_balls(scenario):
-    check_uncertainty_on_balls(scenario)
 
 
 @pytest.mark.parametrize("scenario", fast_are(FAST_CLOSED_FORMS, CLOSED_FORM_SCENARIOS))
