@@ -60,7 +60,7 @@ def pytest_collection_modifyitems(config, items):
     rank |= {f"test_{name}.py": len(rank) + 1 for name in LAST}
     items.sort(key=lambda item: rank.get(item.path.name, len(LONGEST_FIRST)))
     for item in items:
-        if is_nightly(item.nodeid):
+        if is_nightly(item.nodeid) and not item.get_closest_marker("full"):  # a long form stays one
             for mark in SLOW:
                 item.add_marker(mark)
     if config.args == ["tests"] and not config.getoption("ignore"):  # all tests are there

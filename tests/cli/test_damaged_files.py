@@ -57,7 +57,12 @@ def damaged(data, load, draw):
     return json.dumps(damaged_document(load(data), draw)).encode("utf-8", "surrogatepass")
 
 
-def check_examples(stored, tmp_path, command, count, seed):
+THOUSANDS = pytest.param(5000, 2, marks=[pytest.mark.full, pytest.mark.timeout(3600)])
+
+
+@pytest.mark.parametrize(("count", "seed"), [(60, 1), THOUSANDS])
+@pytest.mark.parametrize("command", ["report", "report --history", "history", "reproduce"])
+def test_damaged_results_are_bad_files(stored, tmp_path, command, count, seed, record_testsuite_property):
     draw, outcomes = random.Random(seed), Counter()
     folder = tmp_path / "history" / stored.name
     for number in range(count):
@@ -78,23 +83,7 @@ def check_examples(stored, tmp_path, command, count, seed):
             assert name.rsplit("/")[-1] in message, about
             assert max(map(len, message.splitlines())) < TEXT_SIZE + len(str(folder)), about
         outcomes[result.exit_code] += 1
-    return outcomes
-
-
-COMMANDS = ("report", "report --history", "history", "reproduce")
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_damaged_results_are_bad_files(stored, tmp_path, command):
-    outcomes = check_examples(stored, tmp_path, command, 60, seed=1)
     assert command in ("history", "report --history") or min(outcomes[0], outcomes[2]) > 5, outcomes
-
-
-@pytest.mark.full
-@pytest.mark.timeout(3600)
-@pytest.mark.parametrize("command", COMMANDS)
-def test_thousands_of_damaged_results_are_bad_files(stored, tmp_path, command, record_testsuite_property):
-    outcomes = check_examples(stored, tmp_path, command, 5000, seed=2)
     record_testsuite_property(f"damaged stores, {command}: by exit code", dict(outcomes))
 
 
@@ -207,17 +196,11 @@ def check_known(tmp_path, count, seed):
         return check_user_files(tmp_path, damaged_yaml(data), words, count, seed)
 
 
-CHECKS = [check_scenarios, check_sweeps, check_known]
-
-
-@pytest.mark.parametrize("check", CHECKS)
-def test_damaged_files_of_users_are_bad_files(no_work, tmp_path, check):
-    outcomes = check(tmp_path, 60, seed=1)
+@pytest.mark.parametrize(("count", "seed"), [(60, 1), THOUSANDS])
+@pytest.mark.parametrize("check", [check_scenarios, check_sweeps, check_known])
+def test_damaged_files_of_users_are_bad_files(
+    no_work, tmp_path, check, count, seed, record_testsuite_property
+):
+    outcomes = check(tmp_path, count, seed)
     assert min(outcomes.values()) > 5 and len(outcomes) == 2, outcomes
-
-
-@pytest.mark.full
-@pytest.mark.timeout(3600)
-@pytest.mark.parametrize("check", CHECKS)
-def test_thousands_of_damaged_files_of_users(no_work, tmp_path, check, record_testsuite_property):
-    record_testsuite_property(f"damaged files, {check.__name__}", check(tmp_path, 5000, seed=2))
+    record_testsuite_property(f"damaged files, {check.__name__}", outcomes)

@@ -80,7 +80,10 @@ def mutated(rng, text):
     return text
 
 
-def check_mutants(tmp_path, count):
+@pytest.mark.parametrize(
+    "count", [200, pytest.param(5000, marks=[pytest.mark.full, pytest.mark.timeout(1000)])]
+)
+def test_mutated_files_are_read_or_refused(tmp_path, count):
     rng = np.random.default_rng(17)
     refused = 0
     for k in range(count):
@@ -100,14 +103,4 @@ def check_mutants(tmp_path, count):
                 assert [e.attributes for e in again.walk()] == [e.attributes for e in prepared.tree.walk()]
             assert [e.source.line for e in again.walk()] == [e.source.line for e in prepared.tree.walk()]
         assert time.process_time() - begin < 2
-    return refused
-
-
-def test_mutated_files_are_read_or_refused(tmp_path):
-    assert 0.5 * 200 < check_mutants(tmp_path, 200) < 200
-
-
-@pytest.mark.full
-@pytest.mark.timeout(1000)
-def test_five_thousand_mutated_files_are_read_or_refused(tmp_path):
-    assert 0.5 * 5000 < check_mutants(tmp_path, 5000) < 5000
+    assert 0.5 * count < refused < count

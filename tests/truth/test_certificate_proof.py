@@ -296,18 +296,15 @@ def test_a_motion_from_perturbed_initial_values_stays_inside(proofs, name):
         assert error < found.radius(quantity) < NARROW[quantity] * error
 
 
-@pytest.mark.parametrize("name", ["double-tumbling-balls", "tumbling-rod", *TREES[:3], "loaded-tree"])
-def test_the_truth_of_runs_is_within_its_claimed_uncertainty(name):
-    check_present_truth(catalogue_scenario(name), 0.3)
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("scenario", PROVABLE, ids=lambda s: s.name)
-def test_the_truth_of_every_small_scenario_is_within_its_claimed_uncertainty(scenario):
-    check_present_truth(scenario, scenario.duration)
-
-
-def check_present_truth(scenario, duration):
+@pytest.mark.parametrize(
+    ("name", "duration"),
+    [
+        *((name, 0.3) for name in ("double-tumbling-balls", "tumbling-rod", *TREES[:3], "loaded-tree")),
+        *(pytest.param(s.name, s.duration, marks=pytest.mark.full) for s in PROVABLE),
+    ],
+)
+def test_the_truth_of_runs_is_within_its_claimed_uncertainty(name, duration):
+    scenario = catalogue_scenario(name)
     times = scenario.times[scenario.times <= duration + 1e-9]
     _, enclosure = prove_motion(scenario.model, scenario.state, times)
     assert enclosure.radius("r") <= 1e-18

@@ -242,27 +242,20 @@ def test_no_unstable_scenario_is_left_out(name):
     assert (np.max(found) > RENORMALISATION_GROWTH) == (name in UNSTABLE_SCENARIOS)
 
 
-@pytest.mark.parametrize("name", UNSTABLE_SCENARIOS[:2])
-def test_observed_divergence(name):
-    check_divergence(name, "extended")
+LONG = (pytest.mark.full, pytest.mark.timeout(900))
+# By quad a minute each; longer chains take many, and extended precision, 2000 times finer, must do there.
+NO_CHAINS = [name for name in UNSTABLE_SCENARIOS if not name.startswith("chain")]
 
 
-@pytest.mark.full
-@pytest.mark.timeout(900)
-@pytest.mark.parametrize("name", UNSTABLE_SCENARIOS[2:])
-def test_observed_divergence_on_every_unstable_scenario(name):
-    check_divergence(name, "extended")
-
-
-@pytest.mark.full
-@pytest.mark.timeout(900)
-@pytest.mark.parametrize("name", [name for name in UNSTABLE_SCENARIOS if not name.startswith("chain")])
-def test_observed_divergence_from_quad(name):
-    """A minute each; longer chains take many, and extended precision, 2000 times finer, must do there."""
-    check_divergence(name, "quad")
-
-
-def check_divergence(name, precision):
+@pytest.mark.parametrize(
+    ("name", "precision"),
+    [
+        *((name, "extended") for name in UNSTABLE_SCENARIOS[:2]),
+        *(pytest.param(name, "extended", marks=LONG) for name in UNSTABLE_SCENARIOS[2:]),
+        *(pytest.param(name, "quad", marks=LONG) for name in NO_CHAINS),
+    ],
+)
+def test_observed_divergence(name, precision):
     """Double precision departs from a higher precision at the horizon, observed within 15 s or else 30 s."""
     pytest.importorskip("heyoka")
     seen = count_divergences(name, precision, 15) or count_divergences(name, precision, 30)
