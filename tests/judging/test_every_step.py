@@ -28,10 +28,10 @@ from plumbline.truth import step_comparison
 from plumbline.truth.rounding_bound import EPS
 from plumbline.truth.step_charts import StepCharts
 from plumbline.truth.step_comparison import RUN_QUANTITIES, StepsFromSamples
+from tests.helpers import planted_runs
 from tests.helpers.catalogue import catalogue_scenario, states_of
 from tests.helpers.nightly_tests import SLOW, slow, some_fast
 from tests.helpers.pinocchio_by_crba import steps_by_crba
-from tests.helpers.planted_runs import RUN_MISTAKES
 from tests.helpers.planting import planted
 from tests.helpers.requirements import require_extended_precision
 
@@ -168,7 +168,7 @@ def test_places_are_bounded_by_what_closed_forms_of_slow_turns_lose(name, monkey
     assert {"step_position", "run_position"} <= wrong()
 
 
-@pytest.mark.parametrize("mistake", some_fast(RUN_MISTAKES, 8))
+@pytest.mark.parametrize("mistake", some_fast(planted_runs.RUN_MISTAKES, 8))
 def test_a_mistake_inside_a_run_is_reported_with_its_step(mistake):
     """Relative 1e-9, in some steps only; the single steps from given states mostly do not meet it."""
     defect = mistake.defect
@@ -188,7 +188,7 @@ def test_a_mistake_inside_a_run_is_reported_with_its_step(mistake):
     assert all(f"at step {row.extra['first_step']:.0f} (t = " in row.reason for row in steps)
 
 
-@pytest.mark.parametrize("mistake", some_fast(RUN_MISTAKES, 32))
+@pytest.mark.parametrize("mistake", some_fast(planted_runs.RUN_MISTAKES, 32))
 def test_a_mistake_inside_a_run_is_named_with_its_condition(mistake):
     """A factor of 1 + 1e-9, and in which steps it acts; in the first step it is below what is diagnosed."""
     defect = mistake.defect
@@ -254,8 +254,6 @@ def test_the_given_state_the_times_and_the_number_of_steps_are_compared(engine, 
 
 
 def test_a_bias_below_the_rounding_of_one_step_is_seen_in_their_mean():
-    from tests.helpers import planted_runs
-
     model, states = subject("tumbling-ball")
     tiny = planted_runs.mujoco_mistake(planted_runs.from_step(1), planted_runs._scaled_gravity)
     with patch.object(planted_runs, "SIZE", 4e-13), tiny():
@@ -267,8 +265,6 @@ def test_a_bias_below_the_rounding_of_one_step_is_seen_in_their_mean():
 
 def test_steps_without_a_bound_are_counted_and_those_that_differ_are_named():
     """They are left out by the condition of the motion alone: all, where no step counts as resolved."""
-    from tests.helpers import planted_runs
-
     model, states = subject("tumbling-ball")
     late = planted_runs.mujoco_mistake(planted_runs.from_step(500), planted_runs._scaled_gravity)
     with patch.object(step_comparison, "MAX_TURN", 0.0), late():

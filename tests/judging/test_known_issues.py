@@ -37,7 +37,7 @@ def row(verdict="disagrees", quantity="acceleration", context=CONTEXT):
     return context.make_row("state", "-", quantity, verdict, "why")
 
 
-def judged_by(rows, entries, whole, finer=False, bodies=1):
+def judged_by(rows, entries, *, whole=True, finer=False, bodies=1):
     """Rows with their excuses, and what is stale then."""
     excuses = known_issues.KnownIssues(entries, finer)
     return SimpleNamespace(
@@ -52,7 +52,7 @@ def covers(an_entry, of):
 
 def test_an_entry_marks_its_row_and_no_other():
     rows = [row(), row(quantity="joint_reaction"), row("unresolved")]
-    judged = judged_by(rows, [entry()], whole=True)
+    judged = judged_by(rows, [entry()])
     assert [r.known_issue for r in judged.rows] == ["a", None, None]
     assert judged.stale == []
 
@@ -62,7 +62,7 @@ def test_a_recorded_disagreement_carries_its_mechanism_as_diagnosis():
     explained = replace(row(), diagnosis="the mass is doubled")
     rows = [row(), row(quantity="joint_reaction"), explained, row(quantity="position")]
     recorded = f"recorded: {known_issues.MECHANISMS['rounding']}. because"
-    found = [r.diagnosis for r in judged_by(rows, known, whole=True).rows]
+    found = [r.diagnosis for r in judged_by(rows, known).rows]
     assert found == [recorded, None, "the mass is doubled", None]
 
 
@@ -161,7 +161,7 @@ def ratio_row(ratio, level="state", quantity="acceleration", engine="mujoco", ve
 )  # fmt: skip
 def test_an_entry_covers_no_larger_error_than_it_states(tmp_path, max_ratio, bodies, ratio, covered):
     entries = loaded(tmp_path, OFF | {"scenario": "tumbling-ball", "max_ratio": max_ratio})
-    judged = judged_by([ratio_row(ratio)], entries, whole=True, bodies=bodies)
+    judged = judged_by([ratio_row(ratio)], entries, bodies=bodies)
     assert (judged.rows[0].known_issue == "a") is covered
     assert ("the entry a covers" in judged.rows[0].reason) is not covered
     assert judged.stale == [], "what exceeds an entry is no sign that the entry is stale"
@@ -173,7 +173,7 @@ def test_a_missing_term_covers_what_its_effect_explains(tmp_path, left):
     entries = loaded(tmp_path, {x: value for x, value in changes.items() if x != "max_ratio"})
     extra = {} if left is None else {"unexplained": left}
     row = replace(ratio_row(1e12), extra=extra)
-    judged = judged_by([row], entries, whole=True).rows[0]
+    judged = judged_by([row], entries).rows[0]
     assert (judged.known_issue == "a") is (left == 0.5)
     assert ("× tolerance unexplained" in judged.reason) is (left != 0.5)
     assert ("does not explain is 0.5 × tolerance" in (judged.diagnosis or "")) is (left == 0.5)
@@ -193,7 +193,7 @@ def test_the_mechanism_is_checked_by_the_relations(mechanism, scatter, shown_by,
         verdict = "disagrees" if scatter > 1 else "agrees"
         rows.append(ratio_row(scatter, "relations", "rotated world", verdict=verdict))
     known = entry(mechanism=mechanism, max_ratio={10: 1e3}, shown_by=shown_by)
-    judged = judged_by(rows, [known], whole=True)
+    judged = judged_by(rows, [known])
     assert (judged.rows[0].known_issue == "a") is covered, judged.rows[0].reason
     assert covered or "equivalent descriptions" in judged.rows[0].reason
 
@@ -203,7 +203,7 @@ def test_the_mechanism_may_be_shown_by_another_column_of_the_engine():
     rows = [ratio_row(10.0, engine="pinocchio"), ratio_row(0.01, "relations", "rotated world", "pinocchio")]
     for scatter, covered in ((0.02, False), (2.0, True)):
         shown = ratio_row(scatter, "relations", "re-chosen body frame", "pinocchio-aba")
-        judged = judged_by([*rows, shown], [known], whole=True)
+        judged = judged_by([*rows, shown], [known])
         assert (judged.rows[0].known_issue == "a") is covered
 
 
@@ -231,15 +231,15 @@ def test_an_id_with_markup_stays_text_on_the_terminal(capsys):
 
 def test_information_needs_no_entry_and_matches_none():
     any_row = entry(level="*", integrator="*", quantity="*")
-    found = judged_by([row("information")], [any_row], whole=True)
+    found = judged_by([row("information")], [any_row])
     assert found.rows[0].known_issue is None and found.stale == []
 
 
 def test_only_random_scenarios_may_show_it_sometimes():
     chance = entry(scenario="random-*", intermittent="at times")
     context = RowContext("random-1-2", "random", "mujoco", "MuJoCo", "4.0.0")
-    assert judged_by([row("agrees", context=context)], [chance], whole=True).stale == []
-    assert judged_by([row(context=context)], [chance], whole=True).rows[0].known_issue == "a"
+    assert judged_by([row("agrees", context=context)], [chance]).stale == []
+    assert judged_by([row(context=context)], [chance]).rows[0].known_issue == "a"
 
 
 def test_a_size_may_be_in_proportion_to_the_chains_ratio_of_inertias():
@@ -257,16 +257,16 @@ def test_the_scatter_of_a_row_itself_shows_its_mechanism():
     scattering, steady, unknown = (
         replace(row(), ratio=50.0, extra=extra) for extra in ({"scatter": 0.9}, {"scatter": 1e-4}, {})
     )
-    assert judged_by([scattering], [recorded], whole=True).rows[0].known_issue == "a"
-    assert judged_by([unknown], [recorded], whole=True).rows[0].known_issue == "a"
-    (found,) = judged_by([steady], [recorded], whole=True).rows
+    assert judged_by([scattering], [recorded]).rows[0].known_issue == "a"
+    assert judged_by([unknown], [recorded]).rows[0].known_issue == "a"
+    (found,) = judged_by([steady], [recorded]).rows
     assert found.known_issue is None and "differ by only" in found.reason
 
 
 def test_a_checked_mechanism_is_in_the_rows_diagnosis():
     recorded = entry(level="*", quantity="*", max_ratio={10: 100.0}, mechanism="rounding")
     turned = replace(CONTEXT.make_row("relations", "-", "rotated world", "agrees", "why"), ratio=20.0)
-    found = judged_by([replace(row(), ratio=50.0), turned], [recorded], whole=True).rows
+    found = judged_by([replace(row(), ratio=50.0), turned], [recorded]).rows
     assert "Checked: they differ by 20 × tolerance." in found[0].diagnosis
 
 
@@ -274,14 +274,14 @@ def test_an_unresolved_row_has_the_size_of_its_entry():
     """What the data decide of it agrees: an entry may require that."""
     recorded = entry(verdict="unresolved", max_ratio={10: 1.0})
     for ratio, known in ((0.3, "a"), (1.5, None), (None, None)):
-        found = judged_by([replace(row("unresolved"), ratio=ratio)], [recorded], whole=True)
+        found = judged_by([replace(row("unresolved"), ratio=ratio)], [recorded])
         assert found.rows[0].known_issue == known
 
 
 def test_smaller_steps_may_resolve_what_was_unresolved():
     open_ = entry(verdict="unresolved")
-    assert judged_by([row("agrees")], [open_], whole=True).stale == [open_]
-    assert judged_by([row("agrees")], [open_], whole=True, finer=True).stale == []
+    assert judged_by([row("agrees")], [open_]).stale == [open_]
+    assert judged_by([row("agrees")], [open_], finer=True).stale == []
 
 
 def test_an_id_twice_is_refused(tmp_path):
@@ -360,7 +360,7 @@ def test_versions_that_are_none_and_those_before_a_release(version, versions, in
 
 def test_the_entry_with_the_rows_verdict_excuses_it_and_the_other_is_stale():
     both = [entry(id="open", verdict="unresolved"), entry(id="off")]
-    judged = judged_by([row()], both, whole=True)
+    judged = judged_by([row()], both)
     assert judged.rows[0].known_issue == "off"
     assert [e.id for e in judged.stale] == ["open"]
 
@@ -369,7 +369,7 @@ def test_the_entry_with_the_rows_verdict_excuses_it_and_the_other_is_stale():
 def test_every_kind_of_pattern_waits_for_the_whole_matrix(pattern):
     wide = entry(scenario=pattern)
     assert judged_by([row("agrees")], [wide], whole=False).stale == []
-    assert judged_by([row("agrees")], [wide], whole=True).stale == [wide]
+    assert judged_by([row("agrees")], [wide]).stale == [wide]
 
 
 def test_lists_of_several_fields_are_an_entry_for_each_pair(tmp_path):
@@ -393,10 +393,10 @@ def test_what_an_entry_does_not_say_is_anything():
 
 def test_an_issue_of_smaller_steps_alone_is_expected_only_there():
     nightly = entry(extra_refinements_only=True)
-    usual, finer = (judged_by([row()], [nightly], whole=True, finer=f) for f in (False, True))
+    usual, finer = (judged_by([row()], [nightly], finer=f) for f in (False, True))
     assert usual.rows[0].known_issue is None and usual.stale == []
     assert finer.rows[0].known_issue == "a" and finer.stale == []
-    assert judged_by([row("agrees")], [nightly], whole=True, finer=True).stale == [nightly]
+    assert judged_by([row("agrees")], [nightly], finer=True).stale == [nightly]
 
 
 def test_an_entry_that_covers_far_more_than_the_run_saw_is_named():
@@ -437,7 +437,7 @@ def with_cause(level="state", **changes):
 def test_an_entry_is_matched_by_cause_size_and_version_in_any_scenario(tmp_path, found, is_known):
     rows = [{"level": "state", "quantity": ["acceleration", "joint_reaction"], "max_ratio": 30}]
     changes = {"scenario": "*", "verdict": "disagrees", "versions": "<5", "cause": CAUSE, "rows": rows}
-    judged = judged_by([found], loaded(tmp_path, changes), whole=True).rows[0]
+    judged = judged_by([found], loaded(tmp_path, changes)).rows[0]
     assert (judged.known_issue == "a") is is_known, judged.reason
 
 
@@ -446,7 +446,7 @@ def test_an_entry_of_what_no_cause_explains_is_matched_by_needs(tmp_path):
     entries = loaded(tmp_path, changes)
     for needs, known in ((("motion",), "a"), (("motion", "gravity"), None), ((), None)):
         row_ = with_cause(kind="unexplained", needs=list(needs))
-        assert judged_by([row_], entries, whole=True).rows[0].known_issue == known
+        assert judged_by([row_], entries).rows[0].known_issue == known
 
 
 @pytest.mark.parametrize(
@@ -465,7 +465,7 @@ def test_a_row_follows_from_the_states_that_show_the_finding(tmp_path, level, qu
     rows = [{"level": "state", "max_ratio": 30}, {"level": level, "max_ratio": 30}]
     changes = {"scenario": "*", "verdict": "disagrees", "cause": CAUSE, "rows": rows}
     following = ratio_row(10.0, level, quantity)
-    found, *_ = judged_by([following, *states], loaded(tmp_path, changes), whole=True).rows
+    found, *_ = judged_by([following, *states], loaded(tmp_path, changes)).rows
     assert (found.known_issue == "a") is is_known, found.reason
     assert is_known or found.reason == following.reason, "the record is about another mechanism"
 
@@ -503,5 +503,5 @@ def test_each_row_of_an_entry_must_occur(tmp_path):
     rows = [{"level": "state", "max_ratio": 30}, {"level": "relations", "max_ratio": 30}]
     changes = {"scenario": "*", "verdict": "disagrees", "mechanism": "rounding", "rows": rows}
     agreeing = ratio_row(0.5, "relations", "rotated world", verdict="agrees")
-    stale = judged_by([ratio_row(10.0), agreeing], loaded(tmp_path, changes), whole=True).stale
+    stale = judged_by([ratio_row(10.0), agreeing], loaded(tmp_path, changes)).stale
     assert [(issue.name, issue.level) for issue in stale] == [("a", "relations")]
