@@ -22,7 +22,7 @@ from plumbline.execution.runner import exit_code, summarize_verdicts
 from plumbline.judging.findings import find_findings
 from plumbline.judging.rows import RowContext, Verdict
 from plumbline.scenario import loader
-from plumbline.storage.results_store import SCHEMA_VERSION
+from plumbline.storage.results_store import SCHEMA_VERSION, read_results
 from tests.helpers import ROOT
 from tests.helpers.commands import invoke, run_plumbline, run_python
 from tests.helpers.tables import table
@@ -238,7 +238,7 @@ def test_a_run_writes_everything_and_exits_by_its_verdict(tmp_path):
     assert "report.html" in result.stdout
     files = {p.name for p in (tmp_path / "o o").iterdir()}
     assert {"results.json", "summary.parquet", "states.parquet", "report.html", "junit.xml"} <= files
-    document = json.loads((tmp_path / "o o" / "results.json").read_text())
+    document = read_results(tmp_path / "o o")
     assert document["schema_version"] == SCHEMA_VERSION
     checks = [row for row in document["rows"] if row["verdict"] != "information"]
     assert {row["verdict"] for row in checks if row["known_issue"] is None} == {"agrees"}

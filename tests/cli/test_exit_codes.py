@@ -1,6 +1,5 @@
 """Exit codes: one table, and no way to exit 0 without a comparison."""
 
-import json
 import os
 import re
 import signal
@@ -17,6 +16,7 @@ from plumbline.execution.exit_codes import EXIT_CODE_MEANINGS, ExitCode
 from plumbline.judging.known_issues import load_known_issues
 from plumbline.processes import worker_process
 from plumbline.processes.worker_pool import ExecutorLost
+from plumbline.storage.results_store import read_results
 from plumbline.truth.ground_truth import TRUTHS_DIFFER
 from tests.helpers import ROOT, wrong_truths
 from tests.helpers.commands import invoke, run_plumbline, run_python, user_environment
@@ -135,11 +135,10 @@ def test_a_truth_with_a_wrong_gravity_fails_the_harness(monkeypatch, tmp_path, c
     result = invoke(*chosen, code=ExitCode.HARNESS_FAILED)
     first = " ".join(result.stdout.split())
     assert first.startswith(f"☒ the harness failed: tumbling-ball: {TRUTHS_DIFFER}")
-    document = json.loads((tmp_path / "results.json").read_text())
-    doubtful = {row["level"] for row in document["rows"] if row["verdict"] == "harness failed"}
-    assert doubtful == {"trajectory"}
-    assert not [row for row in document["rows"] if row["level"] in ("trajectory", "invariants")
-                and row["verdict"] != "harness failed"]  # fmt: skip
+    rows = read_results(tmp_path)["rows"]
+    assert {row["level"] for row in rows if row["verdict"] == "harness failed"} == {"trajectory"}
+    compared = [row for row in rows if row["level"] in ("trajectory", "invariants")]
+    assert {row["verdict"] for row in compared} == {"harness failed"}
     assert 'type="harness failed"' in (tmp_path / "junit.xml").read_text()
 
 
@@ -148,8 +147,7 @@ def test_a_certified_state_that_contradicts_the_definition_fails_the_harness(mon
     chosen = ["run", "double-loaded-rods", "--engine", "pinocchio", *AT_STATES]
     result = invoke(*chosen, tmp_path, code=ExitCode.HARNESS_FAILED)
     assert "contradicts the definition of the mechanism" in " ".join(result.stdout.split())
-    document = json.loads((tmp_path / "results.json").read_text())
-    assert {row["verdict"] for row in document["rows"]} == {"harness failed"}
+    assert {row["verdict"] for row in read_results(tmp_path)["rows"]} == {"harness failed"}
 
 
 @pytest.mark.parametrize(("level", "quantity"), [("state", "acceleration"), ("trajectory", "position_limit")])
@@ -165,7 +163,7 @@ def test_engines_that_agree_against_an_accepted_truth_put_the_harness_in_doubt(
         f"mujoco) differ from the truth in {quantity}, by "
     )
     assert "and agree with each other: suspect the truth" in shown
-    rows = json.loads((tmp_path / "results.json").read_text())["rows"]
+    rows = read_results(tmp_path)["rows"]
     failed = {row["quantity"].partition("_by_")[0] for row in rows if row["verdict"] == "harness failed"}
     assert failed == {quantity}
     assert not [row for row in rows if row["verdict"] == "disagrees"]

@@ -30,7 +30,7 @@ from plumbline.scenario.generator import (
 )
 from plumbline.scenario.mechanism_document import mechanism_document
 from plumbline.storage.history_of_nights import History
-from plumbline.storage.results_store import ResultTables, read_table
+from plumbline.storage.results_store import ResultTables, read_results, read_table
 from plumbline.studies.coverage_study import CoverageFailure
 from tests.helpers.nightly_tests import slow
 from tests.helpers.nights import run_night
@@ -137,8 +137,7 @@ def test_a_night_proves_motions_and_uses_them(tmp_path):
     result, place = run_nightly(tmp_path, random_count=0, proof_cpu_seconds=10.0)
     assert result.metadata["proofs"]["proved"] == ["rest"]
     assert "; motions: 1 proved, 1 of them now" in result.metadata["sentence"]
-    stored = json.loads((place / "results.json").read_text())
-    assert stored["scenarios"]["rest"]["truth"].startswith("proved: ")
+    assert read_results(place)["scenarios"]["rest"]["truth"].startswith("proved: ")
     shown = decoded_chunks((place / "report.html").read_text(encoding="utf-8"))["scenario-0"]["departures"]
     assert shown["runs"] and all(run["left"] is None and run["until"] == 2 for run in shown["runs"])
     result, _ = run_nightly(tmp_path, random_count=0, proof_cpu_seconds=10.0)
@@ -165,7 +164,7 @@ def test_a_night_is_whole_and_remembered(tmp_path):
         "report.html", "summary.md",
     }  # fmt: skip
     assert sorted(p.name for p in tmp_path.iterdir()) == ["history"]
-    stored = json.loads((place / "results.json").read_text())["run"]
+    stored = read_results(place)["run"]
     assert (stored["seed"], stored["random"]) == (11, 2)
     kept = [row for row in result.rows if row.family == RANDOM_FAMILY]
     for row in kept:  # scenarios without anything remarkable are only counted
@@ -206,7 +205,7 @@ def test_a_night_is_kept_without_its_coverage(tmp_path):
     with patch.object(nightly, "measure_coverage", side_effect=CoverageFailure(reason)):
         result, place = run_nightly(tmp_path, random_count=0)
     assert result.metadata["exit_code"] == 5 and not (place / "coverage.parquet").exists()
-    assert json.loads((place / "results.json").read_text())["run"]["sentence"].endswith(reason)
+    assert read_results(place)["run"]["sentence"].endswith(reason)
     assert "no coverage of rest" in (place / "report.html").read_text(encoding="utf-8")
 
 

@@ -10,6 +10,7 @@ import pytest
 from plumbline.cli.options import LOCK_FILE
 from plumbline.execution.exit_codes import ExitCode
 from plumbline.processes.isolation import FileLock
+from plumbline.storage.results_store import read_results
 from tests.helpers import ROOT, example_results
 from tests.helpers.commands import invoke, run_plumbline
 from tests.helpers.requirements import needs_pipes
@@ -81,7 +82,7 @@ def test_a_damaged_file_leaves_the_report_as_it_was(results, name, damage, words
     if damage:
         (results / name).write_bytes(damage((results / name).read_bytes()))
     else:  # one body more than the table has
-        document = json.loads((results / "results.json").read_text())
+        document = read_results(results)
         for scenario in document["scenarios"].values():
             scenario["bodies"] = 2
             for name in scenario["model"].keys() - {"gravity"}:
@@ -120,8 +121,7 @@ def test_the_command_that_repeats_a_cell_names_the_file_as_given(tmp_path, monke
     for given, stored in (("rest.yaml", "./rest.yaml"), (str(mine), str(mine)), ("rest", "rest.yaml")):
         words = ["run", given, "--engine", "mujoco", "--level", "state", "--jobs", "1", "--out", "out"]
         run_plumbline(*words, cwd=tmp_path, code=0)
-        document = json.loads((tmp_path / "out" / "results.json").read_text())
-        assert document["scenarios"]["rest"]["file"] == stored
+        assert read_results(tmp_path / "out")["scenarios"]["rest"]["file"] == stored
 
 
 def test_an_engine_that_crashes_at_import_ends_no_sweep(tmp_path):

@@ -5,6 +5,7 @@ from unittest.mock import patch
 
 import pyarrow.parquet as pq
 
+from plumbline.storage.results_store import read_results
 from tests.helpers.commands import invoke
 
 
@@ -24,7 +25,7 @@ def test_a_sweep_and_a_drift_table_of_a_tree_and_a_loop(tmp_path):
 
 def test_a_tree_is_compared_with_its_joint_moments(tmp_path):
     invoke("run", "universal-pendulum", "--engine", "mujoco", "--out", tmp_path, "--json", code=0)
-    results = json.loads((tmp_path / "results.json").read_text())
+    results = read_results(tmp_path)
     rows = {row["quantity"]: row["verdict"] for row in results["rows"]}
     assert rows["joint_moment"] == rows["acceleration"] == "agrees"
     levels = {"state", "step", "trajectory", "invariants", "relations"}

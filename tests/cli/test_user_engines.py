@@ -10,6 +10,7 @@ import pytest
 from plumbline.engines import specifications
 from plumbline.engines.registry import USER_ENGINES
 from plumbline.processes.line_process import BadSpecification
+from plumbline.storage.results_store import read_results
 from tests.helpers import ROOT
 from tests.helpers.commands import invoke
 
@@ -38,7 +39,7 @@ def test_a_program_is_a_column_and_its_answers_are_kept_until_it_changes(tmp_pat
     assert first.exit_code == second.exit_code == 0, first.output
     assert "2 agree" in first.stdout and "answers of earlier runs" not in first.stderr
     assert "answers of earlier runs were used" in second.stderr
-    results = json.loads((tmp_path / "out/results.json").read_text())
+    results = read_results(tmp_path / "out")
     assert results["run"]["versions"] == {"toy": "0.1"}
     lifted = {row["quantity"] for row in results["rows"] if row["extra"].get("lifted")}
     assert lifted == {"acceleration", "angular_acceleration"}

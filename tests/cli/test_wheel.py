@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from plumbline.engines.environments import _run_uv
+from plumbline.storage.results_store import read_results
 from plumbline.truth import has_independent_truth
 from tests.helpers import ROOT
 from tests.helpers.commands import run_plumbline
@@ -69,7 +70,7 @@ def test_installed_it_compares_engines_and_writes_one_folder(unpacked, tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {".git", "plumbline-out"}
     assert (tmp_path / "plumbline-out/report.html").is_file()
     assert agreed(done.stdout) >= 14
-    run = json.loads((tmp_path / "plumbline-out/results.json").read_text())["run"]
+    run = read_results(tmp_path / "plumbline-out")["run"]
     assert run["commit"] is None and "certified" in run["truth"]
 
 

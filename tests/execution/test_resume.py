@@ -1,7 +1,6 @@
 """A run that is killed goes on where it stopped, and ends as if it had not been."""
 
 import contextlib
-import json
 import os
 import random
 import signal
@@ -18,6 +17,7 @@ import pytest
 from plumbline.engines import engine_calls
 from plumbline.execution.result_cache import DiskResultCache, task_hash
 from plumbline.processes.worker_pool import Outcome, Pickled, Task
+from plumbline.storage.results_store import read_results
 from tests.helpers import ROOT
 from tests.helpers.catalogue import catalogue_scenario
 from tests.helpers.commands import invoke, run_plumbline
@@ -47,7 +47,7 @@ def finished_results(out, level):
 
 def comparable_results(out):
     """All results of a run without its times."""
-    document = json.loads((out / "results.json").read_text())
+    document = read_results(out)
     run = {k: document["run"][k] for k in ("sentence", "exit_code", "versions", "truth", "stale_issues")}
     rows = [{k: v for k, v in row.items() if k not in TIME_FIELDS} for row in document["rows"]]
     tables = {}

@@ -1,6 +1,5 @@
 """The nightly runs the self-test, and its result counts."""
 
-import json
 import re
 from types import SimpleNamespace
 
@@ -9,6 +8,7 @@ import pytest
 from plumbline.cli import nightly
 from plumbline.execution import selftest
 from plumbline.execution.selftest import SelfTestResult
+from plumbline.storage.results_store import read_results
 from tests.helpers.nights import run_night
 
 PASSING_TEST = """
@@ -123,7 +123,7 @@ def test_a_night_whose_self_test_misses_a_defect_is_not_green(tmp_path, trouble)
         return SelfTestResult({"planted": 67, "reported": 67}, trouble)
 
     _, place = run_night(tmp_path, level="state", self_test=reported)
-    run = json.loads((place / "results.json").read_text())["run"]
+    run = read_results(place)["run"]
     assert run["exit_code"] == bool(trouble) and run["self_test"]["planted"] == 67
     assert ("67 planted" in run["sentence"]) == (not trouble) and trouble in run["sentence"]
     assert (place / "self_test.xml").is_file()
@@ -141,6 +141,6 @@ def test_a_night_killed_as_it_was_done_is_not_had_twice(tmp_path, monkeypatch):
     (first,) = (tmp_path / "history").iterdir()
     assert (tmp_path / "unfinished" / "plan.json").exists()
     result, place = run_night(tmp_path, level="state", seed=None)
-    seeds = [json.loads((p / "results.json").read_text())["run"]["seed"] for p in (first, place)]
+    seeds = [read_results(p)["run"]["seed"] for p in (first, place)]
     assert place != first and seeds[0] != seeds[1] == result.metadata["seed"]
     assert not (tmp_path / "unfinished").exists()

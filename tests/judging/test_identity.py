@@ -1,6 +1,5 @@
 """Two columns of a run that are one computation under two names are reported; independent ones never are."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -21,6 +20,7 @@ from plumbline.judging.identity import (
 )
 from plumbline.model.datatypes import Integrator
 from plumbline.processes.worker_pool import Limits
+from plumbline.storage.results_store import read_results
 from tests.helpers import pendulums
 from tests.helpers.catalogue import catalogue_scenario
 
@@ -168,5 +168,4 @@ def test_a_run_reports_an_alias_that_is_not_declared(monkeypatch, tmp_path):
     runner.save(result, tmp_path / "out", "test")
     page = reports.write(tmp_path / "out").read_text()
     assert "implicitfast equals that of MuJoCo with Euler bit for bit" in page
-    stored = json.loads((tmp_path / "out" / "results.json").read_text())
-    assert stored["scenarios"][RUN_SCENARIO]["family"] == "run"
+    assert read_results(tmp_path / "out")["scenarios"][RUN_SCENARIO]["family"] == "run"

@@ -1,6 +1,5 @@
 """A nightly run over engines with every fault: each loses its own cell, with its reason, and no other."""
 
-import json
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +10,7 @@ from plumbline.engines import registry
 from plumbline.processes import worker_process
 from plumbline.processes.worker_pool import Limits
 from plumbline.storage.history_of_nights import History
+from plumbline.storage.results_store import read_results
 from tests.helpers import faulty_engines as faulty
 from tests.helpers.catalogue import catalogue_scenario
 from tests.helpers.nights import run_night
@@ -55,7 +55,7 @@ def test_every_fault_at_once_loses_exactly_its_own_cell(tmp_path, monkeypatch, c
         r for r in result.rows if r.verdict == "disagrees"
     ]
     # the night's results are complete, its failures are recorded, and no file is left elsewhere
-    stored = json.loads((place / "results.json").read_text())
+    stored = read_results(place)
     assert stored["run"]["exit_code"] == 3 and len(stored["rows"]) == len(result.rows)
     assert [n["id"] for n in History(tmp_path / "out").overview()] == [place.name]
     assert [p.name for p in tmp_path.iterdir()] == ["out"], "an engine's file is in the working folder"

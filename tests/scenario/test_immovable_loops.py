@@ -1,6 +1,5 @@
 """Loops that cannot move: `check` names them, sampled rates are exactly 0, and no engine disagrees."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +11,7 @@ from plumbline.judging.rows import RowContext
 from plumbline.judging.state_level import judge_states
 from plumbline.model.loops import immovable_joints
 from plumbline.scenario.loader import find_scenario_file, load_scenario_text
+from plumbline.storage.results_store import read_results
 from plumbline.truth.certified_state import certify_state
 from plumbline.truth.ground_truth import state_truth
 from tests.helpers.catalogue import catalogue_scenario, states_of
@@ -148,6 +148,6 @@ def test_a_truss_with_its_bars_in_one_line_is_not_compared(tmp_path, monkeypatch
     words = ["run", "flat.yaml", "--engine", "mujoco", "--jobs", "1", "--out", "out"]
     ran = invoke(*words, code=ExitCode.DISAGREEMENT)
     assert "0 independent checks: 4 are information, nothing was compared" in ran.output
-    rows = json.loads(Path("out/results.json").read_text())["rows"]
+    rows = read_results(Path("out"))["rows"]
     assert {row["level"] for row in rows} == {"state", "step", "trajectory", "relations"}
     assert all("every pose that the loops allow is singular" in row["reason"] for row in rows)

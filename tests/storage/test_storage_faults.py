@@ -1,7 +1,6 @@
 """Faults of the disk: every write fails in turn; nothing half is ever read as good, and the night goes on."""
 
 import errno
-import json
 import os
 import sys
 import tempfile
@@ -15,6 +14,7 @@ from plumbline.cli import nightly
 from plumbline.execution import runner
 from plumbline.execution.plan import Plan
 from plumbline.storage.history_of_nights import History
+from plumbline.storage.results_store import read_results
 from tests.helpers.commands import run_plumbline
 from tests.helpers.in_process import InProcessWorkers
 from tests.helpers.nights import run_night
@@ -110,7 +110,7 @@ def check_recovery(disk, out, expected, failing_step, error, persistent):
         assert not found.damaged and len(found.nights) <= 1  # 1: whole, a later step failed
     rows, place = night(out)
     assert rows == expected
-    assert json.loads((place / "results.json").read_text())["run"]["exit_code"] == 0
+    assert read_results(place)["run"]["exit_code"] == 0
     assert sorted(p.name for p in out.iterdir()) == ["history"]
     assert not list(out.rglob(".*")), "temporary files are left"
 
