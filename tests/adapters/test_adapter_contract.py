@@ -487,10 +487,12 @@ def infinite_at_the_end(rows):
     return rows
 
 
-def run_arguments(engine, integrator):
+def simulated_by(simulate, engine, integrator):
+    """A run of the integrator, of an adapter that simulates in another way."""
     subject = one_body(engine)
-    state = pendulums.state_from_seed(subject)
-    return subject, state, TIMES, integrator.name, step_or_tolerance(integrator)
+    state, size = pendulums.state_from_seed(subject), step_or_tolerance(integrator)
+    arguments = subject, state, TIMES, integrator.name, size
+    return worker.call_adapter(engine, "simulate", *arguments, overrides={"_simulate": simulate})
 
 
 TAMPERED = {  # fields of a run, how they are changed, and what the contract reports
@@ -509,12 +511,9 @@ TAMPERED = {  # fields of a run, how they are changed, and what the contract rep
 @pytest.mark.parametrize(("names", "change", "message"), TAMPERED.values(), ids=TAMPERED)
 @every_integrator
 def test_detects_in_a_trajectory(engine, integrator, names, change, message):
-    args = run_arguments(engine, integrator)
-    worker.call_adapter(engine, "simulate", *args, overrides={"_simulate": unchanged})
+    simulated_by(unchanged, engine, integrator)
     with pytest.raises(EngineFailure, match=message):
-        worker.call_adapter(
-            engine, "simulate", *args, overrides={"_simulate": partial(altered, names, change)}
-        )
+        simulated_by(partial(altered, names, change), engine, integrator)
 
 
 def comes_to_rest(real, *args):
@@ -528,8 +527,7 @@ def comes_to_rest(real, *args):
 
 @every_integrator
 def test_a_motion_may_come_to_rest(engine, integrator):
-    args = run_arguments(engine, integrator)
-    worker.call_adapter(engine, "simulate", *args, overrides={"_simulate": comes_to_rest})
+    simulated_by(comes_to_rest, engine, integrator)
 
 
 def one_step_more(real, *args):
@@ -540,9 +538,8 @@ def one_step_more(real, *args):
 @every_integrator
 def test_detects_another_number_of_steps(engine, integrator):
     """Of fixed steps: those of a tolerance are the engine's own choice."""
-    args = run_arguments(engine, integrator)
     with pytest.raises(EngineFailure, match="steps is") if integrator.kind == "step" else nullcontext():
-        worker.call_adapter(engine, "simulate", *args, overrides={"_simulate": one_step_more})
+        simulated_by(one_step_more, engine, integrator)
 
 
 def without_tolerance(real, *args):
@@ -551,9 +548,7 @@ def without_tolerance(real, *args):
 
 @every_integrator
 def test_a_run_says_how_closely_its_steps_were_solved(engine, integrator):
-    args = run_arguments(engine, integrator)
-    run = worker.call_adapter(engine, "simulate", *args, overrides={"_simulate": without_tolerance})
-    assert run.solver_rtol == integrator.solver_rtol
+    assert simulated_by(without_tolerance, engine, integrator).solver_rtol == integrator.solver_rtol
 
 
 def nan_acceleration(real, *args):

@@ -26,15 +26,18 @@ def small_catalogue(monkeypatch):
     monkeypatch.setattr("plumbline.execution.proofs.catalogue", lambda: some)
 
 
+def prove(scenario, duration, folder):
+    """Path of a certificate of a tumbling ball, proved with a cache of its own, and what was printed."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PLUMBLINE_CACHE", str(folder / "cache"))
+        result = invoke("prove", scenario, "--duration", duration, "--out", folder, code=0)
+    return folder / "tumbling-ball.json.gz", result.output
+
+
 @pytest.fixture(scope="module")
 def certificate(tmp_path_factory):
     """Path of a certificate of 0.25 s, and what `prove` printed."""
-    folder = tmp_path_factory.mktemp("certificates")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PLUMBLINE_CACHE", str(folder / "cache"))
-        result = invoke("prove", "tumbling-ball", "--duration", 0.25, "--out", folder)
-    assert result.exit_code == 0, result.output
-    return folder / "tumbling-ball.json.gz", result.output
+    return prove("tumbling-ball", 0.25, tmp_path_factory.mktemp("certificates"))
 
 
 def test_prove_writes_a_certificate_and_prints_radii(certificate):
@@ -87,11 +90,7 @@ def lighter(tmp_path_factory):
     text = find_scenario_file("tumbling-ball").read_text(encoding="utf-8")
     path = folder / "lighter.yaml"
     path.write_text(f"name: tumbling-ball\ngravity: [0, 0, -9.8]\n{text}", encoding="utf-8")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PLUMBLINE_CACHE", str(folder / "cache"))
-        result = invoke("prove", path, "--duration", 0.125, "--out", folder)
-    assert result.exit_code == 0, result.output
-    return folder / "tumbling-ball.json.gz", path
+    return prove(path, 0.125, folder)[0], path
 
 
 def test_numbers_decide_of_which_scenario_a_certificate_is_a_proof(certificate, lighter):

@@ -42,10 +42,28 @@ ENGINES = ("mujoco", "pinocchio", "exudyn", "exudyn-tree")
 OF_JOINT_SPACE = {name for name in RUN_QUANTITIES if name not in ("run_quadrature", "run_equations")}
 
 
-def rows_of(adapter, integrator, model, states):
+def rows_of(adapter, name, model, states):
+    """The rows of the integrator of a name, each by its quantity."""
+    integrator = adapter.integrator(name)
     with patch("plumbline.engines.engine_calls.load_adapter", lambda _: adapter):
         answer = run_step_study(adapter.name, integrator, model, states)
-    return judge_steps(CONTEXT, integrator, model, states, answer).rows
+    rows = judge_steps(CONTEXT, integrator, model, states, answer).rows
+    found = {row.quantity: row for row in rows}
+    assert len(found) == len(rows)
+    return found
+
+
+def disagreeing(rows):
+    return {name for name, row in rows.items() if row.verdict == Verdict.DISAGREES}
+
+
+def rows_of_runs(*arguments):
+    return {name: row for name, row in rows_of(*arguments).items() if name in RUN_QUANTITIES}
+
+
+def last_two(adapter):
+    """Of the integrators that make motions by declared steps."""
+    return [one.name for one in adapter.integrators if one.method is not None and one.has_motions][-2:]
 
 
 @cache
@@ -65,13 +83,13 @@ def subject(name):
 def test_every_step_of_honest_engines_agrees(engine, name):
     model, states = subject(name)
     adapter = load_adapter(engine)
-    for integrator in [i for i in adapter.integrators if i.method is not None and i.has_motions][-2:]:
-        rows = [row for row in rows_of(adapter, integrator, model, states) if row.quantity in RUN_QUANTITIES]
-        assert all(row.verdict == Verdict.AGREES and row.ratio < 1 for row in rows), rows
+    for name in last_two(adapter):
+        rows = rows_of_runs(adapter, name, model, states)
+        assert all(row.verdict == Verdict.AGREES and row.ratio < 1 for row in rows.values()), rows
         if engine != "exudyn":
-            assert {row.quantity for row in rows} == OF_JOINT_SPACE
+            assert rows.keys() == OF_JOINT_SPACE
         steps = max(run_counts(model.n))
-        assert any(f" of {steps} steps " in row.reason for row in rows), [row.reason for row in rows]
+        assert any(f" of {steps} steps " in row.reason for row in rows.values()), rows
 
 
 @slow
@@ -85,10 +103,9 @@ def test_every_step_of_honest_engines_agrees(engine, name):
 )
 def test_steps_agree_where_slides_have_carried_bodies_far_away(index, engine, integrator):
     s, adapter = random_mechanism(*index), load_adapter(engine)
-    rows = rows_of(adapter, adapter.integrator(integrator), s.model, [s.state])
-    of_run = [row for row in rows if row.quantity in RUN_QUANTITIES]
-    assert {row.quantity for row in of_run} == OF_JOINT_SPACE
-    assert all(row.verdict == Verdict.AGREES for row in of_run), of_run
+    rows = rows_of_runs(adapter, integrator, s.model, [s.state])
+    assert rows.keys() == OF_JOINT_SPACE
+    assert all(row.verdict == Verdict.AGREES for row in rows.values()), rows
 
 
 @pytest.mark.parametrize(
@@ -102,8 +119,7 @@ def test_steps_agree_where_slides_have_carried_bodies_far_away(index, engine, in
 def test_newtons_tolerance_is_relative_to_the_terms_of_its_first_residual(index, integrator):
     """A ball of 2 g at 30 rad/s has larger rates than forces; p̈ along p may grow; forces in a whip change."""
     s, adapter = random_scenario(*index), load_adapter("exudyn")
-    rows = rows_of(adapter, adapter.integrator(integrator), s.model, [s.state])
-    (equations,) = [row for row in rows if row.quantity == "run_equations"]
+    equations = rows_of(adapter, integrator, s.model, [s.state])["run_equations"]
     assert equations.verdict == Verdict.AGREES and equations.ratio > 0.1
 
 
@@ -111,10 +127,9 @@ def test_newtons_tolerance_is_relative_to_the_terms_of_its_first_residual(index,
 def test_a_run_is_judged_as_far_as_the_method_itself_goes():
     """Three bodies of 3 g to 20 kg become so fast at 0.16 s that RK4 is unstable."""
     s, adapter = random_scenario(7, 60), load_adapter("mujoco")
-    rows = rows_of(adapter, adapter.integrator("RK4"), s.model, [s.state])
-    of_run = [row for row in rows if row.quantity in RUN_QUANTITIES]
-    assert {row.quantity for row in of_run} == OF_JOINT_SPACE
-    for row in of_run:
+    rows = rows_of_runs(adapter, "RK4", s.model, [s.state])
+    assert rows.keys() == OF_JOINT_SPACE
+    for row in rows.values():
         assert row.verdict == Verdict.AGREES
         assert "; after these MuJoCo warned" in row.reason
         assert row.reason.endswith(": with this step the method itself does not resolve the rest")
@@ -130,9 +145,7 @@ def test_a_run_that_stops_where_the_method_goes_on_has_failed(monkeypatch):
 
     own = type(adapter).step
     monkeypatch.setattr(type(adapter), "step", stops)
-    (row,) = [
-        row for row in rows_of(adapter, adapter.integrator("RK4"), model, states) if row.quantity == "run"
-    ]
+    row = rows_of(adapter, "RK4", model, states)["run"]
     assert row.verdict == Verdict.FAILED and row.reason.endswith(": it stops")
 
 
@@ -142,12 +155,11 @@ def test_every_step_of_free_bodies_far_away_agrees(engine):
     model, states = subject("nesc-tumbling-brick")
     flying = [replace(s, r=s.r + np.array([300, -200, 100]), v=s.v + np.array([30, -20, 10])) for s in states]
     adapter = load_adapter(engine)
-    for integrator in [i for i in adapter.integrators if i.method is not None and i.has_motions][-2:]:
-        rows = [row for row in rows_of(adapter, integrator, model, flying) if row.quantity in OF_JOINT_SPACE]
-        assert {row.quantity for row in rows} == OF_JOINT_SPACE
-        assert all(row.verdict == Verdict.AGREES and not row.extra.get("left_out_steps") for row in rows), (
-            rows
-        )
+    for name in last_two(adapter):
+        rows = rows_of(adapter, name, model, flying)
+        for quantity in OF_JOINT_SPACE:
+            row = rows[quantity]
+            assert row.verdict == Verdict.AGREES and not row.extra.get("left_out_steps"), row
 
 
 @pytest.mark.parametrize("name", ["semi-implicit-euler", "rkmk4"])
@@ -158,14 +170,10 @@ def test_places_are_bounded_by_what_closed_forms_of_slow_turns_lose(name, monkey
         state, omega=np.array([[0.004, 0.01, 0.016]]), v=np.array([[3.0, -2, 1]]), r=np.zeros((1, 3))
     )
 
-    def wrong():
-        rows = rows_of(adapter, adapter.integrator(name), model, [slow])
-        return {row.quantity for row in rows if row.verdict == Verdict.DISAGREES}
-
-    assert not wrong()
+    assert not disagreeing(rows_of(adapter, name, model, [slow]))
     nothing = step_comparison.Lost(np.zeros(1), np.zeros(1))
     monkeypatch.setattr(step_comparison, "_lost_in_closed_forms", lambda *_: nothing)
-    assert {"step_position", "run_position"} <= wrong()
+    assert {"step_position", "run_position"} <= disagreeing(rows_of(adapter, name, model, [slow]))
 
 
 @pytest.mark.parametrize("mistake", some_fast(planted_runs.RUN_MISTAKES, 8))
@@ -174,14 +182,14 @@ def test_a_mistake_inside_a_run_is_reported_with_its_step(mistake):
     defect = mistake.defect
     model, states = subject(defect.mechanism)
     with planted(defect) as adapter:
-        rows = rows_of(adapter, adapter.integrator(defect.integrator), model, states)
-    wrong = [row for row in rows if row.verdict == Verdict.DISAGREES]
-    assert wrong, [(row.quantity, row.verdict, row.ratio, row.reason) for row in rows]
+        rows = rows_of(adapter, defect.integrator, model, states)
+    wrong = disagreeing(rows)
+    assert wrong, rows
     if mistake.quantities:
-        assert any(row.quantity in mistake.quantities for row in wrong)
+        assert wrong & set(mistake.quantities)
         return
-    steps = [row for row in wrong if row.quantity in RUN_QUANTITIES and "first_step" in row.extra]
-    assert steps, [row.quantity for row in wrong]
+    steps = [rows[name] for name in wrong & set(RUN_QUANTITIES) if "first_step" in rows[name].extra]
+    assert steps, wrong
     found = min(row.extra["first_step"] for row in steps if row.quantity != "run_samples" or len(steps) == 1)
     first = mistake.first_step
     assert first is None or abs(found - first) <= 1, (found, first)
@@ -222,7 +230,6 @@ def test_a_mistake_inside_a_run_is_named_with_its_condition(mistake):
 def test_the_given_state_the_times_and_the_number_of_steps_are_compared(engine, name):
     model, states = subject("loaded-ball")
     adapter = load_adapter(engine)
-    integrator = adapter.integrator(name)
     right = type(adapter)._step
 
     def wrong(change):
@@ -244,12 +251,11 @@ def test_the_given_state_the_times_and_the_number_of_steps_are_compared(engine, 
     def one_less(run):
         return replace(run, steps=run.steps - 1)
 
-    (honest,) = (r for r in rows_of(adapter, integrator, model, states) if r.quantity == "run_samples")
+    honest = rows_of(adapter, name, model, states)["run_samples"]
     assert honest.verdict == Verdict.AGREES, honest.reason
     for change in (late, off_at_first, faster, one_less):
         with patch.object(type(adapter), "_step", wrong(change)):
-            rows = rows_of(adapter, integrator, model, states)
-        (row,) = [row for row in rows if row.quantity == "run_samples"]
+            row = rows_of(adapter, name, model, states)["run_samples"]
         assert row.verdict == Verdict.DISAGREES, row.reason
 
 
@@ -257,10 +263,8 @@ def test_a_bias_below_the_rounding_of_one_step_is_seen_in_their_mean():
     model, states = subject("tumbling-ball")
     tiny = planted_runs.mujoco_mistake(planted_runs.from_step(1), planted_runs._scaled_gravity)
     with patch.object(planted_runs, "SIZE", 4e-13), tiny():
-        adapter = load_adapter("mujoco")
-        rows = rows_of(adapter, adapter.integrator("Euler"), model, states)
-    wrong = {row.quantity for row in rows if row.verdict == Verdict.DISAGREES}
-    assert wrong == {"run_mean"}, {row.quantity: row.ratio for row in rows}
+        rows = rows_of(load_adapter("mujoco"), "Euler", model, states)
+    assert disagreeing(rows) == {"run_mean"}, rows
 
 
 def test_steps_without_a_bound_are_counted_and_those_that_differ_are_named():
@@ -268,9 +272,7 @@ def test_steps_without_a_bound_are_counted_and_those_that_differ_are_named():
     model, states = subject("tumbling-ball")
     late = planted_runs.mujoco_mistake(planted_runs.from_step(500), planted_runs._scaled_gravity)
     with patch.object(step_comparison, "MAX_TURN", 0.0), late():
-        adapter = load_adapter("mujoco")
-        rows = rows_of(adapter, adapter.integrator("Euler"), model, states)
-    (row,) = [row for row in rows if row.quantity == "run_velocity"]
+        row = rows_of(load_adapter("mujoco"), "Euler", model, states)["run_velocity"]
     steps = max(run_counts(model.n))
     assert row.verdict == Verdict.INFORMATION
     assert (row.extra["left_out_steps"], row.extra["left_out_wrong_steps"]) == (steps, steps - 499)
@@ -286,8 +288,7 @@ def test_an_adapter_without_coordinates_says_so():
         return replace(right(self, *arguments), coordinates=None, velocities=None)
 
     with patch.object(type(adapter), "_simulate", without):
-        rows = rows_of(adapter, adapter.integrator("RK4"), model, states)
-    (row,) = [row for row in rows if row.quantity == "run"]
+        row = rows_of(adapter, "RK4", model, states)["run"]
     assert row.verdict == Verdict.INFORMATION and "coordinates" in row.reason
 
 
@@ -313,7 +314,7 @@ def test_a_rod_that_spins_about_itself_is_as_fast_as_it_turns():
 
 
 def alarms(adapter, integrator, model, state):
-    rows = rows_of(adapter, integrator, model, [state])
+    rows = rows_of(adapter, integrator, model, [state]).values()
     return [r.reason for r in rows if r.verdict in (Verdict.DISAGREES, Verdict.FAILED)]
 
 
@@ -327,7 +328,7 @@ def test_no_false_alarm_on_random_mechanisms(seed):
     model, state = mechanism_of(seed)
     for engine in ENGINES:
         adapter = load_adapter(engine)
-        for integrator in [i for i in adapter.integrators if i.method is not None]:
+        for integrator in [i.name for i in adapter.integrators if i.method is not None]:
             found = alarms(adapter, integrator, model, state)
             if found and engine == "pinocchio":
                 with steps_by_crba(adapter):
