@@ -25,7 +25,7 @@ from plumbline.truth.certified_state import certify_state
 from tests.helpers.catalogue import catalogue_scenario
 from tests.helpers.commands import invoke
 from tests.helpers.exudyn_initial_accelerations import initial_accelerations
-from tests.helpers.requirements import needs_uv
+from tests.helpers.requirements import needs_uv, refuse_packages, require_package_index
 from tests.helpers.runs import run_scenarios
 
 PYTHON = (
@@ -300,15 +300,6 @@ def test_a_version_that_cannot_be_had_is_a_verdict():
 # --- what is no version, no wheel, or cannot be fetched ------------------------------------------
 
 
-@pytest.fixture
-def package_index():
-    """Skips with the reason where no package index answers."""
-    try:
-        environments.newest_requirement("packaging", pre=False)
-    except environments.EnvironmentUnavailable as error:
-        pytest.skip(f"no package index can be reached: {error}")
-
-
 def build_wheel(folder, package="mujoco"):
     """The installed distribution packed again as the wheel that it came from."""
     found = metadata.distribution(package)
@@ -358,11 +349,7 @@ def test_the_uv_that_make_installed_is_found(tmp_path, monkeypatch, place):
 @needs_uv
 @pytest.mark.parametrize("version", ["9.9.9", "latest"])
 def test_an_index_that_does_not_answer_is_reported(tmp_path, monkeypatch, version):
-    for name in ("UV_INDEX_URL", "UV_EXTRA_INDEX_URL", "UV_INDEX", "UV_FIND_LINKS"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setenv("UV_DEFAULT_INDEX", "http://127.0.0.1:9/simple")  # the port of discard: refused
-    monkeypatch.setenv("UV_HTTP_RETRIES", "0")
-    monkeypatch.setenv("UV_CACHE_DIR", str(tmp_path / "uv"))
+    refuse_packages(monkeypatch, tmp_path)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     result = run_scenarios(["rest"], [f"mujoco@{version}"], "state")
     (row,) = result.rows
@@ -374,7 +361,8 @@ def test_an_index_that_does_not_answer_is_reported(tmp_path, monkeypatch, versio
 @pytest.mark.full
 @needs_uv
 @pytest.mark.timeout(1800)
-def test_latest_pre_and_a_wheel_run_beside_the_installed_one(tmp_path, package_index):
+def test_latest_pre_and_a_wheel_run_beside_the_installed_one(tmp_path):
+    require_package_index()
     names = ["mujoco", "mujoco@latest", "mujoco@pre", f"mujoco@{build_wheel(tmp_path)}"]
     result = run_scenarios(["tumbling-ball"], names, "state", limits=Limits(600))
     found = {name: result.engines[name] for name in names}
@@ -390,7 +378,8 @@ def test_latest_pre_and_a_wheel_run_beside_the_installed_one(tmp_path, package_i
 @pytest.mark.full
 @needs_uv
 @pytest.mark.timeout(900)
-def test_an_empty_wheel_is_reported(tmp_path, package_index):
+def test_an_empty_wheel_is_reported(tmp_path):
+    require_package_index()
     path = tmp_path / "mujoco-4.0.0-py3-none-any.whl"
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("mujoco/__init__.py", "")

@@ -23,6 +23,11 @@ def engines():
         return describe_engines(workers, ["reference", "mujoco"])
 
 
+@pytest.fixture
+def mujoco(engines):
+    return {"mujoco": engines["mujoco"]}
+
+
 outcome_of = by_content(run_task)  # many tests begin with the same truth and the same answers
 
 
@@ -37,6 +42,14 @@ def begun(engines, level="state"):
     bench = make_scenario_run(engines, level)
     (truth,) = bench.tasks()
     return bench, bench.on_outcome(outcome_of(truth))
+
+
+def finished_rows(bench, tasks):
+    """All rows, once the tasks are done."""
+    for task in tasks:
+        bench.on_outcome(outcome_of(task))
+    assert bench.is_done
+    return bench.findings().rows
 
 
 def truth_of(bench, kind):
@@ -85,9 +98,8 @@ def raise_key_error(*_):
 
 def test_a_judge_that_raises_is_a_failure_of_the_harness(engines):
     bench, cells = begun(engines)
-    for task in cells:
-        bench.on_outcome(outcome_of(replace(task, judge=raise_key_error)))
-    assert [(r.verdict, r.reason) for r in bench.findings().rows] == [
+    rows = finished_rows(bench, [replace(task, judge=raise_key_error) for task in cells])
+    assert [(r.verdict, r.reason) for r in rows] == [
         ("harness failed", "the answer cannot be judged: KeyError: 'a mistake'")
     ] * 2
 
@@ -95,10 +107,8 @@ def test_a_judge_that_raises_is_a_failure_of_the_harness(engines):
 def test_a_lost_truth_of_states_fails_every_cell_with_the_reason(engines):
     bench = make_scenario_run(engines, "state")
     (truth,) = bench.tasks()
-    for task in bench.on_outcome(Outcome(truth.key, failure="crashed")):
-        bench.on_outcome(outcome_of(task))
-    assert bench.is_done
-    assert [(r.verdict, r.reason) for r in bench.findings().rows] == [
+    rows = finished_rows(bench, bench.on_outcome(Outcome(truth.key, failure="crashed")))
+    assert [(r.verdict, r.reason) for r in rows] == [
         ("harness failed", "rest has no truth to judge by: crashed")
     ] * 2
 
@@ -108,10 +118,8 @@ def test_a_motion_truth_whose_worker_died_is_computed_again_without_a_compiler(e
     (truth,) = bench.tasks()
     (second,) = bench.on_outcome(Outcome(truth.key, failure="crashed: the worker died of SIGSEGV"))
     assert second.key == truth.key and second.arguments[-1] == 0 and not bench.is_done
-    for task in bench.on_outcome(outcome_of(second)):
-        bench.on_outcome(outcome_of(task))
-    assert bench.is_done
-    assert not any(row.verdict.needs_attention for row in bench.findings().rows)
+    rows = finished_rows(bench, bench.on_outcome(outcome_of(second)))
+    assert not any(row.verdict.needs_attention for row in rows)
     assert "Taylor" not in bench.truths[TaskKind.MOTION_TRUTH].method.split("closed form")[0]
 
 
@@ -120,10 +128,7 @@ def test_a_truth_that_is_lost_twice_fails_every_cell_with_the_reason(engines):
     (truth,) = bench.tasks()
     bench.on_outcome(Outcome(truth.key, failure="crashed"))
     cells = bench.on_outcome(Outcome(truth.key, failure="crashed twice"))
-    for task in cells:
-        bench.on_outcome(outcome_of(task))
-    assert bench.is_done
-    rows = bench.findings().rows
+    rows = finished_rows(bench, cells)
     assert len(rows) == len(cells)
     reason = "rest has no truth to judge by: crashed twice"
     assert all(r.verdict == "harness failed" and r.reason == reason for r in rows)
@@ -162,9 +167,8 @@ class Recorded:
     [((), True), (("acceleration",), True), (("acceleration", "joint_reaction"), False)],
 )
 def test_of_a_cell_whose_disagreements_are_all_recorded_only_the_scatter_is_measured(
-    engines, quantities, searched
+    mujoco, quantities, searched
 ):
-    mujoco = {"mujoco": engines["mujoco"]}
     run = make_scenario_run(mujoco, "state", known=Recorded(*quantities))
     (truth,) = run.tasks()
     (cell,) = run.on_outcome(outcome_of(truth))
@@ -194,9 +198,8 @@ def steps_of(bench, engine, integrator):
     ],
 )
 def test_steps_are_not_searched_where_the_accelerations_they_are_made_of_disagree(
-    engines, quantity, recorded, searched, are_states_first
+    mujoco, quantity, recorded, searched, are_states_first
 ):
-    mujoco = {"mujoco": engines["mujoco"]}
     bench = make_scenario_run(mujoco, "all", "tumbling-ball", 1, known=Recorded(*recorded))
     steps = steps_of(bench, "mujoco", "Euler")
     (states,) = bench.on_outcome(outcome_of(truth_of(bench, TaskKind.STATE_TRUTH)))
@@ -211,15 +214,15 @@ def test_steps_are_not_searched_where_the_accelerations_they_are_made_of_disagre
     assert ["step" if x.key.integrator else "state" for x in following] == searched
 
 
-def plan_of(name, has_all_studies=False):
+def run_with_studies(engines, name, has_all_studies=False):
     chosen = catalogue_scenario(name)
-    return Plan([chosen], ["mujoco"], random_state_count=1, has_all_studies=has_all_studies), chosen
+    plan = Plan([chosen], ["mujoco"], random_state_count=1, has_all_studies=has_all_studies)
+    return ScenarioRun(plan, chosen, engines)
 
 
 @pytest.mark.parametrize("is_truth_first", [True, False])
-def test_a_study_of_low_order_is_left_to_the_night_where_steps_decide(engines, is_truth_first):
-    plan, chosen = plan_of("double-tumbling-rods")
-    bench = ScenarioRun(plan, chosen, {"mujoco": engines["mujoco"]})
+def test_a_study_of_low_order_is_left_to_the_night_where_steps_decide(mujoco, is_truth_first):
+    bench = run_with_studies(mujoco, "double-tumbling-rods")
     truth = truth_of(bench, TaskKind.MOTION_TRUTH)
     euler, rk4 = (outcome_of(steps_of(bench, "mujoco", name)) for name in ("Euler", "RK4"))
     studies = []
@@ -231,19 +234,17 @@ def test_a_study_of_low_order_is_left_to_the_night_where_steps_decide(engines, i
     assert "of this family all run on double-loaded-rods" in row.reason
 
 
-def test_a_study_of_low_order_runs_where_steps_do_not_decide(engines):
-    plan, chosen = plan_of("double-tumbling-rods")
-    bench = ScenarioRun(plan, chosen, {"mujoco": engines["mujoco"]})
+def test_a_study_of_low_order_runs_where_steps_do_not_decide(mujoco):
+    bench = run_with_studies(mujoco, "double-tumbling-rods")
     bench.on_outcome(outcome_of(truth_of(bench, TaskKind.MOTION_TRUTH)))
     lost = Outcome(steps_of(bench, "mujoco", "Euler").key, failure="crashed")
     assert [x.key for x in bench.on_outcome(lost)] == [replace(lost.key, kind=TaskKind.TRAJECTORY)]
     assert bench.left_to_the_night == 0
 
 
-def test_every_study_runs_at_night_and_on_the_plainest_scenario(engines):
+def test_every_study_runs_at_night_and_on_the_plainest_scenario(mujoco):
     for has_all_studies, name in ((True, "double-tumbling-rods"), (False, "double-loaded-rods")):
-        plan, chosen = plan_of(name, has_all_studies)
-        bench = ScenarioRun(plan, chosen, {"mujoco": engines["mujoco"]})
+        bench = run_with_studies(mujoco, name, has_all_studies)
         truth = outcome_of(truth_of(bench, TaskKind.MOTION_TRUTH))
         following = [x.key.integrator for x in bench.on_outcome(truth)]
         assert following == ["Euler", "implicit", "implicitfast", "RK4"]
@@ -264,9 +265,8 @@ def test_of_each_family_the_plainest_scenario_is_studied_and_of_others_the_plain
 )
 def test_of_methods_of_one_order_the_first_ones_study_runs(name, left):
     """Of trees the equations of Exudyn's steps are compared, with springs they are not."""
-    plan, chosen = plan_of(name)
     with WorkerPool(1) as workers:
-        bench = ScenarioRun(plan, chosen, describe_engines(workers, ["exudyn"]))
+        bench = run_with_studies(describe_engines(workers, ["exudyn"]), name)
     truth = outcome_of(truth_of(bench, TaskKind.MOTION_TRUTH))
     assert [x.key.integrator for x in bench.on_outcome(truth)] == ["trapezoidal"]
     bench.on_outcome(outcome_of(steps_of(bench, "exudyn", "generalized-alpha")))
@@ -274,8 +274,8 @@ def test_of_methods_of_one_order_the_first_ones_study_runs(name, left):
 
 
 @pytest.mark.parametrize(("of_steps", "expected"), [("agrees", "information"), ("disagrees", "unresolved")])
-def test_what_a_study_leaves_open_is_information_where_every_step_agrees(engines, of_steps, expected):
-    bench = make_scenario_run({"mujoco": engines["mujoco"]}, "all", "tumbling-ball", 1)
+def test_what_a_study_leaves_open_is_information_where_every_step_agrees(mujoco, of_steps, expected):
+    bench = make_scenario_run(mujoco, "all", "tumbling-ball", 1)
     studies = bench.on_outcome(outcome_of(truth_of(bench, TaskKind.MOTION_TRUTH)))
     study = next(x for x in studies if (x.key.engine, x.key.integrator) == ("mujoco", "RK4"))
     for task, quantity, verdict in (

@@ -147,8 +147,12 @@ def runs_with_differences(*differences):
     return [np.full((1, 1, 1), x) for x in np.cumsum([0.0, *differences])]
 
 
+def order_of(differences, floor, declared):
+    return observed_order(runs_with_differences(*differences), floor, declared)
+
+
 def test_orders_are_logarithms_of_ratios_of_differences():
-    seen = observed_order(runs_with_differences(64.0, 16.0, 4.0, 0.5), 1e-9, 2)
+    seen = order_of((64.0, 16.0, 4.0, 0.5), 1e-9, 2)
     assert seen.orders == (2.0, 2.0, 3.0)
     assert seen.differences == (64.0, 16.0, 4.0, 0.5)
     assert (seen.value, seen.is_asymptotic, seen.is_at_rounding_floor) == (2.0, True, False)
@@ -158,7 +162,7 @@ def test_orders_are_logarithms_of_ratios_of_differences():
     ("floor", "used"), [(0.5 / 32 * 0.99, 3), (0.5 / 32, 2), (4.0 / 32, 1), (16.0 / 32, 0)]
 )
 def test_a_difference_counts_above_32_floors(floor, used):
-    seen = observed_order(runs_with_differences(64.0, 16.0, 4.0, 0.5), floor, 5)
+    seen = order_of((64.0, 16.0, 4.0, 0.5), floor, 5)
     assert np.isfinite(seen.orders).tolist() == [k < used for k in range(3)]
     assert seen.value == ([2.0, 2.0, 3.0][used - 1] if used else None)
     assert seen.differences == (64.0, 16.0, 4.0, 0.5)
@@ -167,7 +171,7 @@ def test_a_difference_counts_above_32_floors(floor, used):
 
 @pytest.mark.parametrize(("floor", "at_floor"), [(2.0, True), (1.99, False)])
 def test_all_differences_within_32_floors_are_rounding(floor, at_floor):
-    assert observed_order(runs_with_differences(64.0, 16.0, 4.0), floor, 2).is_at_rounding_floor is at_floor
+    assert order_of((64.0, 16.0, 4.0), floor, 2).is_at_rounding_floor is at_floor
 
 
 @pytest.mark.parametrize(
@@ -182,7 +186,7 @@ def test_all_differences_within_32_floors_are_rounding(floor, at_floor):
 )
 def test_two_consecutive_orders_near_the_declared_one_show_it(orders, declared, shown):
     sizes = 1e3 * 2.0 ** -np.cumsum([0.0, *orders])
-    seen = observed_order(runs_with_differences(*sizes), 1e-12, declared)
+    seen = order_of(sizes, 1e-12, declared)
     assert seen.is_asymptotic is (shown is not None)
     assert shown is None or seen.value == pytest.approx(shown, abs=1e-9)
 
@@ -191,15 +195,12 @@ def test_two_consecutive_orders_near_the_declared_one_show_it(orders, declared, 
 def test_the_three_finest_orders_above_rounding_lead_somewhere(more):
     """4.55, 4.3, 4.15 are on their way to 4; differences below rounding do not count."""
     sizes = 1e3 * 2.0 ** -np.cumsum([0.0, 4.55, 4.3, 4.15, *more])
-    seen = observed_order(runs_with_differences(*sizes), sizes[3] / 32 * 0.99, 4)
+    seen = order_of(sizes, sizes[3] / 32 * 0.99, 4)
     assert seen.is_asymptotic and seen.value == pytest.approx(4.0, abs=1e-9)
 
 
 def test_runs_that_agree_have_no_order():
-    assert np.isnan(observed_order(runs_with_differences(0.0, 4.0, 1.0), 1e-9, 2).orders).tolist() == [
-        True,
-        False,
-    ]
+    assert np.isnan(order_of((0.0, 4.0, 1.0), 1e-9, 2).orders).tolist() == [True, False]
 
 
 def test_romberg_is_richardson_by_hand():

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from plumbline.engines import environments
-from plumbline.engines.environments import EnvironmentUnavailable, PublishedVersions
+from plumbline.engines.environments import PublishedVersions
 from plumbline.studies import version_search
 from plumbline.studies.version_search import (
     NoSearch,
@@ -18,7 +17,7 @@ from plumbline.studies.version_search import (
     find_change,
 )
 from tests.helpers.commands import invoke
-from tests.helpers.requirements import needs_uv
+from tests.helpers.requirements import needs_uv, refuse_packages, require_package_index
 
 VERSIONS = [f"1.{k}" for k in range(40)]
 INSTALLED = metadata.version("mujoco")
@@ -150,11 +149,7 @@ def test_a_bad_model_file_exits_with_2_and_its_line(arm, monkeypatch):
 
 @needs_uv
 def test_without_network_the_reason_is_reported(arm, monkeypatch, tmp_path):
-    for name in ("UV_INDEX_URL", "UV_EXTRA_INDEX_URL", "UV_INDEX", "UV_FIND_LINKS", "PIP_FIND_LINKS"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setenv("UV_DEFAULT_INDEX", "http://127.0.0.1:9/simple")  # the port of discard: refused
-    monkeypatch.setenv("UV_HTTP_RETRIES", "0")
-    monkeypatch.setenv("UV_CACHE_DIR", str(tmp_path / "uv"))
+    refuse_packages(monkeypatch, tmp_path)
     monkeypatch.setenv("UV_TOOL_DIR", str(tmp_path / "tools"))
     result = run(arm, "--engine", "mujoco")
     assert result.exit_code == 3
@@ -165,10 +160,7 @@ def test_without_network_the_reason_is_reported(arm, monkeypatch, tmp_path):
 @pytest.mark.timeout(900)
 def test_real_versions(arm):
     """MuJoCo 3.13.0 reads a link's inertia without the rpy of its origin, 3.14.0 with it."""
-    try:
-        environments.newest_requirement("packaging", pre=False)
-    except EnvironmentUnavailable as error:
-        pytest.skip(f"no package index can be reached: {error}")
+    require_package_index()
     result = run(arm, "--engine", "mujoco", "--good", "3.14.0", "--bad", "3.13.0", "--json")
     assert result.exit_code == 0, result.output
     document = json.loads(result.stdout)
