@@ -14,8 +14,7 @@ import pytest
 from plumbline.engines.environments import _run_uv
 from plumbline.storage.results_store import read_results
 from plumbline.truth import has_independent_truth
-from tests.helpers import ROOT
-from tests.helpers.commands import run_plumbline
+from tests.helpers.commands import run_plumbline, run_python
 from tests.helpers.dask_cluster import cluster
 from tests.helpers.terminal_counts import agreed
 from tools.release import problem, release_notes
@@ -30,10 +29,7 @@ MOVED = {"adapters", "reference_impl", "reports", "bench", "tests", "tools"}
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory):
     folder = tmp_path_factory.mktemp("dist")
-    subprocess.run(
-        [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", folder],
-        cwd=ROOT, check=True, capture_output=True,
-    )  # fmt: skip
+    run_python("-m", "hatchling", "build", "-t", "wheel", "-d", folder, code=0)
     (found,) = folder.glob("*.whl")
     return found
 

@@ -1,8 +1,6 @@
 """Servers of further engines: their cost is listed first, and those that are built agree with the truth."""
 
-import os
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -10,25 +8,19 @@ import pytest
 from plumbline.engines.registry import ENGINES, IMPORTERS
 from plumbline.execution.comparison import compare
 from plumbline.judging.rows import Verdict
-from tests.helpers import ROOT
+from tests.helpers.commands import run_plumbline, run_python
 from tools.engine_servers import ENGINE_SERVERS
 
 
-def listed(*words, path=None):
-    environment = os.environ | ({} if path is None else {"PATH": path})
-    command = [sys.executable, "-m", "tools.engine_servers", *words]
-    return subprocess.run(
-        command, cwd=ROOT, capture_output=True, text=True, env=environment, check=True
-    ).stdout
+def listed(*words, **variables):
+    return run_python("-m", "tools.engine_servers", *words, code=0, **variables).stdout
 
 
 def test_sizes_licences_and_missing_tools_are_listed_before_anything_is_built(tmp_path):
-    lines = dict(
-        zip([s.name for s in ENGINE_SERVERS], listed("--list", path=str(tmp_path)).splitlines(), strict=True)
-    )
-    for server in ENGINE_SERVERS:
-        assert server.licence in lines[server.name] and " MB" in lines[server.name]
-        assert "is built" in lines[server.name] or "is not installed; " in lines[server.name]
+    lines = listed("--list", PATH=str(tmp_path)).splitlines()
+    for server, line in zip(ENGINE_SERVERS, lines, strict=True):
+        assert server.licence in line and " MB" in line
+        assert "is built" in line or "is not installed; " in line
 
 
 def test_a_night_gets_the_servers_that_are_built():
@@ -61,8 +53,6 @@ def test_what_is_recorded_of_a_server_is_found_again(tmp_path):
     dart = next(server for server in ENGINE_SERVERS if server.name == "dart")
     if not dart.is_built:
         pytest.skip("dart is not built here: `make engines` builds it")
-    command = [sys.executable, "-m", "plumbline", "run", "chain-10-small", "--level", "state", "--engine",
-               "reference", *dart.options, "--out", tmp_path]  # fmt: skip
-    done = subprocess.run([*map(str, command)], cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout
+    words = "run", "chain-10-small", "--level", "state", "--engine", "reference", *dart.options
+    done = run_plumbline(*words, "--out", tmp_path, code=0)
     assert "2 disagree as recorded" in " ".join(done.stdout.split())

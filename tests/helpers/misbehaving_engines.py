@@ -189,7 +189,7 @@ def with_field(**changes: Callable[[Any], Any]) -> Callable[[Answers], Any]:
 
 
 def each_field(make: Callable[[Any], Any]) -> Callable[[Answers], Any]:
-    return lambda right: with_field(acceleration=make)(right)
+    return with_field(acceleration=make)
 
 
 ARRAY = "state 0: acceleration is {}, must be an array of float64 of shape (1, 3)"

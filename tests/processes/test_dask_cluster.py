@@ -3,8 +3,6 @@
 import contextlib
 import os
 import signal
-import subprocess
-import sys
 import time
 from dataclasses import replace
 from importlib.util import find_spec
@@ -19,7 +17,7 @@ from plumbline.execution.plan import Plan
 from plumbline.execution.runner import run_plan
 from plumbline.processes.worker_pool import Limits, Task
 from plumbline.scenario import loader
-from tests.helpers import ROOT
+from tests.helpers.commands import run_plumbline
 from tests.helpers.dask_cluster import cluster
 
 
@@ -69,11 +67,8 @@ def check_losses_cost_one_task(address):
 
 
 def test_a_missing_scheduler_is_reported():
-    done = subprocess.run(
-        [sys.executable, "-m", "plumbline", "run", "rest", "--scheduler", "nonsense"],
-        cwd=ROOT, capture_output=True, text=True,
-    )  # fmt: skip
-    assert done.returncode == 2 and "nonsense" in done.stderr
+    done = run_plumbline("run", "rest", "--scheduler", "nonsense", code=2)
+    assert "nonsense" in done.stderr
 
 
 class LostClient:

@@ -6,8 +6,6 @@ import base64
 import math
 import re
 import shutil
-import subprocess
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +17,7 @@ from plumbline.storage.script_index import write_script_index
 from reports import html_report as report
 from reports.stored_results import Results
 from tests.helpers import example_results as fixture
+from tests.helpers.commands import run_python
 from tests.helpers.pages import watch
 
 pytestmark = pytest.mark.browser
@@ -589,8 +588,7 @@ COLOURS = """async (data) => {  // size and number of colours of a picture
 
 def test_the_picture_for_the_readme_is_of_the_report(chromium, out, tmp_path):
     path = tmp_path / "report.png"
-    command = [sys.executable, "-m", "reports.screenshot", out / "report.html", path]
-    subprocess.run(command, check=True, cwd=Path(report.__file__).parents[1])
+    run_python("-m", "reports.screenshot", out / "report.html", path, code=0)
     page = chromium.new_page()
     width, height, colours = page.evaluate(COLOURS, base64.b64encode(path.read_bytes()).decode())
     page.close()

@@ -1,6 +1,5 @@
 """Truth along trajectories: two methods of different kind and coordinates, and quad precision above them."""
 
-import subprocess
 import sys
 
 import numpy as np
@@ -21,6 +20,7 @@ from plumbline.truth.trajectory_truth import (
     trajectory_truth,
 )
 from tests.helpers.catalogue import catalogue_scenario, catalogue_scenarios
+from tests.helpers.commands import run_python
 from tests.helpers.nightly_tests import fast_are
 from tests.helpers.random_chains import random_chain
 from tests.helpers.requirements import needs_truth_tools
@@ -231,5 +231,5 @@ def test_sympy_is_hidden_only_while_heyoka_is_imported():
     program = (
         "from plumbline.truth import taylor; taylor.load_heyoka(); import sys; print('sympy' in sys.modules)"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    done = run_python("-c", program, code=0)
     assert done.stdout.strip() == "False"
