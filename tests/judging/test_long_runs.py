@@ -45,6 +45,10 @@ def run_long(name, engine, integrator, seconds=100.0):
     }
 
 
+def all_agree(rows):
+    return {row.verdict for row in rows.values()} == {"agrees"}
+
+
 @pytest.fixture
 def use_defect(monkeypatch):
     """``use_defect(defect)``: MuJoCo with it, as the engine that `endure` gets."""
@@ -59,7 +63,7 @@ def use_defect(monkeypatch):
 
 def test_a_chaotic_motion_keeps_what_is_conserved_for_100_s():
     rows = run_long("double-tumbling-balls", "mujoco", "RK4")
-    assert {row.verdict for row in rows.values()} == {"agrees"} and len(rows) == 5
+    assert all_agree(rows) and len(rows) == 5
     energy = rows["energy_drift_long"]
     assert energy.level == "invariants" and energy.compared_until == 100.0 and energy.declared_order == 4
     assert 3.5 < energy.order < 5.5
@@ -142,24 +146,21 @@ def growth_row_with_drag():
 @pytest.mark.full
 def test_step_control_keeps_each_invariant_within_its_tolerance():
     rows = worker.run_in_engine_process("pinocchio", run_long, "tumbling-ball", "pinocchio", "dop853", 50.0)
-    assert {row.verdict for row in rows.values()} == {"agrees"}
+    assert all_agree(rows)
     assert "the error that the tolerance 1e-08 accepts in every step" in rows["energy_drift_long"].reason
 
 
-def agreeing_rows(name, duration):
-    rows = run_long(name, "mujoco", "RK4", duration)
-    assert {row.verdict for row in rows.values()} == {"agrees"} and len(rows) == 4
-    return rows
-
-
 def test_a_mechanism_with_a_loop_keeps_what_is_conserved():
-    rows = agreeing_rows("slider-crank", 2.0)
+    rows = run_long("slider-crank", "mujoco", "RK4", 2.0)
+    assert all_agree(rows) and len(rows) == 4
     assert rows["energy_drift_long"].compared_until == 2.0
 
 
 def test_a_limit_of_softer_runs_is_not_surer_than_they_are_of_it():
     """A limit of attitudes is not of length 1 once the runs part: by 1e-10 on this helical joint."""
-    norm = agreeing_rows("sprung-helical", 12.5)["norm_drift_long"]
+    rows = run_long("sprung-helical", "mujoco", "RK4", 12.5)
+    assert all_agree(rows) and len(rows) == 4
+    norm = rows["norm_drift_long"]
     assert norm.value > 1e-11 and "the limit of softer runs, ±" in norm.reason
 
 
@@ -170,7 +171,7 @@ def test_runs_end_before_a_singular_pose():
     singular = rows.pop("singular_pose")
     assert singular.verdict == "unresolved" and singular.compared_until == 0.6875
     assert "from t = 0.7129 s on" in singular.reason and "compared up to t = 0.6875 s" in singular.reason
-    assert {row.verdict for row in rows.values()} == {"agrees"}
+    assert all_agree(rows)
     assert {row.compared_until for row in rows.values()} == {0.6875}
 
 
@@ -205,7 +206,7 @@ def test_shorter_steps_show_whether_the_steps_were_why_a_run_stopped(monkeypatch
 def test_long_runs_end_where_the_motion_is_too_fast_for_every_step():
     """The bob falls free for 0.4515 s; then the cart, a millionth of its mass, is thrown aside."""
     rows = run_long("light-cart-pole", "pinocchio", "rkmk4", 2.0)
-    assert {row.verdict for row in rows.values()} == {"agrees"}
+    assert all_agree(rows)
     assert {row.compared_until for row in rows.values()} == {0.375}
     for row in rows.values():
         assert row.derivation.endswith("resolve 0.375 s of 2 s, then the motion is too fast")

@@ -59,10 +59,13 @@ def stepped(adapter, integrator, model, states):
         return run_steps(adapter.name, integrator.name, model, states, sizes, counts)
 
 
+def rows_of(integrator, model, states, answer):
+    return judge_steps(CONTEXT, integrator, model, states, answer).rows
+
+
 def judged(adapter, integrator, model, states):
     """Rows of an adapter's steps, judged by the integrator's declared method."""
-    answer = stepped(adapter, integrator, model, states)
-    return judge_steps(CONTEXT, integrator, model, states, answer).rows
+    return rows_of(integrator, model, states, stepped(adapter, integrator, model, states))
 
 
 @pytest.mark.parametrize(("engine", "name"), [("mujoco", "RK4"), ("pinocchio", "semi-implicit-euler")])
@@ -139,11 +142,11 @@ def test_equations_of_a_branching_tree_of_rods_and_balls_are_compared():
     states, adapter = random_states(model, 2, seed=3), load_adapter("exudyn")
     for integrator in methods("exudyn"):
         answer = stepped(adapter, integrator, model, states)
-        rows = judge_steps(CONTEXT, integrator, model, states, answer).rows
+        rows = rows_of(integrator, model, states, answer)
         assert {"step_equations", "step_first_acceleration"} <= {row.quantity for row in rows}
         assert not disagreeing(rows), [row.reason for row in rows]
         lighter = replace(model, mass=model.mass * [1, 1, 1 - 1e-6, 1])
-        wrong = disagreeing(judge_steps(CONTEXT, integrator, lighter, states, answer).rows)
+        wrong = disagreeing(rows_of(integrator, lighter, states, answer))
         assert wrong["step_equations"] > 1
 
 
@@ -164,13 +167,13 @@ def test_equations_of_trees_on_other_joints_are_compared_where_these_are_togethe
         others["turn"] = axes
     for integrator in methods("exudyn"):
         answer = stepped(adapter, integrator, model, states)
-        rows = judge_steps(CONTEXT, integrator, model, states, answer).rows
+        rows = rows_of(integrator, model, states, answer)
         assert not disagreeing(rows), [row.reason for row in rows]
         if integrator.method.constraint_level == "velocity":
             assert "step_equations" not in {row.quantity for row in rows}
             continue
         for name, value in others.items():
-            rows = judge_steps(CONTEXT, integrator, replace(model, **{name: value}), states, answer).rows
+            rows = rows_of(integrator, replace(model, **{name: value}), states, answer)
             assert "step_equations" in disagreeing(rows), name
 
 
@@ -240,10 +243,10 @@ def test_an_engine_that_refuses_or_fails_has_one_row():
     model, states = subject("balls")
     integrator = load_adapter("exudyn-tree").integrator("RK44")
     refused = StepEvaluation([StepAttempt(0, 0.01, refusal="angles are singular")], 0.1)
-    (row,) = judge_steps(CONTEXT, integrator, model, states, refused).rows
+    (row,) = rows_of(integrator, model, states, refused)
     assert (row.verdict, row.quantity, row.reason) == (Verdict.UNSUPPORTED, "all", "angles are singular")
     failed = StepEvaluation([StepAttempt(0, 0.01, failure="it crashed", place="in f")], 0.1)
-    (row,) = judge_steps(CONTEXT, integrator, model, states, failed).rows
+    (row,) = rows_of(integrator, model, states, failed)
     assert (row.verdict, row.reason, row.extra["place"]) == (Verdict.FAILED, "it crashed", "in f")
 
 
@@ -259,7 +262,7 @@ def test_first_accelerations_are_wrong_by_what_finite_differences_leave(draw):
     answer = stepped(load_adapter("exudyn"), integrator, model, states)
 
     def first_row():
-        rows = judge_steps(CONTEXT, integrator, model, states, answer).rows
+        rows = rows_of(integrator, model, states, answer)
         return next(row for row in rows if row.quantity == "step_first_acceleration")
 
     first = first_row()
@@ -410,7 +413,7 @@ def test_a_wrong_number_of_a_tree_is_reported_by_its_steps(engine, field):
     answer = stepped(load_adapter(engine), integrator, model, states)
     wrong = replace(model, **{field: getattr(model, field) * (1 + 1e-6) + 1e-6 * (field == "rest")})
     states = [complete_state(wrong, state) for state in states]
-    assert disagreeing(judge_steps(CONTEXT, integrator, wrong, states, answer).rows)
+    assert disagreeing(rows_of(integrator, wrong, states, answer))
 
 
 def test_dampers_between_branches_are_explicit():
@@ -525,16 +528,16 @@ def test_steps_of_a_slide_that_is_held_at_a_pitch_are_compared(name):
     steeper = replace(model, length=np.where(pitched, model.length * (1 + 1e-9), model.length))
     for integrator in methods("mujoco")[-2:]:
         answer = run_step_study("mujoco", integrator, model, states[:2])
-        rows = judge_steps(CONTEXT, integrator, model, states[:2], answer).rows
+        rows = rows_of(integrator, model, states[:2], answer)
         assert {row.verdict for row in rows} == {Verdict.AGREES} and len(rows) > 8, rows
-        assert disagreeing(judge_steps(CONTEXT, integrator, steeper, states[:2], answer).rows)
+        assert disagreeing(rows_of(integrator, steeper, states[:2], answer))
 
 
 def assert_sharp(integrator, model, states, answer, factors):
     """The steps agree, and those of bodies that are heavier by the factors do not."""
-    assert not disagreeing(judge_steps(CONTEXT, integrator, model, states, answer).rows)
+    assert not disagreeing(rows_of(integrator, model, states, answer))
     heavier = replace(model, mass=model.mass * factors)
-    assert disagreeing(judge_steps(CONTEXT, integrator, heavier, states, answer).rows)
+    assert disagreeing(rows_of(integrator, heavier, states, answer))
 
 
 @pytest.mark.parametrize(
