@@ -15,6 +15,7 @@ from tests.helpers.planted_defects import E, M, P, at_identity
 from tests.helpers.planted_steps import (
     CLASSICAL,
     WEIGHTS,
+    Coordinates,
     Step,
     exchanged_halves,
     first_order_quaternion,
@@ -162,13 +163,13 @@ BRANCH_DEFECTS = (
 # -- steps -----------------------------------------------------------------------------------------
 
 
-def euler(system: object, q: Array, v: Array, h: float) -> tuple[Array, Array]:
+def euler(system: object, q: Array, v: Array, h: float) -> Coordinates:
     """The declared semi-implicit step."""
     v = v + h * system.acceleration(q, v)  # type: ignore[attr-defined]
     return system.integrate(q, h * v), v  # type: ignore[attr-defined]
 
 
-def rk4(system: object, q: Array, v: Array, h: float) -> tuple[Array, Array]:
+def rk4(system: object, q: Array, v: Array, h: float) -> Coordinates:
     """The declared classical step."""
     return runge_kutta(system, q, v, h, CLASSICAL, WEIGHTS)
 
@@ -176,7 +177,7 @@ def rk4(system: object, q: Array, v: Array, h: float) -> tuple[Array, Array]:
 def wrong_when(condition: Callable[[object, Array, Array, float], bool], wrong: Step, right: Step) -> Step:
     """A wrong step in a branch."""
 
-    def step(system: object, q: Array, v: Array, h: float) -> tuple[Array, Array]:
+    def step(system: object, q: Array, v: Array, h: float) -> Coordinates:
         return (wrong if condition(system, q, v, h) else right)(system, q, v, h)
 
     return step

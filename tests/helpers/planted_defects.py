@@ -21,8 +21,10 @@ from plumbline.model.kinematics import (
 )
 from tests.helpers.planting import (
     Answers,
+    Corrections,
     Defect,
     Inputs,
+    Term,
     added_gamma,
     added_moment,
     answer_change,
@@ -144,7 +146,7 @@ def short_run(simulate: Any, model: Model, state: State, times: Array, i: Integr
 # --- of one body, or in a rare branch ------------------------------------------------------------
 
 
-def moment_of_force_at(point: str, force: Callable[[Model, State], Array]) -> Callable[[Model, State], Array]:
+def moment_of_force_at(point: str, force: Term) -> Term:
     """s × Aᵀ F: the moment of a world force that acts at a point of the body."""
     return lambda m, s: np.cross(getattr(m, point)[: m.n], to_body(s, force(m, s)))
 
@@ -170,7 +172,7 @@ def relative_rates(_: Model, state: State) -> Array:
     return state.omega - to_body(state, np.concatenate([np.zeros((1, 3)), absolute[:-1]]))
 
 
-def drag_from(kind: str, rate: Callable[[Model, State], Array]) -> Inputs:
+def drag_from(kind: str, rate: Term) -> Inputs:
     """The drag force −c_t v or moment −c_r ω′ of another velocity."""
     drag = f"drag_{kind}"
     return model_change(
@@ -212,7 +214,7 @@ def rod_gamma_after_balls(model: Model, state: State) -> Array:
     return np.array(rows)
 
 
-def proximal_gamma(k: int) -> Callable[[Model, State], Array]:
+def proximal_gamma(k: int) -> Term:
     """−(what ω × (ω × s) of body k gives to γ of its own ball joint)."""
 
     def defect(model: Model, state: State) -> Array:
@@ -614,7 +616,7 @@ def both_changes(first: Answers | None, second: Answers) -> Answers:
     return lambda m, states, reported: second(m, states, first(m, states, reported) if first else reported)
 
 
-def recomputed_reaction(order: int) -> Callable[[Model, State, StateQuantities], dict[str, Any]]:
+def recomputed_reaction(order: int) -> Corrections:
     """Reactions from the accelerations, summed from the free end (1) or as total less the rest (-1)."""
 
     def change(m: Model, s: State, a: StateQuantities) -> dict[str, Any]:
@@ -626,7 +628,7 @@ def recomputed_reaction(order: int) -> Callable[[Model, State, StateQuantities],
     return change
 
 
-def recomputed_sums(order: int) -> Callable[[Model, State, StateQuantities], dict[str, Any]]:
+def recomputed_sums(order: int) -> Corrections:
     """Energies and momentum summed anew, bodies in the given order."""
 
     def change(m: Model, s: State, _: StateQuantities) -> dict[str, Any]:

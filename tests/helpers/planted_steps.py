@@ -19,7 +19,8 @@ from plumbline.model.datatypes import Array, Integrator, Model, State, Trajector
 from plumbline.model.kinematics import quaternion_rate
 from tests.helpers.planting import Defect, replaced_by, run_as, run_with_clock
 
-Step = Callable[[Any, Array, Array, float], tuple[Array, Array]]  # system, q, v, h -> q, v
+Coordinates = tuple[Array, Array]  # q, v
+Step = Callable[[Any, Array, Array, float], Coordinates]  # system, q, v, h
 Quadrature = Literal["", "a is the acceleration", "sign of alpha_m", "rates by Euler"]
 
 
@@ -73,24 +74,24 @@ def inverse_differential(theta: Array, v: Array, terms: int = 9) -> Array:
 # -- steps ---------------------------------------------------------------------------------------
 
 
-def exchanged_halves(system: Any, q: Array, v: Array, h: float) -> tuple[Array, Array]:
+def exchanged_halves(system: Any, q: Array, v: Array, h: float) -> Coordinates:
     """Positions first, by the old velocity; then velocities, by the new accelerations."""
     q = system.integrate(q, h * v)
     return q, v + h * system.acceleration(q, v)
 
 
-def stale_velocity(system: Any, q: Array, v: Array, h: float) -> tuple[Array, Array]:
+def stale_velocity(system: Any, q: Array, v: Array, h: float) -> Coordinates:
     """Explicit Euler: positions by the old velocity."""
     return system.integrate(q, h * v), v + h * system.acceleration(q, v)
 
 
-def mean_velocity(system: Any, q: Array, v: Array, h: float) -> tuple[Array, Array]:
+def mean_velocity(system: Any, q: Array, v: Array, h: float) -> Coordinates:
     """Positions by the mean of the old and the new velocity."""
     new = v + h * system.acceleration(q, v)
     return system.integrate(q, h * (v + new) / 2), new
 
 
-def first_order_quaternion(system: Any, q: Array, v: Array, h: float) -> tuple[Array, Array]:
+def first_order_quaternion(system: Any, q: Array, v: Array, h: float) -> Coordinates:
     """Quaternions by p + h ṗ, normalised."""
     v = v + h * system.acceleration(q, v)
     p, w = system.quaternions(q), h * v.reshape(-1, 3) / 2
@@ -101,7 +102,7 @@ def first_order_quaternion(system: Any, q: Array, v: Array, h: float) -> tuple[A
     return system.configuration(moved / np.linalg.norm(moved, axis=1, keepdims=True)), v
 
 
-def reused_acceleration(system: Any, q: Array, v: Array, h: float) -> tuple[Array, Array]:
+def reused_acceleration(system: Any, q: Array, v: Array, h: float) -> Coordinates:
     """The classical method whose first slope is the last one of the step before, never computed again."""
     rate, a = v, getattr(system, "last", None)
     a = system.acceleration(q, v) if a is None else a
@@ -115,7 +116,7 @@ def reused_acceleration(system: Any, q: Array, v: Array, h: float) -> tuple[Arra
     return system.integrate(q, theta), v + change
 
 
-def two_half_steps(system: Any, q: Array, v: Array, h: float) -> tuple[Array, Array]:
+def two_half_steps(system: Any, q: Array, v: Array, h: float) -> Coordinates:
     """Two semi-implicit steps of half the size."""
     for _ in range(2):
         v = v + h / 2 * system.acceleration(q, v)
@@ -123,14 +124,14 @@ def two_half_steps(system: Any, q: Array, v: Array, h: float) -> tuple[Array, Ar
     return q, v
 
 
-def velocity_verlet(system: Any, q: Array, v: Array, h: float) -> tuple[Array, Array]:
+def velocity_verlet(system: Any, q: Array, v: Array, h: float) -> Coordinates:
     """Kick, drift, kick; the second kick by the accelerations at the half-way velocity."""
     half = v + h / 2 * system.acceleration(q, v)
     q = system.integrate(q, h * half)
     return q, half + h / 2 * system.acceleration(q, half)
 
 
-def last_body_stale(system: Any, q: Array, v: Array, h: float) -> tuple[Array, Array]:
+def last_body_stale(system: Any, q: Array, v: Array, h: float) -> Coordinates:
     """The last joint's position by the old velocity, all others semi-implicitly."""
     new = v + h * system.acceleration(q, v)
     return system.integrate(q, h * np.concatenate([new[:-3], v[-3:]])), new
@@ -139,9 +140,9 @@ def last_body_stale(system: Any, q: Array, v: Array, h: float) -> tuple[Array, A
 def runge_kutta(
     system: Any, q: Array, v: Array, h: float, a: tuple[tuple[float, ...], ...], b: tuple[float, ...],
     terms: int = 9,
-) -> tuple[Array, Array]:  # fmt: skip
+) -> Coordinates:  # fmt: skip
     """An explicit Runge-Kutta step in exponential coordinates; ``terms`` of dexp⁻¹ after the identity."""
-    k: list[tuple[Array, Array]] = []
+    k: list[Coordinates] = []
     for row in a:
         theta = sum((h * w * s[0] for w, s in zip(row, k, strict=True)), np.zeros_like(v))
         rate = sum((h * w * s[1] for w, s in zip(row, k, strict=True)), v)
@@ -166,7 +167,7 @@ wrong_weights = partial(runge_kutta, a=CLASSICAL, b=(1 / 6, 2.001 / 6, 1.999 / 6
 def implicit(
     system: Any, q: Array, v: Array, h: float,
     change: Callable[[Array], Array] = lambda D: D, moves_by_old: bool = False,
-) -> tuple[Array, Array]:  # fmt: skip
+) -> Coordinates:  # fmt: skip
     """v + h (M + hD)⁻¹ M a with D = −∂(M a)/∂v altered; f is quadratic in v, so differences are exact."""
     a, M = system.acceleration(q, v), system.mass_matrix()
     columns = [
@@ -242,7 +243,7 @@ def _mujoco_run(step: Step) -> Callable[..., Trajectory]:
 def _pinocchio_step(step: Step) -> Step:
     """The step on Pinocchio's system, whose quaternions are scalar last."""
 
-    def wrapped(system: Any, q: Array, v: Array, h: float) -> tuple[Array, Array]:
+    def wrapped(system: Any, q: Array, v: Array, h: float) -> Coordinates:
         system.quaternions = lambda q: np.roll(q.reshape(-1, 4), 1, axis=1)
         system.configuration = lambda p: np.roll(p, -1, axis=1).ravel()
         return step(system, q, v, h)

@@ -56,6 +56,9 @@ Inputs = Callable[[Model, State], tuple[Model, State]]
 Answers = Callable[[Model, list[State], list[StateQuantities]], list[StateQuantities]]
 Run = Callable[[Callable[..., Trajectory], Model, State, Array, Integrator, float], Trajectory]
 Patch = Callable[[], AbstractContextManager[Any]]
+Term = Callable[[Model, State], Array]
+Fields = Callable[[Model, State], dict[str, Array]]
+Corrections = Callable[[Model, State, StateQuantities], dict[str, Any]]
 EVERY_JOINT = "every joint"  # the mechanism of `every_joint`
 RANDOM_LOOP = "random loop"  # in space, closed by a universal joint
 ELEMENTS = ("armature", "damping", "stiffness", "effort", "springs")
@@ -261,7 +264,7 @@ def number_change(
     return alter
 
 
-def model_change(change: Callable[[Model, State], dict[str, Array]]) -> Inputs:
+def model_change(change: Fields) -> Inputs:
     """Fields of the model replaced, depending on the state or not."""
 
     def alter(model: Model, state: State) -> tuple[Model, State]:
@@ -271,7 +274,7 @@ def model_change(change: Callable[[Model, State], dict[str, Array]]) -> Inputs:
     return alter
 
 
-def state_change(change: Callable[[Model, State], dict[str, Array]]) -> Inputs:
+def state_change(change: Fields) -> Inputs:
     """Minimal coordinates of the state replaced."""
     return lambda model, state: (model, complete_state(model, replace(state, **change(model, state))))
 
@@ -283,12 +286,12 @@ def with_row(k: int, right: Array, wrong: Array) -> Array:
     return out
 
 
-def body_change(k: int, **change: Callable[[Model, State], Array]) -> Inputs:
+def body_change(k: int, **change: Term) -> Inputs:
     """Fields of the model replaced in the row of one body."""
     return model_change(lambda m, s: rows_changed(k, m, {name: f(m, s) for name, f in change.items()}))
 
 
-def body_state_change(k: int, **change: Callable[[Model, State], Array]) -> Inputs:
+def body_state_change(k: int, **change: Term) -> Inputs:
     """Minimal coordinates of one body replaced."""
     return state_change(lambda m, s: rows_changed(k, s, {name: f(m, s) for name, f in change.items()}))
 
@@ -303,7 +306,7 @@ def when(condition: Callable[[Model, State], bool], change: Inputs) -> Inputs:
     return lambda m, s: change(m, s) if condition(m, s) else (m, s)
 
 
-def added_moment(extra: Callable[[Model, State], Array], *bodies: int) -> Inputs:
+def added_moment(extra: Term, *bodies: int) -> Inputs:
     """A moment (N, 3) in body axes on some bodies, or on all."""
 
     def change(model: Model, state: State) -> dict[str, Array]:
@@ -322,7 +325,7 @@ def turned_by(*vector: float) -> Callable[[Array], Array]:
 # --- ways to alter what it returns ------------------------------------------------------------------
 
 
-def recomputed(change: Callable[[Model, State, StateQuantities], dict[str, Any]]) -> Answers:
+def recomputed(change: Corrections) -> Answers:
     """Quantities recomputed from model, state and the other answers."""
     return lambda m, states, reported: [
         replace(a, **change(m, s, a)) for s, a in zip(states, reported, strict=True)
@@ -441,7 +444,7 @@ def wrong_gamma(change: Callable[[Model, State, direct.ConstraintRows], Array]) 
     return replaced_by("reference_impl.direct:constraint_rows", make)
 
 
-def added_gamma(extra: Callable[[Model, State], Array]) -> Patch:
+def added_gamma(extra: Term) -> Patch:
     """Something (c,) added to γ of a chain's rows."""
     return wrong_gamma(lambda m, s, rows: rows.gamma + extra(m, with_joint_coordinates(m, s)))
 
