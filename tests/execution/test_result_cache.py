@@ -27,11 +27,11 @@ def quiet(*_):
     pass
 
 
-def hash_anew(task):
-    """The hash of a task with the files and variables of now."""
+def hash_anew(python=""):
+    """The hash of a task of an environment, with the files and variables of now."""
     environment_fingerprint.environment_fingerprint.cache_clear()
     try:
-        return task_hash(task)
+        return task_hash(Task("a", quiet, python=python))
     finally:
         environment_fingerprint.environment_fingerprint.cache_clear()
 
@@ -105,11 +105,11 @@ def test_a_rebuilt_file_of_a_package_that_lies_elsewhere_is_noticed(tmp_path, li
 
 def test_the_answers_of_another_version_depend_on_its_environment(tmp_path):
     site = make_environment(tmp_path)
-    task, hashes = Task("a", quiet, python=str(tmp_path / "bin" / "python")), set()
+    hashes = set()
     for text in ("x = 1\n", "x = 2\n"):
         (site / "engine" / "__init__.py").write_text(text)
-        hashes.add(hash_anew(task))
-    assert len(hashes) == 2 and hash_anew(replace(task, python="")) not in hashes
+        hashes.add(hash_anew(str(tmp_path / "bin" / "python")))
+    assert len(hashes) == 2 and hash_anew() not in hashes
 
 
 @pytest.mark.parametrize("file", ["engine-1.0.dist-info/RECORD", "engine/libengine.so.4", "mujoco.py"])
@@ -120,7 +120,7 @@ def test_another_installation_has_other_cells(tmp_path, monkeypatch, file):
     hashes = set()
     for size in (1, 2):
         (tmp_path / file).write_text("x" * size)
-        hashes.add(hash_anew(Task("a", quiet)))
+        hashes.add(hash_anew())
     assert len(hashes) == 2
 
 
@@ -129,32 +129,32 @@ def test_another_processor_has_other_cells(monkeypatch):
     hashes = set()
     for features in ("flags: fma", "flags: fma avx512f"):
         monkeypatch.setattr(environment_fingerprint, "processor_features", lambda features=features: features)
-        hashes.add(hash_anew(Task("a", quiet)))
+        hashes.add(hash_anew())
     assert len(hashes) == 2
 
 
 @pytest.mark.parametrize("name", ["BAD", "MUJOCO_DEBUG", "LD_LIBRARY_PATH", "OPENBLAS_CORETYPE", "x"])
 def test_a_variable_that_an_engine_can_read_changes_the_hash(monkeypatch, name):
-    before = hash_anew(Task("a", quiet))
+    before = hash_anew()
     monkeypatch.setenv(name, "/nan")
-    assert hash_anew(Task("a", quiet)) != before
+    assert hash_anew() != before
 
 
 def test_a_file_that_a_variable_names_changes_the_hash(monkeypatch, tmp_path):
     for name, path in (("ENGINE_SETTINGS", tmp_path / "a.yaml"), ("LD_LIBRARY_PATH", tmp_path)):
         (tmp_path / "a.yaml").write_text("x: 1\n")
         monkeypatch.setenv(name, f"/usr/lib:{path}")
-        before = hash_anew(Task("a", quiet))
+        before = hash_anew()
         patch_keeping_size_and_time(tmp_path / "a.yaml")
-        assert hash_anew(Task("a", quiet)) != before
+        assert hash_anew() != before
         monkeypatch.delenv(name)
 
 
 def test_another_terminal_has_the_same_cells(monkeypatch):
-    before = hash_anew(Task("a", quiet))
+    before = hash_anew()
     for name in ("TERM", "COLUMNS", "SSH_CONNECTION", "SHLVL", "GITHUB_RUN_ID", "PLUMBLINE_CACHE", "TMPDIR"):
         monkeypatch.setenv(name, "/another")
-    assert hash_anew(Task("a", quiet)) == before
+    assert hash_anew() == before
 
 
 def variables_of_worker():
