@@ -36,9 +36,17 @@ def test_the_reason_of_an_inconclusive_row_states_the_measured_bound():
     assert "at 3 of 3 states and in 6 of 6 comparisons" in row.reason and row.extra["compared_states"] == 0.0
 
 
-def loosened(bounds, *states, body=slice(None), by=1e6):
+def right_answers():
+    return load_adapter("reference").evaluate(MODEL, STATES)
+
+
+def sharp_bounds():
+    return [state_rounding_bound(MODEL, s) for s in STATES]
+
+
+def loosened(*states, body=slice(None), by=1e6):
     """The bounds with those of the acceleration at some states too loose, or not a number."""
-    found = list(bounds)
+    found = sharp_bounds()
     for state in states:
         acceleration = found[state].acceleration.copy()
         acceleration[body] *= by
@@ -51,8 +59,7 @@ def loosened(bounds, *states, body=slice(None), by=1e6):
     ("body", "by"), [(slice(None), 1e6), (slice(None), np.nan), (1, np.nan), (1, np.inf), (0, 1e6)]
 )
 def test_each_state_counts_only_with_its_own_bound(loose, verdict, body, by):
-    sharp = [state_rounding_bound(MODEL, s) for s in STATES]
-    row = judge_shifted_answers((1, 0, 0.5), bounds=loosened(sharp, *loose, body=body, by=by)).rows[0]
+    row = judge_shifted_answers((1, 0, 0.5), bounds=loosened(*loose, body=body, by=by)).rows[0]
     assert row.verdict == verdict, row.reason
     assert f"at {len(loose)} of 3 states and in " in row.reason
     assert row.extra["compared_states"] == 3 - len(loose) and row.ratio == pytest.approx(0.5, rel=ADDED)
@@ -62,12 +69,11 @@ def test_each_state_counts_only_with_its_own_bound(loose, verdict, body, by):
 
 @pytest.mark.parametrize("by", [1e6, np.nan])
 def test_a_disagreement_in_any_state_decides_whatever_the_other_bounds_are(by):
-    sharp = [state_rounding_bound(MODEL, s) for s in STATES]
-    bounds = loosened(sharp, 0, 1, 2, body=1, by=by)
+    bounds = loosened(0, 1, 2, body=1, by=by)
     assert judge_shifted_answers((1, 0, 1.5), bounds=bounds).rows[0].verdict == "disagrees", (
         "a sharp body of a loose state"
     )
-    assert judge_shifted_answers((2, 1, 1.5), bounds=loosened(sharp, 0, 1, 2)).rows[0].verdict == "disagrees"
+    assert judge_shifted_answers((2, 1, 1.5), bounds=loosened(0, 1, 2)).rows[0].verdict == "disagrees"
 
 
 @pytest.mark.parametrize("drag", [False, True])
@@ -89,8 +95,7 @@ def test_implicitfast_is_an_alias_of_euler_only_without_drag(drag):
 
 def judge_shifted_answers(*off, bounds=None, **evaluation):
     """Findings on answers that are ``off`` by so many bounds of acceleration: (state, body, bounds)."""
-    right = load_adapter("reference").evaluate(MODEL, STATES)
-    bounds = bounds or [state_rounding_bound(MODEL, s) for s in STATES]
+    right, bounds = right_answers(), bounds or sharp_bounds()
     reported = list(right)
     for state, body, by in off:
         shift = np.zeros((2, 3))
@@ -101,7 +106,7 @@ def judge_shifted_answers(*off, bounds=None, **evaluation):
 
 
 def test_the_row_is_of_the_body_that_is_worst_by_its_own_bound():
-    bounds = [state_rounding_bound(MODEL, s) for s in STATES]
+    bounds = sharp_bounds()
     # The larger error in m/s² is elsewhere: body 1 of state 0 gets a bound a thousand times as wide.
     wide = bounds[0].acceleration * [1e3, 1.0]
     bounds[0] = replace(bounds[0], acceleration=wide)
@@ -149,7 +154,7 @@ def test_one_bound_is_the_border(by, expected):
 
 
 def test_quantities_that_an_engine_does_not_offer_or_deliver_are_reported():
-    right = load_adapter("reference").evaluate(MODEL, STATES)
+    right = right_answers()
     less = [*right[:2], replace(right[2], joint_reaction=None)]
     rows = judge_shifted_answers(quantities=less).rows
     (row,) = (row for row in rows if row.quantity == "joint_reaction")
@@ -163,7 +168,7 @@ def test_quantities_that_an_engine_does_not_offer_or_deliver_are_reported():
 
 
 def test_vectors_count_by_their_length_and_matrices_by_their_worst_entry():
-    right = load_adapter("reference").evaluate(MODEL, STATES)
+    right = right_answers()
     matrix = right[0].mass_matrix.copy()
     matrix[0, 1] -= 1.0
     matrix[3, 4] += 0.5
@@ -180,8 +185,7 @@ def test_vectors_count_by_their_length_and_matrices_by_their_worst_entry():
 @pytest.mark.parametrize(("share", "verdict"), [(0.5, "disagrees"), (1.5, "agrees"), (1e6, "unresolved")])
 def test_the_uncertainty_of_a_limit_widens_the_bound_and_is_stated(share, verdict):
     """An extrapolated answer off by two bounds, with an uncertainty of so many bounds."""
-    reported = load_adapter("reference").evaluate(MODEL, STATES)
-    bounds = [state_rounding_bound(MODEL, s) for s in STATES]
+    reported, bounds = right_answers(), sharp_bounds()
     answers = [
         replace(
             a,

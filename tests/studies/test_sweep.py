@@ -46,6 +46,10 @@ def write_sweep_file(folder, text):
     return path
 
 
+def loaded(folder, text=SWEEP_FILE):
+    return sweep_file.load(write_sweep_file(folder, text))
+
+
 def run_sweep(spec, cells, seconds=300.0, progress=lambda *_: None, **engines):
     """The rows of a sweep; descriptions of engines may be given instead of those found here."""
     with WorkerPool(1, Limits(seconds)) as workers:
@@ -54,7 +58,7 @@ def run_sweep(spec, cells, seconds=300.0, progress=lambda *_: None, **engines):
 
 
 def test_the_grid_and_the_draws(tmp_path):
-    spec, cells = sweep_file.load(write_sweep_file(tmp_path, SWEEP_FILE))
+    spec, cells = loaded(tmp_path)
     assert len(cells) == 3 * 2 * spec.count
     assert sorted({cell.values["bodies[0].mass"] for cell in cells}) == pytest.approx([0.5, 1.0, 2.0])
     drawn = [cell.values["bodies[1].proximal[0]"] for cell in cells]
@@ -66,11 +70,9 @@ def test_the_grid_and_the_draws(tmp_path):
         assert cell.scenario.model.proximal[1, 0] == cell.values["bodies[1].proximal[0]"]
         assert cell.scenario.state.omega[1, 2] == cell.values["bodies[1].angular_velocity[2]"]
         assert cell.scenario.duration == 0.25
-    again = sweep_file.load(write_sweep_file(tmp_path, SWEEP_FILE))[1]
+    again = loaded(tmp_path)[1]
     assert [cell.values for cell in again] == [cell.values for cell in cells]
-    assert [
-        c.values for c in sweep_file.load(write_sweep_file(tmp_path, SWEEP_FILE.replace("7", "8")))[1]
-    ] != [c.values for c in cells]
+    assert [c.values for c in loaded(tmp_path, SWEEP_FILE.replace("7", "8"))[1]] != [c.values for c in cells]
 
 
 def test_a_sweep_runs_and_is_kept(tmp_path):
@@ -94,7 +96,7 @@ def test_a_sweep_runs_and_is_kept(tmp_path):
 def test_values_that_make_no_pendulum_are_a_cell_with_a_reason(tmp_path):
     vary = "vary: {'bodies[0].mass': {values: [-1, 1]}}"
     text = f"schema_version: 1\nscenario: tumbling-rod\n{vary}\nduration: 0.25\n"
-    spec, cells = sweep_file.load(write_sweep_file(tmp_path, text))
+    spec, cells = loaded(tmp_path, text)
     assert cells[0].scenario is None
     rows = run_sweep(spec, cells).to_pylist()
     assert [row["verdict"] for row in rows] == ["unsupported", "agrees"]
@@ -145,7 +147,7 @@ def test_an_engine_too_coarse_to_resolve_a_mistake_is_unresolved(tmp_path):
         SWEEP_FILE.replace("points: 3", "points: 1").replace("[-1, 1]", "[1]").replace("count: 2", "count: 1")
     )
     text = text.replace("mujoco: RK4", "mujoco: Euler") + "step: 0.03125\n"
-    spec, cells = sweep_file.load(write_sweep_file(tmp_path, text))
+    spec, cells = loaded(tmp_path, text)
     _, row = run_sweep(spec, cells).to_pylist()
     assert (row["implementation"], row["integrator"], row["verdict"]) == ("mujoco", "Euler", "unresolved")
     assert row["position_error"] > 0 and row["finest_error"] > 0 and row["attitude_error"] > 0
@@ -170,7 +172,7 @@ def test_a_missing_engine_and_a_truth_that_fails_are_rows(tmp_path):
     text = (
         SWEEP_FILE.replace("points: 3", "points: 1").replace("[-1, 1]", "[1]").replace("count: 2", "count: 1")
     )
-    spec, cells = sweep_file.load(write_sweep_file(tmp_path, text))
+    spec, cells = loaded(tmp_path, text)
     missing = EngineInfo("mujoco", "MuJoCo", "", (), "mujoco is not installed here: No module")
     _, row = run_sweep(spec, cells, mujoco=missing).to_pylist()
     assert (row["verdict"], row["reason"]) == ("not installed", missing.missing)
@@ -186,7 +188,7 @@ def test_a_missing_engine_and_a_truth_that_fails_are_rows(tmp_path):
 def test_mistakes_in_the_file_are_named_with_their_place(tmp_path, old, new, words):
     text = new if old == "FILE" else SWEEP_FILE.replace(old, new)
     with pytest.raises(ScenarioError, match=words):
-        sweep_file.load(write_sweep_file(tmp_path, text))
+        loaded(tmp_path, text)
 
 
 def test_an_integrator_that_the_engine_has_not_is_named_with_its_place(tmp_path):
@@ -203,7 +205,7 @@ def test_a_cell_that_no_step_is_short_enough_for_ends_soon_and_alone(tmp_path):
     vary = "vary: {'gravity[2]': {values: [-9.81, -1.0e20]}}"
     head = "schema_version: 1\nscenario: double-tumbling-balls\n"
     text = f"{head}{vary}\nduration: 0.25\nengines: {{mujoco: RK4}}\n"
-    spec, cells = sweep_file.load(write_sweep_file(tmp_path, text))
+    spec, cells = loaded(tmp_path, text)
     done = []
     with limited_time(20):
         rows = run_sweep(spec, cells, progress=lambda *counts: done.append(counts)).to_pylist()
@@ -226,7 +228,7 @@ def test_a_reference_that_hangs_is_stopped(tmp_path, monkeypatch):
     """A batch that is over its time is tried cell by cell, each with the same limit."""
     monkeypatch.setattr(sweep, "_run_reference_batch", hang)
     text = SWEEP_FILE.replace("engines: {mujoco: RK4}", "").replace("points: 3", "points: 1")
-    spec, cells = sweep_file.load(write_sweep_file(tmp_path, text.replace("count: 2", "count: 1")))
+    spec, cells = loaded(tmp_path, text.replace("count: 2", "count: 1"))
     rows = run_sweep(spec, cells, seconds=1.0).to_pylist()
     assert [(row["verdict"], row["reason"][:23]) for row in rows] == [
         ("failed", "timeout: no answer with")
