@@ -6,7 +6,7 @@ import { superscript, h, ink, number } from "./text.js";
  * @typedef {MotionData["runs"][number]} Run
  * @typedef {[number, number, number, number]} Quat
  * @typedef {{ r: Vec, q: Quat }} Pose
- * @typedef {{ canvas: HTMLCanvasElement, note: HTMLElement, run: Run, runs: Run[], colour: string }} View
+ * @typedef {{ canvas: HTMLCanvasElement, note: HTMLElement, run: Run, colour: string }} View
  */
 
 /** @param {Quat} q @param {Vec} v @returns {Vec} */
@@ -117,15 +117,13 @@ export function motion(data, o) {
 
   if (m) {
     (m.base[0] ? o.engines : [""]).forEach((engine, k) => { // "": a still of the initial state
-      const runs = m.runs.filter((run) => run.engine === engine);
-      if (!runs.length) return;
-      const run = runs.reduce((a, b) => (final(b) < final(a) ? b : a));
+      const run = m.runs.find((one) => one.engine === engine);
+      if (!run) return;
       const note = h("span", { class: "off" });
       const canvas = h("canvas", { tabindex: 0, role: "img" });
       /** @type {View} */
-      const view = { canvas, note, run, runs, colour: `--c${k % 8}` };
-      const choice = h("select", { "aria-label": `Integrator of ${name(engine)}`, change: () => { view.run = runs[Number(choice.value)]; label(view); draw(view); } }, runs.map((one, i) => h("option", { value: i, selected: one === run }, one.integrator)));
-      stage.append(h("figure", { class: engine === o.engine ? "mine" : "" }, h("figcaption", {}, h("b", { title: name(engine) }, name(engine)), runs.length > 1 ? choice : h("span", {}, run.integrator)), canvas, h("figcaption", {}, note)));
+      const view = { canvas, note, run, colour: `--c${k % 8}` };
+      stage.append(h("figure", { class: engine === o.engine ? "mine" : "" }, h("figcaption", {}, h("b", { title: name(engine) }, name(engine)), h("span", {}, run.integrator)), canvas, h("figcaption", {}, note)));
       label(view);
       orbit(canvas);
       views.push(view);

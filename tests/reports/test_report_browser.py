@@ -476,15 +476,17 @@ def test_a_table_of_four_integrators_fits_and_a_cut_one_fades(open_page, single)
         page.wait_for_function(fade, arg=[table.element_handle(), edge])
 
 
-def test_pictures_of_the_motion_are_level_and_keep_their_controls(open_page):
+def test_pictures_of_the_motion_are_level_and_name_engine_and_integrator(open_page):
     page = open_page(link(scenario="double-two-rods", engine="mujoco"))
     page.set_viewport_size({"width": 1280, "height": 800})
     tops = {round(canvas.bounding_box()["y"], 1) for canvas in page.locator(".stage canvas").all()}
     assert len(tops) == 1
-    assert page.locator(".stage select").count() == 2
+    engines = ["The notes", "MuJoCo", "Pinocchio", "Exudyn", "Exudyn, kinematic tree"]
+    assert page.locator(".stage b").all_text_contents() == engines
+    assert page.locator(".stage b + span").all_text_contents() == ["RK4", "RK4", "RK4", "midpoint", "RK4"]
     for figure in page.locator(".stage figure").all():
         box = figure.bounding_box()
-        for part in figure.locator("select, span, b").all():
+        for part in figure.locator("span, b").all():
             inner = part.bounding_box()
             assert inner["x"] + inner["width"] <= box["x"] + box["width"] + 0.5
 
