@@ -421,6 +421,7 @@ class RegularMotion(NamedTuple):
 
     end: float  # s
     is_singular: bool  # whether it ends before the last sample
+    singular_value: float  # at the end
 
 
 def regular_motion(model: Model, state: State, times: Array) -> RegularMotion:
@@ -465,10 +466,10 @@ def regular_motion(model: Model, state: State, times: Array) -> RegularMotion:
             t, value, stride = float(grid[-1]), float(values[-1]), min(2 * stride, longest)
             system, here = _end_of(run, model)
         elif stride < SHORTEST_STRIDE * interval:
-            return RegularMotion(t, True)
+            return RegularMotion(t, True, value)
         else:
             stride /= 2
-    return RegularMotion(t, value < MIN_MOTION_SINGULAR_VALUE)
+    return RegularMotion(t, value < MIN_MOTION_SINGULAR_VALUE, value)
 
 
 def resolved_motion_end(model: Model, state: State, last: float, step: float) -> float:
