@@ -90,12 +90,13 @@ def random_states(model: Model, count: int, seed: int) -> list[State]:
     u, udot = (np.where(model.rods[:, None], x, 0.0) for x in (u, cross(udot, u)))
     free = model.free[:, None]
     x, xdot, r, v = (np.zeros((count, model.n, size)) for size in (model.columns, model.columns, 3, 3))
+    used = np.arange(model.columns) < np.array([[len(kind.motions)] for kind in model.kinds])
     for k in range(wanted if has_coordinates else 0):
         for i, kind in enumerate(model.kinds):
             for j, (motion, _) in enumerate(kind.motions):
                 x[k, i, j] = rng.uniform(-3, 3) if motion == "turn" else rng.normal()
         spread = own_rate * 10 ** rng.uniform(-1.0, np.log10(4.0))
-        xdot[k] = spread * rng.normal(size=xdot[k].shape)
+        xdot[k] = np.where(used, spread * rng.normal(size=used.shape), 0.0)
         r[k], v[k] = (np.where(free, size * rng.normal(size=r[k].shape), 0.0) for size in (1.0, spread))
     states = complete_state(model, State(p, omega, u, udot, r, v, x, xdot)[:wanted])
     return [states[k] for k in range(wanted)]

@@ -23,3 +23,13 @@ def test_a_run_of_its_file_has_the_states_of_a_night_among_others(scenario):
     for one, other in zip(few, many, strict=False):
         for name, values in vars(one).items():
             np.testing.assert_array_equal(values, getattr(other, name), err_msg=name)
+
+
+@pytest.mark.parametrize("scenario", CASES, ids=lambda scenario: scenario.name)
+def test_joints_have_no_coordinates_or_rates_beyond_their_own(scenario):
+    """Rounding bounds take every number of a state for a coordinate or a rate."""
+    for state in states_of(scenario, 3):
+        for k, kind in enumerate(scenario.model.kinds[: scenario.model.n]):
+            beyond = slice(len(kind.motions), None)
+            assert not np.any(state.x[k, beyond])
+            assert not np.any(state.xdot[k, beyond])
