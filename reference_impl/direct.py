@@ -189,17 +189,20 @@ class DirectSystem:
         solution[self._order] = y * scale
         return solution, joints, elements
 
-    def solve_with_dense_factors(self, *motion: *Motion) -> Solution:
+    def solve_with_dense_factors(
+        self, *motion: *Motion, x: Float[Array, "joints coordinates"] | None = None
+    ) -> Solution:
         """Solve (N5) by dense factors of the assembled S, an independent way to the x of `solve`.
 
         Args:
             motion: r, p, ṙ and ṗ.
+            x: as for `solve`.
 
         Returns:
             As `solve`.
 
         """
-        values, b, joints, elements = self._entries(motion, None)
+        values, b, joints, elements = self._entries(motion, x)
         return self._solution_from_unknowns(motion[1], solve_dense(self._dense(values), b), joints, elements)
 
     def _loop_unknowns(

@@ -10,6 +10,8 @@ from plumbline.model.kinematics import (
     complete_state,
     velocity_jacobian,
 )
+from plumbline.truth.rounding_bound import state_rounding_bound
+from tests.helpers.catalogue import catalogue_scenario
 from tests.helpers.random_chains import random_chain
 
 
@@ -48,6 +50,19 @@ def test_a_singular_model_fails_with_its_cause():
         Reference().evaluate(thin_body, [state])
     with pytest.raises(EngineFailure, match="inertia of body 1 is singular"):
         Reference().simulate(thin_body, state, np.array([0.0, 1.0]), "dop853", 1e-6)
+
+
+@pytest.mark.parametrize("option", Reference.options)
+@pytest.mark.parametrize("name", ["sprung-ball", "tree-of-seven-sprung", "flyball-governor"])
+def test_other_ways_to_solve_take_account_of_elements_and_loops(option, name):
+    """Each answer is within the bound, and so their difference within two."""
+    scenario = catalogue_scenario(name)
+    usual, other = (
+        engine.evaluate(scenario.model, [scenario.state])[0]
+        for engine in (Reference(), Reference().with_option(option))
+    )
+    allowed = 2 * state_rounding_bound(scenario.model, scenario.state).acceleration
+    assert np.all(np.linalg.norm(usual.acceleration - other.acceleration, axis=1) <= allowed)
 
 
 @pytest.mark.full
