@@ -18,7 +18,7 @@ from plumbline.measurements.order_and_limit import (
     romberg,
     tightest_tolerance_limit,
 )
-from plumbline.measurements.refinement_study import run_samples
+from plumbline.measurements.refinement_study import run_samples, scaled_states
 from plumbline.model.datatypes import Array, Float, Integrator, Model, Trajectory
 from plumbline.model.invariants import (
     MOTION_UNITS,
@@ -76,10 +76,7 @@ class RefinementAnalysis:
         self.invariant_scales = invariant_scales(model, truth.trajectory, truth.length)
         # Positions alone may converge faster than the method: symplectic Euler from a state without
         # torque is a leapfrog in r, and shows its order 1 in ṙ only.
-        length, speed = truth.length, self.invariant_scales["gap_rate"]
-        self.scaled_states = [
-            np.concatenate([a / length, b / speed], axis=-1) for a, b in zip(r, v, strict=True)
-        ]
+        self.scaled_states = scaled_states(r, v, truth.length, self.invariant_scales["gap_rate"])
         self.invariant_drifts = [None if t is None else compute_invariants(model, t) for t in trajectories]
         # The equations of an implicit step are solved to a tolerance: independent errors of so many steps add
         # up like a random walk.

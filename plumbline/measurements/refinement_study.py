@@ -58,6 +58,22 @@ def run_refinement_study(
     return engine_calls.run_refinement(engine, integrator, model, state, times, steps, is_resolved)
 
 
+def scaled_states(
+    r: Sequence[Float[Array, "samples bodies 3"]],
+    v: Sequence[Float[Array, "samples bodies 3"]],
+    length: float,
+    speed: float,
+) -> list[Float[Array, "samples bodies 6"]]:
+    """Put positions and velocities of each run side by side, over their scales.
+
+    Args:
+        length: scale of positions [m].
+        speed: that of velocities [m/s]; 0 where nothing moves, and every scale is as good.
+
+    """
+    return [np.concatenate([a / length, b / (speed or 1.0)], axis=-1) for a, b in zip(r, v, strict=True)]
+
+
 def is_resolved(model: Model, integrator: Integrator, runs: Sequence[RefinementRun]) -> bool:
     """Return whether order and limits are resolved, so that a finer step could lower no bound by much.
 
@@ -76,9 +92,9 @@ def is_resolved(model: Model, integrator: Integrator, runs: Sequence[RefinementR
     finest, length = trajectories[-1], float(np.sum(stretched_length(model)))
     scales = invariant_scales(model, finest, length)
     r, p, v = (run_samples(after_failures, name) for name in "rpv")
-    speed = scales["gap_rate"]
-    scaled = [np.concatenate([a / length, b / speed], axis=-1) for a, b in zip(r, v, strict=True)]
-    order = observed_order(scaled, RUN_ROUNDING / 8, integrator.order)
+    order = observed_order(
+        scaled_states(r, v, length, scales["gap_rate"]), RUN_ROUNDING / 8, integrator.order
+    )
     is_declared = order.is_asymptotic and abs((order.value or 0.0) - integrator.order) <= ORDER_MARGIN
     if not (is_declared or order.is_at_rounding_floor):
         return False

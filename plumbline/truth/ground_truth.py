@@ -149,7 +149,10 @@ def motion_truth(
     # what is free or slides leaves the stretched mechanism
     length = max(length, float(np.max(np.linalg.norm(truth.trajectory.r, axis=-1))))
     scales = motion_scales(model, truth.trajectory, length)
-    excess = np.max([truth.uncertainty[q] / (scales[q] * RUN_ROUNDING * growth) for q in scales], axis=0)
+    off = np.array([truth.uncertainty[q] for q in scales])
+    explained = np.array([scales[q] * RUN_ROUNDING * growth for q in scales])
+    with np.errstate(divide="ignore"):  # where nothing moves nothing is explained, and 0 need not be
+        excess = np.max(np.divide(off, explained, out=np.zeros_like(off), where=off != 0), axis=0)
     # not a number: one of them is not finite
     worst, differ = int(np.argmax(excess)), not np.all(excess <= 1)
     return MotionTruth(

@@ -13,10 +13,16 @@ from plumbline.engines.engine_calls import RefinementStudy, run_refinement
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.trajectory_level import judge_trajectory
 from plumbline.measurements import refinement_study
-from plumbline.measurements.order_and_limit import refinement_resolutions
-from plumbline.measurements.refinement_study import MIN_RUNS, STOP_MARGIN, is_resolved, run_refinement_study
+from plumbline.measurements.order_and_limit import observed_order, refinement_resolutions
+from plumbline.measurements.refinement_study import (
+    MIN_RUNS,
+    STOP_MARGIN,
+    is_resolved,
+    run_refinement_study,
+    scaled_states,
+)
 from plumbline.model.datatypes import Integrator
-from plumbline.truth.ground_truth import motion_truth
+from plumbline.truth.ground_truth import RUN_ROUNDING, motion_truth
 from tests.helpers.catalogue import catalogue_scenario
 from tests.judging.test_trajectory_verdicts import (
     METHOD,
@@ -171,6 +177,13 @@ def test_sampled_rates_that_are_scaled_late_are_reported():
         rows = judge_trajectory(WHO, s.model, truth, integrator, RefinementStudy(runs, None)).rows
         wrong[name] = {r.quantity for r in rows if r.level == "trajectory" and r.verdict == "disagrees"}
     assert wrong == {"as sampled": set(), "scaled": {"velocity_limit", "angular_velocity_limit"}}
+
+
+@pytest.mark.parametrize(("drift", "is_rounding"), [(0.0, True), (1e-9, False)])
+def test_runs_of_what_nothing_moves_differ_by_rounding_unless_they_move(drift, is_rounding):
+    r = np.broadcast_to([0.1, 0.2, -0.3], (9, 1, 3))
+    runs = scaled_states([r] * 4, [drift * k + 0 * r for k in range(4)], 0.5, 0.0)
+    assert observed_order(runs, RUN_ROUNDING / 8, 4).is_at_rounding_floor is is_rounding
 
 
 def test_the_rule_cannot_see_the_truth():

@@ -202,6 +202,18 @@ def test_a_truth_that_is_not_a_number_is_in_doubt(ball, name):
         assert motion_truth(model, at, TIMES, None).conflict
 
 
+def test_what_nothing_moves_has_a_truth(ball):
+    """Where rates are 0 rounding explains no difference, and there is none; a difference is in doubt."""
+    model, at, _ = ball
+    alone = model.changed(**{name: 0 * getattr(model, name) for name in ("gravity", "force", "moment")})
+    still = complete_state(alone, replace(at, omega=0 * at.omega))
+    sound = motion_truth(alone, still, TIMES, None)
+    assert not sound.conflict and not np.any(sound.uncertainty["velocity"])
+    off = TrajectoryTruth(sound.trajectory, sound.uncertainty | {"velocity": np.full(9, 1e-20)}, "made")
+    with patch("plumbline.truth.trajectory_truth.trajectory_truth", lambda *_: off):
+        assert motion_truth(alone, still, TIMES, None).conflict
+
+
 def test_the_wanted_time_does_not_shrink_with_the_uncertainty(ball):
     *_, sound = ball
     vague = replace(sound, uncertainty=sound.uncertainty | {"position": np.linspace(0, 1e-8, 9)})
