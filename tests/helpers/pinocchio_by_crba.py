@@ -10,5 +10,5 @@ def steps_by_crba(adapter):
     """Let the adapter's chains find accelerations by crba and a dense solve."""
     module = sys.modules[type(adapter).__module__]
     chain = module.PinocchioChain
-    with patch.object(module, "PinocchioChain", lambda model, _, **more: chain(model, "crba", **more)):
+    with patch.object(module, "PinocchioChain", lambda model, _, *more: chain(model, "crba", *more)):
         yield

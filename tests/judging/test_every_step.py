@@ -333,4 +333,4 @@ def test_no_false_alarm_on_random_mechanisms(seed):
             if found and engine == "pinocchio":
                 with steps_by_crba(adapter):
                     found = alarms(adapter, integrator, model, state)
-            assert not found, (seed, engine, integrator.name, found)
+            assert not found, (seed, engine, integrator, found)
