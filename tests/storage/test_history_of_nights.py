@@ -115,7 +115,7 @@ def change_verdicts(path):
     pq.write_table(table.set_column(place, "verdict", pa.array(["accords"] * len(table))), path)
 
 
-SPOILED = [  # file of a night, what is done to it, and what is said of it
+SPOILED = [  # a file of a night, what is done to it, and the message that names it
     ("results.json", lambda path: path.write_text("{"), "results.json: not a results file"),
     ("summary.parquet", lambda path: path.write_bytes(path.read_bytes()[:-8]), "summary.parquet: is damaged"),
     ("summary.parquet", Path.unlink, "summary.parquet"),
