@@ -167,32 +167,28 @@ def _gathered(values: Sequence[Array] | Array, rows: Sequence[Sequence[int]]) ->
     return total / (sum(map(len, rows)) / 3)
 
 
-def _add_points(node_kind: str, body_kind: str, rows: Sequence[Sequence[int]]) -> Callable[[_Items], None]:
+def _add_points(node_kind: str, body_kind: str, rows: Sequence[Sequence[int]], s: _Items) -> None:
     """Mass points of some coordinates each, of which half is the reference."""
-
-    def add(s: _Items) -> None:
-        nodes, points = [], []
-        for one in s.bodies:
-            for own in rows:
-                half = (one.place[own] / 2).tolist()
-                given = {"referenceCoordinates": half, "initialCoordinates": half}
-                nodes.append(s.node(node_kind, initialVelocities=one.velocity[own].tolist(), **given))
-                along = {"referenceRotation": _to_x(own[0])} if rows is LINES else {}
-                points.append(s.body(body_kind, nodes[-1], mass=one.mass, **along))
-        s.mbs.Assemble()
-        call = texts(ITEM, node_kind, body_kind)
-        for quantity, output in (("body_position", "Position"), ("body_velocity", "Velocity")):
-            values = np.array([s.of_body(point, output) for point in points])
-            in_space = np.sum(values.reshape(-1, len(rows), 3), axis=1)  # of lines, which have directions
-            s.add(quantity, call, _gathered(values, rows) if rows is PLANES else in_space)
-        s.add("body_velocity", f"{call} {MASS}", _gathered(s.momenta(points), rows) / s.masses)
-        if rows is SPACE:
-            for output in ("Displacement", "Coordinates"):
-                halves = [s.mbs.GetNodeOutput(node, getattr(Output, output)) for node in nodes]
-                call = f"{ITEM}.{node_kind} OutputVariableType.{output}"
-                s.add("body_position", call, 2 * np.array(halves))
-
-    return add
+    nodes, points = [], []
+    for one in s.bodies:
+        for own in rows:
+            half = (one.place[own] / 2).tolist()
+            given = {"referenceCoordinates": half, "initialCoordinates": half}
+            nodes.append(s.node(node_kind, initialVelocities=one.velocity[own].tolist(), **given))
+            along = {"referenceRotation": _to_x(own[0])} if rows is LINES else {}
+            points.append(s.body(body_kind, nodes[-1], mass=one.mass, **along))
+    s.mbs.Assemble()
+    call = texts(ITEM, node_kind, body_kind)
+    for quantity, output in (("body_position", "Position"), ("body_velocity", "Velocity")):
+        values = np.array([s.of_body(point, output) for point in points])
+        in_space = np.sum(values.reshape(-1, len(rows), 3), axis=1)  # of lines, which have directions
+        s.add(quantity, call, _gathered(values, rows) if rows is PLANES else in_space)
+    s.add("body_velocity", f"{call} {MASS}", _gathered(s.momenta(points), rows) / s.masses)
+    if rows is SPACE:
+        for output in ("Displacement", "Coordinates"):
+            halves = [s.mbs.GetNodeOutput(node, getattr(Output, output)) for node in nodes]
+            call = f"{ITEM}.{node_kind} OutputVariableType.{output}"
+            s.add("body_position", call, 2 * np.array(halves))
 
 
 def _add_created_points(s: _Items) -> None:
@@ -235,74 +231,66 @@ def _angles(one: Body) -> Array:
     return np.asarray(Pose(one.place, one.attitude).forms["xyz"])
 
 
-def _add_rotors(body_kind: str) -> Callable[[_Items], None]:
+def _add_rotors(body_kind: str, s: _Items) -> None:
     """A rotor about each axis: attitudes are their turns in a row, spins their sum."""
-
-    def add(s: _Items) -> None:
-        inertia, rotors = 0.5, []
-        frames = [np.roll(_to_x(axis), 2, axis=1) for axis in range(3)]  # whose third column is the axis
-        for one in s.bodies:
-            for frame, angle, rate in zip(frames, _angles(one), one.spin, strict=True):
-                given = {"initialCoordinates": [float(angle)], "initialVelocities": [float(rate)]}
-                node = s.node("Node1D", **given)
-                rotors.append(s.body(body_kind, node, inertia=inertia, referenceRotation=frame))
-        s.mbs.Assemble()
-        call = texts(ITEM, "Node1D", body_kind)
-        turns = np.reshape([s.of_body(rotor, "RotationMatrix") for rotor in rotors], (-1, 3, 3, 3))
-        s.add_axes(call, [x @ y @ z @ PROBE_TURN for x, y, z in turns @ np.array(frames).swapaxes(-1, -2)])
-        spins = np.reshape([s.of_body(rotor, "AngularVelocity") for rotor in rotors], (-1, 3, 3))
-        s.add("frame_angular_velocity", call, np.sum(spins, axis=1))
-        s.add("frame_angular_velocity", f"{call} {MASS}", _gathered(s.momenta(rotors), LINES) / inertia)
-
-    return add
+    inertia, rotors = 0.5, []
+    frames = [np.roll(_to_x(axis), 2, axis=1) for axis in range(3)]  # whose third column is the axis
+    for one in s.bodies:
+        for frame, angle, rate in zip(frames, _angles(one), one.spin, strict=True):
+            given = {"initialCoordinates": [float(angle)], "initialVelocities": [float(rate)]}
+            node = s.node("Node1D", **given)
+            rotors.append(s.body(body_kind, node, inertia=inertia, referenceRotation=frame))
+    s.mbs.Assemble()
+    call = texts(ITEM, "Node1D", body_kind)
+    turns = np.reshape([s.of_body(rotor, "RotationMatrix") for rotor in rotors], (-1, 3, 3, 3))
+    s.add_axes(call, [x @ y @ z @ PROBE_TURN for x, y, z in turns @ np.array(frames).swapaxes(-1, -2)])
+    spins = np.reshape([s.of_body(rotor, "AngularVelocity") for rotor in rotors], (-1, 3, 3))
+    s.add("frame_angular_velocity", call, np.sum(spins, axis=1))
+    s.add("frame_angular_velocity", f"{call} {MASS}", _gathered(s.momenta(rotors), LINES) / inertia)
 
 
-def _add_plane_bodies(node_kind: str, body_kind: str, turning: str, sliding: str) -> Callable[[_Items], None]:
+def _add_plane_bodies(node_kind: str, body_kind: str, turning: str, sliding: str, s: _Items) -> None:
     """Bodies in the three planes, at half of each velocity, with joints that would hold probe points."""
+    inertia, bodies, points, joints = 0.5, [], [], []
+    for one in s.bodies:
+        reach = one.turn @ one.arm
+        for angle, spin, plane in zip(_angles(one).tolist(), one.spin.tolist(), PLANES, strict=True):
+            turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+            node = s.node(
+                node_kind, initialCoordinates=[*one.place[plane], angle],
+                initialVelocities=[*one.velocity[plane] / 2, spin],
+            )  # fmt: skip
+            bodies.append(s.body(body_kind, node, inertia=inertia, mass=one.mass))
+            points.append([*(turn.T @ reach[plane]), 0.0])
+            here = s.marker("MarkerBodyRigid", bodyNumber=bodies[-1], localPosition=points[-1])
+            there = s.ground([*(one.place + reach)[plane], 0.0])
+            joints.append(s.object(turning, there, here))
+            for along, across in (([0, 1.0, 0], turn[0]), ([1.0, 0, 0], turn[1])):
+                axes = {"axisMarker0": along, "normalMarker1": [*across, 0.0]}
+                joints.append(s.object(sliding, there, here, **axes))
+    s.mbs.Assemble()
 
-    def add(s: _Items) -> None:
-        inertia, bodies, points, joints = 0.5, [], [], []
-        for one in s.bodies:
-            reach = one.turn @ one.arm
-            for angle, spin, plane in zip(_angles(one).tolist(), one.spin.tolist(), PLANES, strict=True):
-                turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-                node = s.node(
-                    node_kind, initialCoordinates=[*one.place[plane], angle],
-                    initialVelocities=[*one.velocity[plane] / 2, spin],
-                )  # fmt: skip
-                bodies.append(s.body(body_kind, node, inertia=inertia, mass=one.mass))
-                points.append([*(turn.T @ reach[plane]), 0.0])
-                here = s.marker("MarkerBodyRigid", bodyNumber=bodies[-1], localPosition=points[-1])
-                there = s.ground([*(one.place + reach)[plane], 0.0])
-                joints.append(s.object(turning, there, here))
-                for along, across in (([0, 1.0, 0], turn[0]), ([1.0, 0, 0], turn[1])):
-                    axes = {"axisMarker0": along, "normalMarker1": [*across, 0.0]}
-                    joints.append(s.object(sliding, there, here, **axes))
-        s.mbs.Assemble()
+    def read(output: str) -> list[Array]:
+        return [s.of_body(body, output, point) for body, point in zip(bodies, points, strict=True)]
 
-        def read(output: str) -> list[Array]:
-            return [s.of_body(body, output, point) for body, point in zip(bodies, points, strict=True)]
-
-        call, by = texts(ITEM, node_kind, body_kind), "MainSystem.ComputeItem"
-        turns, momenta = np.tile(AXES, (len(bodies), 1, 1)), s.momenta(bodies)
-        for i, turn in enumerate(read("RotationMatrix")):
-            turns[i][np.ix_(PLANES[i % 3], PLANES[i % 3])] = turn.reshape(3, 3)[:2, :2]
-        s.add_axes(call, [x @ y @ z @ PROBE_TURN for x, y, z in turns.reshape(-1, 3, 3, 3)])
-        s.add("frame_position", call, _gathered(read("Position"), PLANES))
-        s.add("frame_velocity", call, 2 * _gathered(read("Velocity"), PLANES))
-        spins = [spin[2] for spin in read("AngularVelocity")]
-        s.add("frame_angular_velocity", call, np.reshape(spins, (-1, 3)))
-        s.add("body_velocity", f"{call} {MASS}", 2 * _gathered(momenta, PLANES) / s.masses)
-        spun = np.reshape([momentum[2] for momentum in momenta], (-1, 3))
-        s.add("frame_angular_velocity", f"{call} {MASS}", spun / inertia)
-        held, first, second = np.reshape(s.jacobians(joints), (-1, 3, 2)).swapaxes(0, 1)
-        s.add("frame_velocity", f"{ITEM}.{turning} {by}", 2 * _gathered(held, PLANES))
-        slid = np.stack([first[:, 0], second[:, 0]], axis=1)
-        s.add("frame_velocity", f"{ITEM}.{sliding} {by}", 2 * _gathered(slid, PLANES))
-        turned = np.reshape(first[:, 1] - second[:, 1], (-1, 3)) / 2
-        s.add("frame_angular_velocity", f"{ITEM}.{sliding} {by}", turned)
-
-    return add
+    call, by = texts(ITEM, node_kind, body_kind), "MainSystem.ComputeItem"
+    turns, momenta = np.tile(AXES, (len(bodies), 1, 1)), s.momenta(bodies)
+    for i, turn in enumerate(read("RotationMatrix")):
+        turns[i][np.ix_(PLANES[i % 3], PLANES[i % 3])] = turn.reshape(3, 3)[:2, :2]
+    s.add_axes(call, [x @ y @ z @ PROBE_TURN for x, y, z in turns.reshape(-1, 3, 3, 3)])
+    s.add("frame_position", call, _gathered(read("Position"), PLANES))
+    s.add("frame_velocity", call, 2 * _gathered(read("Velocity"), PLANES))
+    spins = [spin[2] for spin in read("AngularVelocity")]
+    s.add("frame_angular_velocity", call, np.reshape(spins, (-1, 3)))
+    s.add("body_velocity", f"{call} {MASS}", 2 * _gathered(momenta, PLANES) / s.masses)
+    spun = np.reshape([momentum[2] for momentum in momenta], (-1, 3))
+    s.add("frame_angular_velocity", f"{call} {MASS}", spun / inertia)
+    held, first, second = np.reshape(s.jacobians(joints), (-1, 3, 2)).swapaxes(0, 1)
+    s.add("frame_velocity", f"{ITEM}.{turning} {by}", 2 * _gathered(held, PLANES))
+    slid = np.stack([first[:, 0], second[:, 0]], axis=1)
+    s.add("frame_velocity", f"{ITEM}.{sliding} {by}", 2 * _gathered(slid, PLANES))
+    turned = np.reshape(first[:, 1] - second[:, 1], (-1, 3)) / 2
+    s.add("frame_angular_velocity", f"{ITEM}.{sliding} {by}", turned)
 
 
 def _add_coordinate_constraints(s: _Items) -> None:
@@ -616,15 +604,18 @@ def _add_robots(s: _Items) -> None:
 
 
 PARTS: Sequence[Callable[[_Items], None]] = (
-    _add_points("NodePoint", "ObjectMassPoint", SPACE), _add_points("Point", "MassPoint", SPACE),
+    partial(_add_points, "NodePoint", "ObjectMassPoint", SPACE),
+    partial(_add_points, "Point", "MassPoint", SPACE),
     _add_created_points, _add_started_bodies,
-    _add_points("NodePoint2D", "ObjectMassPoint2D", PLANES), _add_points("Point2D", "MassPoint2D", PLANES),
-    _add_points("Node1D", "ObjectMass1D", LINES), _add_points("Node1D", "Mass1D", LINES),
-    _add_rotors("ObjectRotationalMass1D"), _add_rotors("Rotor1D"),
-    _add_plane_bodies(
-        "NodeRigidBody2D", "ObjectRigidBody2D", "ObjectJointRevolute2D", "ObjectJointPrismatic2D"
-    ),
-    _add_plane_bodies("Rigid2D", "RigidBody2D", "RevoluteJoint2D", "PrismaticJoint2D"),
+    partial(_add_points, "NodePoint2D", "ObjectMassPoint2D", PLANES),
+    partial(_add_points, "Point2D", "MassPoint2D", PLANES),
+    partial(_add_points, "Node1D", "ObjectMass1D", LINES),
+    partial(_add_points, "Node1D", "Mass1D", LINES),
+    partial(_add_rotors, "ObjectRotationalMass1D"),
+    partial(_add_rotors, "Rotor1D"),
+    partial(_add_plane_bodies, "NodeRigidBody2D", "ObjectRigidBody2D",
+            "ObjectJointRevolute2D", "ObjectJointPrismatic2D"),
+    partial(_add_plane_bodies, "Rigid2D", "RigidBody2D", "RevoluteJoint2D", "PrismaticJoint2D"),
     _add_coordinate_constraints, _add_vector_constraints, _add_relative_markers, _add_connectors, _add_loads,
     _add_parameters, _add_algebraic_coordinates, _add_linear_systems, _add_equations,
     _add_inertias, _add_robots,

@@ -87,6 +87,7 @@ def _note(found: FoundAnswer, kind: str, *words: str) -> None:
 
 
 def _label(part: Callable[[], object]) -> str:
-    """What a part does, by the name of its function, which may be partial."""
+    """What a part does, by the name of its function and, of a partial one, the texts that it is given."""
     name: str = getattr(part, "func", part).__name__
-    return name.replace("_", " ").strip()
+    texts = [text for text in getattr(part, "args", ()) if isinstance(text, str)]
+    return " ".join([name.replace("_", " ").strip(), *texts])

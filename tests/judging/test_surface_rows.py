@@ -3,6 +3,7 @@
 import os
 import signal
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pinocchio
@@ -343,19 +344,24 @@ def test_a_part_that_fails_or_ends_its_process_costs_that_part_only():
         found["momentum"] = {("before",): np.ones((1, 3))}
         np.linalg.inv(np.zeros((2, 2)))
 
-    def add_crash():
-        os.kill(os.getpid(), signal.SIGKILL)
+    def add_crash(signal_number):
+        os.kill(os.getpid(), signal_number)
+
+    def add_inverse(names, size):
+        np.linalg.inv(np.zeros((size, size)))
 
     def add_energy():
         found["energy"] = {("energy",): np.ones((1, 1))}
 
     token = IS_APART.set(True)
     try:
-        add_parts(found, add_singular, add_crash, add_energy)
+        crash = partial(add_crash, signal.SIGKILL)
+        add_parts(found, add_singular, crash, partial(add_inverse, "mj_inverse mj_rne", 2), add_energy)
     finally:
         IS_APART.reset(token)
     assert {words for words, _ in found.pop(FAILED_PARTS)} == {
         "add singular: LinAlgError: Singular matrix",
         "add crash: crashed: the process died of SIGKILL",
+        "add inverse mj_inverse mj_rne: LinAlgError: Singular matrix",
     }
     assert set(found) == {"momentum", "energy"}
