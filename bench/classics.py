@@ -201,8 +201,8 @@ def _measure_integrator(
 ) -> dict[str, Any]:  # fmt: skip
     study = run_refinement(engine, name, scenario.model, scenario.state, times, resolutions)
     record: dict[str, Any] = {"engine": engine, "integrator": name}
-    if study.unsupported is not None:
-        return record | {"unsupported": study.unsupported}
+    if study.refusal:
+        return record | {"unsupported": study.refusal.message}
     integrator = load_adapter(engine).integrator(name)
 
     def error(y: Array) -> float:
@@ -214,7 +214,7 @@ def _measure_integrator(
 
     values = [measured(run) for run in study.runs]
     record["runs"] = [
-        {"resolution": run.resolution, "cpu": run.cpu_time, "failure": run.failure}
+        {"resolution": run.resolution, "cpu": run.cpu_time, "failure": run.failure and run.failure.message}
         | ({} if y is None else {"error": error(y)})
         for run, y in zip(study.runs, values, strict=True)
     ]
@@ -250,8 +250,8 @@ def measure_states(name: str) -> list[dict[str, Any]]:
 
 def _measure_engine_states(engine: str, model: Model, states: Any, truth: Any) -> dict[str, Any]:
     answer = evaluate_states(engine, model, states)
-    if answer.unsupported or answer.failure:
-        return {"engine": engine, "unsupported": answer.unsupported or answer.failure}
+    if answer.no_answer:
+        return {"engine": engine, "unsupported": answer.no_answer.message}
 
     def worst(name: str) -> float:
         pairs = [

@@ -13,15 +13,15 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib import metadata
 from io import StringIO
-from typing import Any, TypeVar
 
 import numpy as np
 
 from plumbline.engines.adapter import Adapter, EngineInfo
 from plumbline.engines.environments import declared_attribute
 from plumbline.engines.missing_names import FAILED_PARTS, IS_APART, MISSING_NAMES, OWN_PACKAGES
+from plumbline.engines.no_answer import NoAnswer, attempt
 from plumbline.engines.registry import load_adapter
-from plumbline.engines.variants import NoAnswer, VariantKind
+from plumbline.engines.variants import VariantKind
 from plumbline.model.datatypes import (
     Array,
     Call,
@@ -33,12 +33,9 @@ from plumbline.model.datatypes import (
     StepRun,
     SurfaceAnswer,
     Trajectory,
-    Unsupported,
 )
-from plumbline.processes.exceptions import describe_exception, place_of
 from plumbline.processes.isolation import EndedEarly, call_in_fork
 
-T = TypeVar("T")
 BESIDES = ("surface", "variants")  # what an engine is asked for after the state quantities
 APART = "apart"  # the same, each part and variant in a process of its own
 SURFACE_STATES = 8  # of a scenario, at which what engines report besides the state quantities is compared
@@ -51,15 +48,12 @@ class Evaluation:
     """State quantities of an engine at a list of states, or the reason why there are none."""
 
     quantities: list[StateQuantities]
-    unsupported: str | None  # the engine's reason for refusing
-    failure: str | None  # what the engine did instead
-    cpu_time: float  # CPU s inside the engine's calls
-    gap: str = ""  # the declared gap that the refusal follows from
+    cpu_time: float = 0.0  # CPU s inside the engine's calls
+    no_answer: NoAnswer | None = None  # in place of them
     declared: tuple[str, ...] = ()  # all gaps that the adapter declares
     # what the engine reports besides: `SurfaceAnswer` with all of the first states in one array
     surface: SurfaceAnswer = field(default_factory=dict)
-    surface_failure: str = ""  # what it did instead
-    place: str = ""  # `place_of` what it raised, in one or the other
+    surface_failure: NoAnswer | None = None  # in place of that
     # by kind and names of a variant the quantities at the first states, or what the engine did instead
     variants: VariantAnswers = field(default_factory=dict)
 
@@ -70,9 +64,8 @@ class RefinementRun:
 
     resolution: float  # step in s, or relative tolerance
     trajectory: Trajectory | None
-    failure: str | None
-    cpu_time: float  # CPU s
-    place: str = ""  # `place_of` what it raised
+    cpu_time: float = 0.0  # CPU s
+    failure: NoAnswer | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,9 +73,7 @@ class RefinementStudy:
     """The runs of one integrator at all resolutions, coarse to fine."""
 
     runs: list[RefinementRun]
-    unsupported: str | None  # the engine's reason for refusing
-    gap: str = ""  # the declared gap that this follows from
-    place: str = ""  # `place_of` the refusal
+    refusal: NoAnswer | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,10 +83,8 @@ class StepAttempt:
     state: int  # index of the state
     step: float  # s
     run: StepRun | None = None  # the steps, fewer where more were refused or failed
-    refusal: str = ""  # why the engine refused to take more steps
-    failure: str = ""  # what it did instead of taking more steps
-    gap: str = ""  # the declared gap that the refusal follows from
-    place: str = ""  # `place_of` the failure, or of the refusal
+    refusal: NoAnswer | None = None  # of more steps
+    failure: NoAnswer | None = None  # of more steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,23 +141,6 @@ def describe_missing(name: str, error: ModuleNotFoundError | AttributeError, sub
     return EngineInfo(name, name, version, (), f"the {subject} cannot use version {version}: {error}")
 
 
-def attempt(call: Callable[..., T], *arguments: Any) -> T | NoAnswer:
-    """Call an engine; what it raises, which may be anything, becomes a reason for the results.
-
-    Raises:
-        MemoryError: the worker reached its memory limit, which the pool reports.
-
-    """
-    try:
-        return call(*arguments)
-    except Unsupported as refusal:
-        return NoAnswer(describe_exception(refusal), True, refusal.gap, refusal.missing, place_of(refusal))
-    except MemoryError:
-        raise
-    except Exception as error:
-        return NoAnswer(describe_exception(error), is_refusal=False, place=place_of(error))
-
-
 def evaluate_states(
     engine: str, model: Model, states: Sequence[State], besides: Sequence[str] = BESIDES
 ) -> Evaluation:
@@ -184,36 +156,28 @@ def evaluate_states(
     begin = time.process_time()
     adapter = attempt(load_adapter, engine)
     if isinstance(adapter, NoAnswer):
-        return _no_evaluation(adapter, begin, ())
+        return Evaluation([], time.process_time() - begin, adapter)
     declared = (*adapter.unsupported, *adapter.gaps)
     found = attempt(adapter.evaluate, model, states)
     if isinstance(found, NoAnswer):
-        return _no_evaluation(found, begin, declared)
-    surplus = [name for name in adapter.unsupported for one in found if getattr(one, name, None) is not None]
-    surface, surface_failure, place = dict[str, dict[Call, Array]](), "", ""
-    variants: VariantAnswers = {}
+        return Evaluation([], time.process_time() - begin, found, declared)
+    for name in adapter.unsupported:
+        if any(getattr(one, name, None) is not None for one in found):
+            words = f"{engine} returns the {name} that its adapter declares as unsupported"
+            return Evaluation([], time.process_time() - begin, NoAnswer(words, False), declared)
+    surface, failure, variants = dict[str, dict[Call, Array]](), None, VariantAnswers()
     IS_APART.set(APART in besides)
-    if found and not surplus and "surface" in besides:
+    if found and "surface" in besides:
         stacked = attempt(lambda: stack_answers(adapter.surface(model, states[:SURFACE_STATES])))
         if not isinstance(stacked, NoAnswer):
             surface = stacked
         elif not stacked.is_refusal:
-            surface_failure, place = stacked.message, stacked.place
+            failure = stacked
         elif stacked.missing:  # else the adapter offers nothing of the mechanism
             surface = {MISSING_NAMES: {(stacked.missing,): np.zeros((1, 1, 1))}}
-    if found and not surplus and "variants" in besides:
+    if found and "variants" in besides:
         variants = evaluate_variants(adapter, model, states[:SURFACE_STATES])
-    failure = (
-        f"{engine} returns the {surplus[-1]} that its adapter declares as unsupported" if surplus else None
-    )
-    cpu_time = time.process_time() - begin
-    return Evaluation(found, None, failure, cpu_time, "", declared, surface, surface_failure, place, variants)
-
-
-def _no_evaluation(answer: NoAnswer, begin: float, declared: tuple[str, ...]) -> Evaluation:
-    unsupported, failure = (answer.message, None) if answer.is_refusal else (None, answer.message)
-    cpu_time = time.process_time() - begin
-    return Evaluation([], unsupported, failure, cpu_time, answer.gap, declared, place=answer.place)
+    return Evaluation(found, time.process_time() - begin, None, declared, surface, failure, variants)
 
 
 def evaluate_variants(adapter: Adapter, model: Model, states: Sequence[State]) -> VariantAnswers:
@@ -279,15 +243,12 @@ def run_refinement(
         begin = time.process_time()
         found = attempt(adapter.simulate, model, state, times, integrator, resolution)
         if isinstance(found, NoAnswer) and found.is_refusal:
-            return RefinementStudy(runs, found.message, found.gap, found.place)
-        cpu_time = time.process_time() - begin
-        if isinstance(found, NoAnswer):
-            runs.append(RefinementRun(resolution, None, found.message, cpu_time, found.place))
-        else:
-            runs.append(RefinementRun(resolution, found, None, cpu_time))
+            return RefinementStudy(runs, found)
+        trajectory, failure = (None, found) if isinstance(found, NoAnswer) else (found, None)
+        runs.append(RefinementRun(resolution, trajectory, time.process_time() - begin, failure))
         if is_enough is not None and is_enough(model, adapter.integrator(integrator), runs):
             break
-    return RefinementStudy(runs, None)
+    return RefinementStudy(runs)
 
 
 def run_steps(
@@ -316,11 +277,10 @@ def run_steps(
                 if not isinstance(found, NoAnswer):
                     record = replace(record, run=found)
                     break
-                if not (found.is_refusal or record.failure):
-                    record = replace(record, failure=found.message, place=found.place)
-                elif found.is_refusal and not record.refusal:
-                    place = record.place or found.place
-                    record = replace(record, refusal=found.message, gap=found.gap, place=place)
+                if found.is_refusal:
+                    record = replace(record, refusal=record.refusal or found)
+                else:
+                    record = replace(record, failure=record.failure or found)
             attempts.append(record)
     return StepEvaluation(attempts, time.process_time() - begin)
 

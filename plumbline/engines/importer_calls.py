@@ -9,9 +9,9 @@ from collections.abc import Mapping, Sequence
 
 from plumbline.engines.adapter import EngineInfo
 from plumbline.engines.answers import check_numbers, check_record, check_version
-from plumbline.engines.engine_calls import attempt, describe_missing
+from plumbline.engines.engine_calls import describe_missing
+from plumbline.engines.no_answer import NoAnswer, attempt
 from plumbline.engines.registry import load_importer
-from plumbline.engines.variants import NoAnswer
 from plumbline.importers.importer import ModelFile, Reading
 from plumbline.importers.neutral_model import CanonicalState, ModelQuantities
 from plumbline.model.datatypes import EngineFailure

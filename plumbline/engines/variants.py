@@ -83,14 +83,3 @@ def _column_names() -> Mapping[str, Mapping[str, Sequence[str]]]:
     text = (ROOT / "adapters" / "surface" / "column_names.json").read_text(encoding="utf-8")
     found: Mapping[str, Mapping[str, Sequence[str]]] = json.loads(text)
     return found
-
-
-@dataclass(frozen=True)
-class NoAnswer:
-    """What an engine did in place of an answer."""
-
-    message: str
-    is_refusal: bool  # by the engine or its adapter; else a failure
-    gap: str = ""  # the declared gap that the refusal follows from
-    missing: str = ""  # name that the installed version lacks, where that is the reason
-    place: str = ""  # `place_of` what was raised

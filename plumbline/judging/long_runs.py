@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from plumbline.engines.no_answer import NoAnswer
 from plumbline.judging.rows import JudgingResult, Row, RowContext, Verdict, first_decided, with_unit
 from plumbline.judging.trajectory_level import singular_motion_row
 from plumbline.measurements.drift_order import (
@@ -50,8 +51,8 @@ def judge_long_runs(
     """
     cost = sum(run.cpu_time for run in study.runs)
     if missing := _missing_runs(study):
-        row = context.make_row(
-            "invariants", integrator.name, ALL_LONG, *missing, gap=study.gap,
+        row = context.make_row_of_none(
+            "invariants", integrator.name, ALL_LONG, *missing,
             cpu_time=cost, extra={"asked": study.plan.requested_seconds},
         )  # fmt: skip
         return JudgingResult([row])
@@ -71,15 +72,17 @@ def judge_long_runs(
     return JudgingResult([replace(row, cpu_time=cost, alias_of=alias) for row in rows])
 
 
-def _missing_runs(study: LongRunStudy) -> tuple[Verdict, str] | None:
-    """Verdict and reason where there is no finest run to judge."""
-    if study.unsupported is not None:
-        return Verdict.UNSUPPORTED, study.unsupported
+def _missing_runs(study: LongRunStudy) -> tuple[NoAnswer, str] | None:
+    """What the engine did where there is no finest run to judge, and when."""
+    if study.refusal:
+        return study.refusal, ""
     finest = study.runs[-1]
+    if not finest.failure:
+        return None
     if not finest.windows:
-        return Verdict.FAILED, f"at the finest resolution {finest.resolution:g}: {finest.failure}"
-    if finest.failure is not None and not leaves_range(finest, study.plan.seconds):
-        return Verdict.FAILED, f"within {study.plan.seconds:g} s at {finest.resolution:g}: {finest.failure}"
+        return finest.failure, f"at the finest resolution {finest.resolution:g}: "
+    if not leaves_range(finest, study.plan.seconds):
+        return finest.failure, f"within {study.plan.seconds:g} s at {finest.resolution:g}: "
     return None
 
 
@@ -198,8 +201,8 @@ class _DriftJudge:
     ) -> Row:
         """The row of this invariant; its extra fields hold the largest drift up to each decade."""
         end = drift.end
-        if self.finest.failure is not None:
-            reason += f"; in {self.study.plan.seconds:g} s {self.finest.failure}"
+        if self.finest.failure:
+            reason += f"; in {self.study.plan.seconds:g} s {self.finest.failure.message}"
         elif end < self.finest.reached_time:
             last = self.windows[self.finest.reached_time].max_drift
             reason += (

@@ -5,13 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from plumbline.judging.rows import JudgingResult, Row, RowContext, Verdict
-from plumbline.measurements.relation_result import REPEATABILITY, UNEXPLAINED, Refusal, RelationResult
-
-REFUSALS: dict[Refusal, Verdict] = {
-    "unsupported": Verdict.UNSUPPORTED,
-    "failed": Verdict.FAILED,
-    "not compared": Verdict.INFORMATION,
-}
+from plumbline.measurements.relation_result import REPEATABILITY, UNEXPLAINED, RelationResult
 
 
 def judge_relations(context: RowContext, results: Sequence[RelationResult]) -> JudgingResult:
@@ -29,11 +23,12 @@ def judge_relations(context: RowContext, results: Sequence[RelationResult]) -> J
 
 
 def _relation_row(context: RowContext, result: RelationResult) -> Row:
+    integrator, name = result.integrator, result.relation
+    if result.no_answer:
+        return context.make_row_of_none("relations", integrator, name, result.no_answer)
     if result.ratio is None:
-        return context.make_row(
-            "relations", result.integrator, result.relation, REFUSALS[result.refusal], result.refusal_reason,
-            gap=result.gap, place=result.place,
-        )  # fmt: skip
+        reason = f"not compared: {result.note}"
+        return context.make_row("relations", integrator, name, Verdict.INFORMATION, reason)
     extra: dict[str, float] = {"states": result.state_count, "state": result.worst_state}
     if result.unexplained is not None:
         extra[UNEXPLAINED] = result.unexplained
@@ -56,10 +51,10 @@ def _relation_row(context: RowContext, result: RelationResult) -> Row:
         verdict = Verdict.AGREES
         reason = f"both results of {context.title} agree within {result.ratio:.2g} of {limit}, over {over}"
     else:
-        verdict, name = Verdict.DISAGREES, result.quantity.replace("_", " ")
-        reason = f"the {name} of {context.title} at {where} differs by {result.ratio:.3g} times {limit}"
+        verdict, quantity = Verdict.DISAGREES, result.quantity.replace("_", " ")
+        reason = f"the {quantity} of {context.title} at {where} differs by {result.ratio:.3g} times {limit}"
     return context.make_row(
-        "relations", result.integrator, result.relation, verdict, f"{result.relation}: {reason}",
+        "relations", integrator, name, verdict, f"{name}: {reason}",
         value=result.ratio, tolerance=1.0, derivation=derivation, extra=extra,
     )  # fmt: skip
 
@@ -67,8 +62,8 @@ def _relation_row(context: RowContext, result: RelationResult) -> Row:
 def _repeatability_row(context: RowContext, result: RelationResult, extra: dict[str, float]) -> Row:
     """The row of equal questions: it disagrees on any bit that differs."""
     asked = f"a run of {result.steps} steps" if result.steps else f"{result.state_count} states"
-    if result.refusal_reason:
-        verdict, reason = Verdict.DISAGREES, result.refusal_reason
+    if result.note:
+        verdict, reason = Verdict.DISAGREES, result.note
     elif result.quantity:
         verdict = Verdict.DISAGREES
         reason = f"{result.quantity}, differs by {result.ratio:.2g} of its size from the first answer"

@@ -10,6 +10,7 @@ from typing import Any, Literal, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
+from plumbline.engines.no_answer import NoAnswer
 from plumbline.model.datatypes import Array, Float
 
 Level = Literal["state", "surface", "step", "invariants", "trajectory", "relations", "model"]
@@ -275,6 +276,20 @@ class RowContext:
             self.scenario, self.family, self.engine, self.version, level, integrator, quantity, unit,
             verdict=verdict, reason=reason, **more,
         )  # fmt: skip
+
+    def make_row_of_none(
+        self, level: Level, integrator: str, quantity: str, found: NoAnswer, before: str = "", **more: Any
+    ) -> Row:
+        """Make a row of what an engine refused or failed at.
+
+        Args:
+            before: words before the engine's own.
+            **more: as of `make_row`.
+
+        """
+        verdict = Verdict.UNSUPPORTED if found.is_refusal else Verdict.FAILED
+        reason, more = before + found.message, more | {"gap": found.gap, "place": found.place}
+        return self.make_row(level, integrator, quantity, verdict, reason, **more)
 
 
 def mark_aliases(rows: Iterable[Row]) -> list[Row]:

@@ -11,7 +11,8 @@ from typing import get_args
 import numpy as np
 
 from plumbline.engines.engine_calls import Evaluation
-from plumbline.engines.variants import NoAnswer, VariantKind
+from plumbline.engines.no_answer import NoAnswer
+from plumbline.engines.variants import VariantKind
 from plumbline.judging.identity import state_fingerprints
 from plumbline.judging.rows import (
     FAILED_CALLS,
@@ -59,15 +60,8 @@ def judge_states(context: RowContext, truth: StateTruth, evaluation: Evaluation)
         One row per quantity, and per state the worst body (table "states").
 
     """
-    for verdict, reason in (
-        (Verdict.UNSUPPORTED, evaluation.unsupported),
-        (Verdict.FAILED, evaluation.failure),
-    ):
-        if reason is not None:
-            gap, place = evaluation.gap, evaluation.place
-            return JudgingResult(
-                [context.make_row("state", "-", "all", verdict, reason, gap=gap, place=place)]
-            )
+    if evaluation.no_answer:
+        return JudgingResult([context.make_row_of_none("state", "-", "all", evaluation.no_answer)])
     result = JudgingResult(fingerprints=state_fingerprints(evaluation.quantities))
     for quantity, unit in STATE_UNITS.items():
         if all(getattr(true, quantity) is None for true in truth.quantities):

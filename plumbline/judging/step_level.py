@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from plumbline.engines.engine_calls import StepAttempt, StepEvaluation
+from plumbline.engines.engine_calls import StepEvaluation
+from plumbline.engines.no_answer import NoAnswer
 from plumbline.judging.rows import JudgingResult, Row, RowContext, Verdict, with_unit
 from plumbline.measurements.single_steps import run_counts
 from plumbline.model.datatypes import EngineFailure, Integrator, Model, State, StepRun
@@ -100,17 +101,20 @@ def _single_step_rows(
 ) -> list[Row]:
     method = integrator.method
 
-    def one(verdict: Verdict, reason: str, at: StepAttempt | None = None) -> list[Row]:
-        gap, place = (at.gap, at.place) if at else ("", "")
-        return [context.make_row("step", integrator.name, "all", verdict, reason, gap=gap, place=place)]
+    def one(verdict: Verdict, reason: str) -> list[Row]:
+        return [context.make_row("step", integrator.name, "all", verdict, reason)]
+
+    def none(found: NoAnswer) -> list[Row]:
+        return [context.make_row_of_none("step", integrator.name, "all", found)]
 
     attempts, runs = [attempt for attempt in answer.attempts if attempt.run is not None], answer.runs
     is_constrained = isinstance(method, ConstrainedMethod)  # where fewer steps than asked for have failed
-    failed = [a for a in answer.attempts if a.failure and (is_constrained or a.run is None)]
-    if failed:
-        return one(Verdict.FAILED, failed[0].failure, failed[0])
+    for attempt in answer.attempts:
+        if attempt.failure and (is_constrained or attempt.run is None):
+            return none(attempt.failure)
     if not runs:
-        return one(Verdict.UNSUPPORTED, answer.attempts[0].refusal, answer.attempts[0])
+        assert answer.attempts[0].refusal is not None
+        return none(answer.attempts[0].refusal)
     if not HAS_EXTENDED_PRECISION:
         return one(Verdict.UNSUPPORTED, NO_EXTENDED_PRECISION)
     if isinstance(method, JointSpaceMethod) and not keeps_dependent_rows(model, states[0]):
@@ -120,7 +124,7 @@ def _single_step_rows(
         steps = FormulaSteps(method, model, states, starts)
         for i, attempt in enumerate(attempts):
             if attempt.failure and steps.is_stable(i):
-                return one(Verdict.FAILED, attempt.failure, attempt)
+                return none(attempt.failure)
         found, table = steps.compare([run for *_, run in runs]), STEP_QUANTITIES
     else:
         assert isinstance(method, ConstrainedMethod)
@@ -179,17 +183,19 @@ def _run_rows(
     if attempt is None:
         return []
 
-    def one(verdict: Verdict, reason: str, gap: str = "") -> list[Row]:
-        return [
-            context.make_row("step", integrator.name, "run", verdict, reason, gap=gap, place=attempt.place)
-        ]
+    def one(verdict: Verdict, reason: str) -> list[Row]:
+        return [context.make_row("step", integrator.name, "run", verdict, reason)]
+
+    def none(found: NoAnswer, before: str = "") -> list[Row]:
+        return [context.make_row_of_none("step", integrator.name, "run", found, before)]
 
     run, h = attempt.run, attempt.step
-    failed = (
-        one(Verdict.FAILED, f"in a run of {h:g} s per step: {attempt.failure}") if attempt.failure else []
-    )
-    if run is None or (failed and not isinstance(method, JointSpaceMethod)):
-        return failed or one(Verdict.UNSUPPORTED, attempt.refusal, attempt.gap)
+    failed = none(attempt.failure, f"in a run of {h:g} s per step: ") if attempt.failure else []
+    if failed and not (run and isinstance(method, JointSpaceMethod)):
+        return failed
+    if run is None:
+        assert attempt.refusal is not None
+        return none(attempt.refusal)
     if not HAS_EXTENDED_PRECISION:
         return one(Verdict.UNSUPPORTED, NO_EXTENDED_PRECISION)
     if isinstance(method, ConstrainedMethod):
@@ -235,7 +241,7 @@ def _left_out_words(found: StepDeviations, unit: str) -> tuple[str, int]:
 
 def _run_row(
     context: RowContext, integrator: Integrator, quantity: str, found: StepDeviations, h: float,
-    run: StepRun, alias: str | None, cpu_time: float, failure: str | None,
+    run: StepRun, alias: str | None, cpu_time: float, failure: NoAnswer | None,
 ) -> Row:  # fmt: skip
     """The row of one quantity at every step: the worst step decides, the first wrong one is named.
 
@@ -286,7 +292,9 @@ def _run_row(
         extra |= {"left_out_steps": number, "left_out_wrong_steps": off}
         reason += words
     if failure:
-        reason += f"; after these {failure}: with this step the method itself does not resolve the rest"
+        reason += (
+            f"; after these {failure.message}: with this step the method itself does not resolve the rest"
+        )
     return context.make_row(
         "step", integrator.name, quantity, verdict, reason, unit,
         value=found.errors[at], tolerance=found.bounds[at], ratio=ratio,

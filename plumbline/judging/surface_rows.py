@@ -36,8 +36,7 @@ def judge_surface(context: RowContext, truth: StateTruth, evaluation: Evaluation
 
     """
     if evaluation.surface_failure and truth.surface:
-        failed, place = evaluation.surface_failure, evaluation.place
-        return [context.make_row("surface", "-", "all", Verdict.FAILED, failed, place=place)]
+        return [context.make_row_of_none("surface", "-", "all", evaluation.surface_failure)]
     rows = [
         _row(context, name, truth.surface[name], evaluation)
         for name in SURFACE_QUANTITIES

@@ -54,14 +54,13 @@ def judge_trajectory(
         The rows, and the tables of convergence, curves over time and poses.
 
     """
-    missing = partial(context.make_row, "trajectory", integrator.name, "all")
-    if study.unsupported is not None:
-        row = missing(Verdict.UNSUPPORTED, study.unsupported, gap=study.gap, place=study.place)
-        return JudgingResult([row])
+    missing = partial(context.make_row_of_none, "trajectory", integrator.name, "all")
+    if study.refusal:
+        return JudgingResult([missing(study.refusal)])
     finest = study.runs[-1]
     if finest.trajectory is None:
-        reason = f"at the finest resolution {finest.resolution:g}: {finest.failure}"
-        return JudgingResult([missing(Verdict.FAILED, reason, place=finest.place)])
+        assert finest.failure is not None
+        return JudgingResult([missing(finest.failure, f"at the finest resolution {finest.resolution:g}: ")])
     analysis = RefinementAnalysis(context, model, truth, integrator, study.runs, truth.horizon)
     rows = [*trajectory_rows(analysis), *invariant_rows(analysis)]
     deviations = {

@@ -14,6 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
+from plumbline.engines.no_answer import NoAnswer
 from plumbline.measurements.order_and_limit import ORDER_MARGIN
 from plumbline.measurements.refinement_study import ROUNDING_PER_STEP
 from plumbline.model.datatypes import Array, Float, Integrator
@@ -40,7 +41,7 @@ class LongRun:
     resolution: float  # step [s], or relative tolerance
     steps: int
     reached_time: float  # s
-    failure: str | None  # of the longest run that was tried, where a shorter one replaces it
+    failure: NoAnswer | None  # of the longest run that was tried, where a shorter one replaces it
     uncertainty: dict[float, dict[str, float]]  # `Invariants.uncertainty` by window and invariant
     invariant_scales: dict[float, dict[str, float]]  # by window and invariant
     windows: dict[str, dict[float, DriftWindow]]  # by invariant and window

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from plumbline.engines.no_answer import NoAnswer, attempt
 from plumbline.engines.registry import load_adapter
 from plumbline.measurements.drift_order import (
     BLOCK_COUNT,
@@ -17,10 +18,9 @@ from plumbline.measurements.drift_order import (
     LongRun,
 )
 from plumbline.measurements.order_and_limit import step_unit
-from plumbline.model.datatypes import Array, Integrator, Model, State, Trajectory, Unsupported
+from plumbline.model.datatypes import Array, Integrator, Model, State, Trajectory
 from plumbline.model.invariants import INVARIANT_UNITS, compute_invariants, invariant_scales, kinetic_energy
 from plumbline.model.kinematics import angular_velocity, stretched_length
-from plumbline.processes.exceptions import describe_exception
 from plumbline.truth.ground_truth import singular_note
 
 # By order: coarsest and finest step, as -log2 of the `step_unit`.
@@ -65,14 +65,13 @@ class LongRunStudy:
 
     runs: list[LongRun]
     plan: LongRunPlan
-    unsupported: str | None = None
+    refusal: NoAnswer | None = None
     singular: str = ""  # why the runs end before the plan's length: a pose that is singular, or nearly so
-    gap: str = ""  # the declared gap that the refusal follows from
 
     @property
     def is_in_doubt(self) -> bool:
         """Whether the finest run failed, or its energy leaves its range: the motion may be too fast."""
-        if self.unsupported is not None:
+        if self.refusal:
             return False
         finest = self.runs[-1]
         return finest.failure is not None or leaves_range(finest, self.plan.seconds)
@@ -142,17 +141,14 @@ def run_long_run_study(
         for resolution in resolutions:
             begin, failure, trajectory = time.process_time(), None, None
             for seconds in reversed(lengths):
-                try:
-                    trajectory = adapter.simulate(
-                        model, state, _samples(seconds, spacing), integrator, resolution
-                    )
+                times = _samples(seconds, spacing)
+                found = attempt(adapter.simulate, model, state, times, integrator, resolution)
+                if not isinstance(found, NoAnswer):
+                    trajectory = found
                     break
-                except Unsupported as refusal:
-                    return LongRunStudy(runs, plan, describe_exception(refusal), gap=refusal.gap), None
-                except MemoryError:
-                    raise
-                except Exception as error:  # an engine may raise anything; its message belongs in the results
-                    failure = failure or describe_exception(error)
+                if found.is_refusal:
+                    return LongRunStudy(runs, plan, found), None
+                failure = failure or found
             runs.append(_reduce_run(model, plan, trajectory, resolution, failure, begin))
             doubt = _first_doubt(model, state, trajectory, runs[-1], end) if is_checked else None
             if doubt is not None:
@@ -285,7 +281,7 @@ def _reduce_run(
     plan: LongRunPlan,
     run: Trajectory | None,
     resolution: float,
-    failure: str | None,
+    failure: NoAnswer | None,
     begin: float,
 ) -> LongRun:
     """Reduce a run that began at ``begin`` (process time [s]) to its windows."""

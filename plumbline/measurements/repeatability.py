@@ -14,6 +14,7 @@ from dataclasses import fields, replace
 import numpy as np
 
 from plumbline.engines.metamorphic_hooks import MetamorphicHooks
+from plumbline.engines.no_answer import NoAnswer
 from plumbline.measurements.relation_result import REPEATABILITY, RelationResult
 from plumbline.measurements.run_relations import (
     RUN_STEPS,
@@ -66,7 +67,7 @@ def _check_states(engine: MetamorphicHooks, model: Model, states: Sequence[State
     used = [k for k, answer in enumerate(alone) if not isinstance(answer, Unsupported)]
     if not used:
         (refused, *_) = (answer for answer in alone if isinstance(answer, Unsupported))
-        return RelationResult(REPEATABILITY, None, "", 0, 0, str(refused), gap=refused.gap)
+        return RelationResult(REPEATABILITY, None, no_answer=NoAnswer.by(refused))
     asked = [states[k] for k in used]
     try:
         together = engine.evaluate(model, asked)
@@ -75,9 +76,8 @@ def _check_states(engine: MetamorphicHooks, model: Model, states: Sequence[State
         evaluate_or_refusal(engine.evaluate, other_model, other_state)
         later = engine.evaluate(model, asked[:1])
     except Unsupported as refusal:
-        return RelationResult(
-            REPEATABILITY, np.inf, "", used[0], len(used), f"refused after it had been answered: {refusal}"
-        )
+        note = f"refused after it had been answered: {refusal}"
+        return RelationResult(REPEATABILITY, np.inf, "", used[0], len(used), note=note)
     worst: tuple[float, str, int] = (0.0, "", 0)
     for way, answers in (
         ("in one call with other states", together),
@@ -101,9 +101,9 @@ def _check_run(
     def simulate(of: Model, start: State) -> Trajectory | Unsupported | EngineFailure:
         return run_or_refusal(engine, of, start, times, integrator.name, resolution)
 
-    def run_result(size: float, where: str, reason: str = "") -> RelationResult:
+    def run_result(size: float, where: str, note: str = "") -> RelationResult:
         return RelationResult(
-            REPEATABILITY, size, where, 0, 1, reason, integrator=integrator.name, steps=RUN_STEPS,
+            REPEATABILITY, size, where, 0, 1, note=note, integrator=integrator.name, steps=RUN_STEPS,
             resolution=resolution, end_time=float(times[-1]),
         )  # fmt: skip
 

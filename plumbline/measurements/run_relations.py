@@ -15,7 +15,8 @@ import numpy as np
 
 from plumbline.engines.adapter import Adapter
 from plumbline.engines.metamorphic_hooks import MetamorphicHooks
-from plumbline.measurements.relation_result import OPTION_PREFIX, Refusal, RelationResult
+from plumbline.engines.no_answer import NoAnswer
+from plumbline.measurements.relation_result import OPTION_PREFIX, RelationResult
 from plumbline.model.datatypes import (
     Array,
     EngineFailure,
@@ -28,7 +29,6 @@ from plumbline.model.datatypes import (
 )
 from plumbline.model.invariants import attitude_error, position_error
 from plumbline.model.kinematics import angular_velocity, stretched_length
-from plumbline.processes.exceptions import describe_exception, place_of
 from plumbline.truth.ground_truth import RUN_ROUNDING
 from plumbline.truth.predictability_horizon import perturbation_growth
 from plumbline.truth.rounding_bound import remembered_rounding_bound
@@ -73,8 +73,7 @@ def check_run_relations(
     """
     for option in engine.options_for(model):
         if reason := engine.unmoved_options.get(option):
-            words = f"not compared: {reason}"
-            yield RelationResult(f"motions by {option}", None, "", 0, 0, words, "not compared")
+            yield RelationResult(f"motions by {option}", None, note=reason)
     grown = dict(zip(short_steps(model, state), growth, strict=True))
     yield from with_shorter_steps(
         engine,
@@ -100,9 +99,13 @@ def with_shorter_steps(
         results: list[RelationResult] = []
         for step in steps:
             results = [*check(integrator, step)]
-            if integrator.kind == "tolerance" or all(r.refusal != "failed" for r in results):
+            if integrator.kind == "tolerance" or not any(_has_failed(result) for result in results):
                 break
         yield from results
+
+
+def _has_failed(result: RelationResult) -> bool:
+    return result.no_answer is not None and not result.no_answer.is_refusal
 
 
 def check_integrator_relations(
@@ -195,10 +198,7 @@ def refused_result(name: str, integrator: Integrator, refusal: Unsupported | Eng
         The result, without a ratio.
 
     """
-    kind: Refusal = "unsupported" if isinstance(refusal, Unsupported) else "failed"
-    gap = refusal.gap if isinstance(refusal, Unsupported) else ""
-    reason, place = describe_exception(refusal), place_of(refusal)
-    return RelationResult(name, None, "", 0, 0, reason, kind, integrator.name, gap=gap, place=place)
+    return RelationResult(name, None, no_answer=NoAnswer.by(refusal), integrator=integrator.name)
 
 
 def run_tolerance(

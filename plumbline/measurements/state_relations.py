@@ -28,6 +28,7 @@ from functools import partial
 import numpy as np
 
 from plumbline.engines.metamorphic_hooks import MetamorphicHooks
+from plumbline.engines.no_answer import NoAnswer
 from plumbline.engines.registry import load_adapter
 from plumbline.measurements.relation_result import OPTION_PREFIX, OTHER_FORMULATION_PREFIX, RelationResult
 from plumbline.model.datatypes import Array, Model, State, StateQuantities, Unsupported
@@ -49,7 +50,6 @@ from plumbline.model.redescription import (
     state_of_balls,
 )
 from plumbline.model.welding import split_bodies
-from plumbline.processes.exceptions import describe_exception, place_of
 from plumbline.truth.rounding_bound import RoundingBound, rounding_bounds, state_rounding_bound
 
 WELDED_HALVES = "two welded halves"
@@ -377,8 +377,7 @@ def check_state_relation(
     except MemoryError:
         raise
     except Exception as error:  # an engine may raise anything, and other relations are to be checked
-        reason, place = describe_exception(error), place_of(error)
-        return RelationResult(relation.name, None, "", 0, 0, reason, "failed", place=place)
+        return RelationResult(relation.name, None, no_answer=NoAnswer.by(error))
     for index, (state, other) in enumerate(zip(states, answered, strict=True)):
         here = answers[index]
         if isinstance(here, Unsupported):
@@ -400,12 +399,10 @@ def check_state_relation(
             difference = theirs[q] - mine[q]
             worst = max(worst, (_largest_ratio(difference, allowed), q, index))
             unexplained = max(unexplained, _largest_ratio(difference - missing.get(q, 0.0), allowed))
-    left = unexplained if count and relation.missing_term else None
-    return RelationResult(
-        relation.name, worst[0] if count else None, worst[1], worst[2], count,
-        str(refused or ""), unexplained=left, gap=refused.gap if refused else "",
-        place=place_of(refused) if refused else "",
-    )  # fmt: skip
+    if refused and not count:
+        return RelationResult(relation.name, None, no_answer=NoAnswer.by(refused))
+    left = unexplained if relation.missing_term else None
+    return RelationResult(relation.name, *worst, count, unexplained=left)
 
 
 def _largest_ratio(difference: Array, allowed: Array) -> float:

@@ -18,9 +18,9 @@ from dataclasses import replace
 from typing import Any
 
 from plumbline.engines.engine_calls import SURFACE_STATES, Evaluation, StepAttempt, evaluate_states
+from plumbline.engines.no_answer import NoAnswer
 from plumbline.engines.registry import load_adapter
 from plumbline.engines.surface import EXERCISED_FILE, SURFACES, exercised_rows, other_names
-from plumbline.engines.variants import NoAnswer
 from plumbline.judging.rows import Row, RowContext, Verdict
 from plumbline.judging.state_level import judge_states, judge_variants
 from plumbline.judging.step_level import judge_steps

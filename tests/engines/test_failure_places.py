@@ -61,7 +61,8 @@ def test_shapes_in_the_message_of_a_failure_make_no_other_finding(engine):
 def test_runs_and_steps_keep_the_place_too(engine):
     model, (state, _) = mechanism(2)
     study = run_refinement(engine, "RK4", model, state, np.array([0.0, 0.1]), [0.1])
-    assert study.runs[0].failure == "ValueError: no run of 2 bodies"
-    assert study.runs[0].place.endswith(" > simulate > _simulate")
+    assert study.runs[0].failure.message == "ValueError: no run of 2 bodies"
+    assert study.runs[0].failure.place.endswith(" > simulate > _simulate")
     (attempt,) = run_steps(engine, "RK4", model, [state], [[0.1]], [1]).attempts
-    assert attempt.refusal == "no step of 2 bodies" and attempt.place.endswith(" > step > _step")
+    assert attempt.refusal.message == "no step of 2 bodies"
+    assert attempt.refusal.place.endswith(" > step > _step")

@@ -78,7 +78,7 @@ def is_reported(defect, model, state):
         answers = plant(defect).evaluate(model, [state])
     except Unsupported:  # the engine is not compared on this scenario
         return False
-    rows = judge_states(CONTEXT, truth, Evaluation(answers, None, None, 0.0)).rows
+    rows = judge_states(CONTEXT, truth, Evaluation(answers)).rows
     return any(row.verdict == "disagrees" for row in rows)
 
 

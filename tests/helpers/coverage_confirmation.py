@@ -59,7 +59,7 @@ def judged_rows(name: str, level: Level, change: Inputs) -> list[Row]:
     s, context = catalogue_scenario(name), RowContext(name, "", MOTION_ENGINE, MOTION_ENGINE, "0")
     if level == "state":
         answers = plant(Defect("", engine=STATE_ENGINE, inputs=change)).evaluate(s.model, states(name))
-        return judge_states(context, true_states(name), Evaluation(answers, None, None, 0.0)).rows
+        return judge_states(context, true_states(name), Evaluation(answers)).rows
     engine = STEP_ENGINE if level == "step" else MOTION_ENGINE
     adapter = plant(Defect("", engine=engine, inputs=change))
     with patch("plumbline.engines.engine_calls.load_adapter", lambda _: adapter):

@@ -188,7 +188,7 @@ def evaluated(defect: Defect) -> tuple[list[StateQuantities], list[str]]:
     with planted(defect) as engine:
         reported = engine.evaluate(model, truth.states)
     context = RowContext("planted", "planted", defect.name, defect.name, "0")
-    rows = judge_states(context, truth, Evaluation(reported, None, None, 0.0)).rows
+    rows = judge_states(context, truth, Evaluation(reported)).rows
     return reported, [row.quantity for row in rows if row.verdict == "disagrees"]
 
 

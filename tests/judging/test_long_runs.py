@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from plumbline.engines.no_answer import NoAnswer
 from plumbline.engines.registry import load_adapter
 from plumbline.execution.plan import Plan
 from plumbline.execution.runner import run_plan
@@ -273,7 +274,9 @@ def test_a_drift_that_grows_as_a_power_of_time_leaves_its_range_earlier():
     def run(*drifts):
         windows = {t: DriftWindow(d, d, np.array([d])) for t, d in zip((0.1, 1.0), drifts, strict=True)}
         scales = {t: {"energy_drift": 1.0} for t in windows}
-        return LongRun(0.01, 100, 1.0, "it failed", {}, scales, {"energy_drift": windows}, 0.0)
+        return LongRun(
+            0.01, 100, 1.0, NoAnswer("it failed", False), {}, scales, {"energy_drift": windows}, 0.0
+        )
 
     assert not leaves_range(run(5e-4, 5e-3), 10.0)  # linear: 0.05 of its scale by 10 s
     assert leaves_range(run(5e-5, 5e-3), 10.0)  # quadratic: 0.5

@@ -34,7 +34,7 @@ def doubted_rows(engines, factors, *, recorded=(), defines_truth=""):
     for name, factor in zip(engines, factors, strict=True):
         answers = [replace(a, acceleration=factor * a.acceleration) for a in sound_answers(name)]
         context = RowContext("s", "f", name, name, "0")
-        found = judge_states(context, right, Evaluation(answers, None, None, 0.0))
+        found = judge_states(context, right, Evaluation(answers))
         rows += [replace(row, known_issue="entry" if name in recorded else None) for row in found.rows]
         deviations |= found.deviations
     return doubt_truth(rows, deviations, lambda name: name.partition("-")[0], defines_truth)
@@ -123,7 +123,7 @@ def rows_of_engines(*defective_engines, defect="mass-1-1e-5", leave_out=()):
         engine = load_adapter(name)
         if name in defective_engines:
             engine = plant(replace(planted, engine=name))
-        reported = Evaluation(engine.evaluate(model, right.states), None, None, 0.0)
+        reported = Evaluation(engine.evaluate(model, right.states))
         found += judge_states(RowContext("s", "f", name, engine.title, "0"), right, reported).rows
     return found
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from plumbline.engines.engine_calls import Evaluation, run_refinement
+from plumbline.engines.no_answer import NoAnswer
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.rows import RowContext
 from plumbline.judging.state_level import STATE_UNITS, judge_states
@@ -101,7 +102,7 @@ def judge_shifted_answers(*off, bounds=None, **evaluation):
         shift = np.zeros((2, 3))
         shift[body] = by * bounds[state].acceleration[body] * np.array([2.0, -1.0, 2.0]) / 3
         reported[state] = replace(reported[state], acceleration=reported[state].acceleration + shift)
-    answer = {"quantities": reported, "unsupported": None, "failure": None, "cpu_time": 0.25} | evaluation
+    answer = {"quantities": reported, "cpu_time": 0.25} | evaluation
     return judge_states(WHO, StateTruth(STATES, right, bounds, "itself"), Evaluation(**answer))
 
 
@@ -161,8 +162,8 @@ def test_quantities_that_an_engine_does_not_offer_or_deliver_are_reported():
     assert (row.verdict, row.unit, row.level, row.integrator) == ("unsupported", "N", "state", "-")
     assert row.reason == "Reference offers no joint reaction of its own"
     assert len(rows) == len(CHAIN_QUANTITIES)
-    for field, verdict in (("unsupported", "unsupported"), ("failure", "failed")):
-        (row,) = judge_shifted_answers(**{field: "because"}).rows
+    for is_refusal, verdict in ((True, "unsupported"), (False, "failed")):
+        (row,) = judge_shifted_answers(no_answer=NoAnswer("because", is_refusal)).rows
         assert (row.quantity, row.verdict, row.reason) == ("all", verdict, "because")
         assert (row.integrator, row.level, row.value) == ("-", "state", None)
 
@@ -195,7 +196,7 @@ def test_the_uncertainty_of_a_limit_widens_the_bound_and_is_stated(share, verdic
         for a, b in zip(reported, bounds, strict=True)
     ]
     truth = StateTruth(STATES, reported, bounds, "itself")
-    rows = judge_states(WHO, truth, Evaluation(answers, None, None, 0.0)).rows
+    rows = judge_states(WHO, truth, Evaluation(answers)).rows
     row, others = rows[0], rows[1:]
     largest = share * max(float(np.max(b.acceleration)) for b in bounds)
     assert row.quantity == "acceleration" and row.verdict == verdict
@@ -208,7 +209,7 @@ def test_a_scale_of_zero_is_no_reason_to_be_blunt():
     still = [replace(s, omega=0 * s.omega, v=0 * s.v) for s in STATES]
     right = load_adapter("reference").evaluate(MODEL, still)
     bounds = [state_rounding_bound(MODEL, s) for s in still]
-    found = judge_states(WHO, StateTruth(still, right, bounds, "itself"), Evaluation(right, None, None, 0.0))
+    found = judge_states(WHO, StateTruth(still, right, bounds, "itself"), Evaluation(right))
     row = next(row for row in found.rows if row.quantity == "kinetic_energy")
     assert (row.verdict, row.value, row.tolerance) == ("agrees", 0.0, 0.0)
     assert (row.extra["relative"], row.extra["bound_relative"]) == (0.0, 0.0)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from plumbline.engines.engine_calls import StepAttempt, StepEvaluation, run_steps
+from plumbline.engines.no_answer import NoAnswer
 from plumbline.engines.registry import load_adapter
 from plumbline.execution.plan import Plan, TaskKind, task_keys
 from plumbline.judging.rows import RowContext, Verdict
@@ -242,10 +243,10 @@ def test_a_weight_wrong_by_1e_minus_9_is_reported_on_one_body():
 def test_an_engine_that_refuses_or_fails_has_one_row():
     model, states = subject("balls")
     integrator = load_adapter("exudyn-tree").integrator("RK44")
-    refused = StepEvaluation([StepAttempt(0, 0.01, refusal="angles are singular")], 0.1)
+    refused = StepEvaluation([StepAttempt(0, 0.01, refusal=NoAnswer("angles are singular", True))], 0.1)
     (row,) = rows_of(integrator, model, states, refused)
     assert (row.verdict, row.quantity, row.reason) == (Verdict.UNSUPPORTED, "all", "angles are singular")
-    failed = StepEvaluation([StepAttempt(0, 0.01, failure="it crashed", place="in f")], 0.1)
+    failed = StepEvaluation([StepAttempt(0, 0.01, failure=NoAnswer("it crashed", False, place="in f"))], 0.1)
     (row,) = rows_of(integrator, model, states, failed)
     assert (row.verdict, row.reason, row.extra["place"]) == (Verdict.FAILED, "it crashed", "in f")
 

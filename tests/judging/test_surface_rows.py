@@ -12,9 +12,9 @@ import pytest
 from adapters import mujoco_surface
 from plumbline.engines.engine_calls import Evaluation, evaluate_states, evaluate_variants, stack_answers
 from plumbline.engines.missing_names import FAILED_PARTS, IS_APART, add_parts
+from plumbline.engines.no_answer import NoAnswer
 from plumbline.engines.registry import load_adapter
 from plumbline.engines.surface import SURFACES
-from plumbline.engines.variants import NoAnswer
 from plumbline.judging.findings import find_findings
 from plumbline.judging.rows import RowContext, Verdict, most_wrong_call
 from plumbline.judging.state_level import judge_variants
@@ -56,7 +56,7 @@ def answers_of(engine, model, states):
 
 
 def verdicts(truth, answers):
-    rows = judge_surface(WHO, truth, Evaluation([], None, None, 0.0, surface=answers))
+    rows = judge_surface(WHO, truth, Evaluation([], surface=answers))
     return {row.quantity: row.verdict for row in rows}
 
 
@@ -76,7 +76,7 @@ def assert_agree(rows):
 
 
 def rows_of_variants(truth, variants):
-    return judge_variants(WHO, truth, Evaluation([], None, None, 0.0, variants=variants))
+    return judge_variants(WHO, truth, Evaluation([], variants=variants))
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +94,7 @@ def test_every_call_agrees_and_a_relative_change_of_1e_6_is_seen(engine, given, 
     found = verdicts(truth, answers)
     assert_all_but_wrong_agree(engine, found)
     calls = {name for by_call in answers.values() for call in by_call for name in call}
-    evaluation = Evaluation([], None, None, 0.0, surface=answers)
+    evaluation = Evaluation([], surface=answers)
     assert set(exercised_names(truth, evaluation)) == calls
 
 
@@ -187,9 +187,7 @@ def test_bodies_of_a_loop_are_compared_and_a_relative_change_of_1e_6_is_seen(eng
 @pytest.mark.parametrize(("engine", "count"), [("mujoco", 30), ("pinocchio", 20), ("exudyn", 15)])
 def test_every_variant_agrees_and_a_relative_change_of_1e_6_is_seen(engine, count, tree):
     model, states, truth = tree
-    evaluation = Evaluation(
-        [], None, None, 0.0, variants=evaluate_variants(load_adapter(engine), model, states)
-    )
+    evaluation = Evaluation([], variants=evaluate_variants(load_adapter(engine), model, states))
     assert_agree(judge_variants(WHO, truth, evaluation))
     names = {name for variants in evaluation.variants.values() for call in variants for name in call}
     assert len(names) >= count and set(exercised_names(truth, evaluation)) == names
@@ -265,7 +263,7 @@ def test_an_answer_of_another_shape_disagrees_and_a_failure_is_a_row(tree):
     _, _, truth = tree
     short = {"frame_position": {("f",): truth.surface["frame_position"].value[:, :1]}}
     assert verdicts(truth, short) == {"frame_position": Verdict.DISAGREES}
-    (row,) = judge_surface(WHO, truth, Evaluation([], None, None, 0.0, surface_failure="it crashed"))
+    (row,) = judge_surface(WHO, truth, Evaluation([], surface_failure=NoAnswer("it crashed", False)))
     assert (row.verdict, row.quantity, row.reason) == (Verdict.FAILED, "all", "it crashed")
 
 
@@ -280,7 +278,7 @@ def test_a_wrong_call_is_named(tree):
     model, states, truth = tree
     answers = evaluate_states("mujoco", model, states, ["surface"]).surface["frame_angular_velocity_local"]
     wrong = {call: value * ("mjtSensor.mjSENS_GYRO" not in call) for call, value in answers.items()}
-    evaluation = Evaluation([], None, None, 0.0, surface={"frame_angular_velocity_local": wrong})
+    evaluation = Evaluation([], surface={"frame_angular_velocity_local": wrong})
     (row,) = judge_surface(WHO, truth, evaluation)
     assert row.verdict == Verdict.DISAGREES
     assert "by mjtSensor.mjSENS_GYRO, mj_sensorVel is off by" in row.reason and "too" not in row.reason
@@ -300,7 +298,7 @@ def test_calls_are_what_findings_are_about_whatever_quantities_they_get_wrong(tr
     variants = {"option": {("a",): right, ("b", "c"): wrong}}
     rows = rows_of_variants(truth, variants)
     masses = dict.fromkeys((("e",), ("d",)), 2 * truth.surface["total_mass"].value)
-    rows += judge_surface(WHO, truth, Evaluation([], None, None, 0.0, surface={"total_mass": masses}))
+    rows += judge_surface(WHO, truth, Evaluation([], surface={"total_mass": masses}))
     found = find_findings(rows, {"s": model.n})
     assert {f.title: set(f.quantities) for f in found} == {
         "wrong by b, c": {"acceleration_by_option", "kinetic_energy_by_option"},

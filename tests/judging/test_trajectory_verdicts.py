@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from plumbline.engines.engine_calls import RefinementRun, RefinementStudy
+from plumbline.engines.no_answer import NoAnswer
 from plumbline.judging.refinement_analysis import RefinementAnalysis
 from plumbline.judging.rows import RowContext
 from plumbline.judging.trajectory_level import judge_trajectory, pose_columns
@@ -84,10 +85,10 @@ def refinement_study(errors=None, **more):
     """A study with error c h² and cost 1, 2, 3, … s; or with these errors."""
     errors = [0.01 * h**2 for h in STEPS] if errors is None else errors
     runs = [
-        RefinementRun(h, trajectory_with_error(e, **more), None, i + 1.0)
+        RefinementRun(h, trajectory_with_error(e, **more), i + 1.0)
         for i, (h, e) in enumerate(zip(STEPS, errors, strict=True))
     ]
-    return RefinementStudy(runs, None)
+    return RefinementStudy(runs)
 
 
 def judged_rows(study=None, method=METHOD, model=MODEL, **changes):
@@ -183,8 +184,8 @@ def test_differences_within_four_times_the_rounding_have_no_order(factor, until)
 
 def test_order_is_of_positions_and_velocities_over_their_scales():
     """Positions without error and velocities of order 1: an order 1, not a rounding floor."""
-    made = [RefinementRun(h, trajectory_with_error(0.0, 0.0, 0.01 * h), None, 0.0) for h in STEPS]
-    held = analysis(RefinementStudy(made, None))
+    made = [RefinementRun(h, trajectory_with_error(0.0, 0.0, 0.01 * h)) for h in STEPS]
+    held = analysis(RefinementStudy(made))
     assert held.observed.value == pytest.approx(1)
     sizes = held.truth.length, held.invariant_scales["gap_rate"]
     expected = np.concatenate([TRUE_TRAJECTORY.r / sizes[0], made[0].trajectory.v / sizes[1]], -1)
@@ -261,7 +262,7 @@ def test_the_border_is_the_tolerance_and_the_tolerance_what_is_visible():
 
 def test_runs_that_did_not_stay_finite_are_points_of_the_study():
     some = refinement_study()
-    some.runs[0] = replace(some.runs[0], trajectory=None, failure="blew up")
+    some.runs[0] = replace(some.runs[0], trajectory=None, failure=NoAnswer("blew up", False))
     found = judge_trajectory(WHO, MODEL, make_truth(), METHOD, some)
     assert {row.verdict for row in found.rows} == {"agrees", "information"}
     table = dict(found.tables)["convergence"]
@@ -277,11 +278,13 @@ def test_runs_that_did_not_stay_finite_are_points_of_the_study():
     assert "position" not in reported
     curves = dict(alone.tables)["curves"]
     assert np.all(np.isnan([curves["limit_error"], curves["tolerance"]]))
-    some.runs[-1] = replace(some.runs[-1], trajectory=None, failure="NaN at 1 s")
+    some.runs[-1] = replace(some.runs[-1], trajectory=None, failure=NoAnswer("NaN at 1 s", False))
     (lost,) = judge_trajectory(WHO, MODEL, make_truth(), METHOD, some).rows
     assert (lost.quantity, lost.verdict, lost.integrator) == ("all", "failed", "Heun")
     assert lost.reason == "at the finest resolution 0.000976562: NaN at 1 s"
-    (never,) = judge_trajectory(WHO, MODEL, make_truth(), METHOD, RefinementStudy([], "no drag here")).rows
+    (never,) = judge_trajectory(
+        WHO, MODEL, make_truth(), METHOD, RefinementStudy([], NoAnswer("no drag here", True))
+    ).rows
     assert (never.quantity, never.verdict, never.reason) == ("all", "unsupported", "no drag here")
     assert (lost.level, never.level, never.integrator) == ("trajectory", "trajectory", "Heun")
 
@@ -356,7 +359,7 @@ def test_the_sign_of_an_attitude_is_that_of_its_body_and_time():
     signs = np.random.default_rng(1).choice([-1.0, 1.0], size=(17, 2, 1))
     still = np.zeros((17, 2, 3))
     runs = [Trajectory(TIMES, still, x, still, 0 * x, 1) for x in (signs * other, p)]
-    made = [RefinementRun(h, run, None, 0.0) for h, run in zip(STEPS, runs, strict=False)]
+    made = [RefinementRun(h, run) for h, run in zip(STEPS, runs, strict=False)]
     held = RefinementAnalysis(WHO, model, make_truth(trajectory=runs[1]), METHOD, made, 2.0)
     assert np.array_equal(held.samples["attitude"][0], other)
     assert np.array_equal(held.samples["attitude"][1], p)
@@ -370,7 +373,7 @@ def test_scales_are_sizes_of_what_the_invariants_are_made_of():
     state = pendulums.state_from_seed(model, seed=3, rate=4.0)
     true = pendulums.reference_trajectory(model, state, TIMES)
     held = RefinementAnalysis(
-        WHO, model, make_truth(trajectory=true), METHOD, [RefinementRun(0.1, true, None, 0.0)], 2.0
+        WHO, model, make_truth(trajectory=true), METHOD, [RefinementRun(0.1, true)], 2.0
     )
     scales, omega = held.invariant_scales, angular_velocity(true.p, true.pdot)
     g = np.linalg.norm(model.gravity)
@@ -474,11 +477,8 @@ def test_what_the_quadrature_of_the_work_leaves_open_is_allowed():
     """Drag: energy by the samples' spline; its uncertainty is part of the tolerance, and only there."""
     model = replace(MODEL, drag_moment=np.array([1e-5]))
     true = pendulums.reference_trajectory(model, pendulums.state_from_seed(model, seed=2, rate=0.5), TIMES)
-    runs = [
-        RefinementRun(h, replace(true, v=true.v * (1 + h**2 * TIMES[:, None, None])), None, 0.0)
-        for h in STEPS
-    ]
-    found = judged_rows(RefinementStudy(runs, None), model=model, trajectory=true)
+    runs = [RefinementRun(h, replace(true, v=true.v * (1 + h**2 * TIMES[:, None, None]))) for h in STEPS]
+    found = judged_rows(RefinementStudy(runs), model=model, trajectory=true)
     uncertain = compute_invariants(model, runs[-1].trajectory).uncertainty["energy_drift"]
     assert uncertain > 1e-8
     row = found["energy_drift"]

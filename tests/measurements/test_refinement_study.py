@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from plumbline.engines.engine_calls import RefinementStudy, run_refinement
+from plumbline.engines.no_answer import NoAnswer
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.trajectory_level import judge_trajectory
 from plumbline.measurements import refinement_study
@@ -101,7 +102,7 @@ def test_the_order_must_be_the_declared_one(monkeypatch):
 @pytest.mark.parametrize("lost", range(6))
 def test_a_study_counts_from_its_last_failure_on(lost):
     study = study_with_errors(1e-3 * H**2)
-    study.runs[lost] = replace(study.runs[lost], trajectory=None, failure="diverged")
+    study.runs[lost] = replace(study.runs[lost], trajectory=None, failure=NoAnswer("diverged", False))
     first = lost + 1 + MIN_RUNS if lost < MIN_RUNS else MIN_RUNS
     assert stops_after(study) == (first if first <= 6 else None)
 
@@ -115,7 +116,7 @@ def test_a_resolved_limit_that_is_wrong_is_reported_all_the_same():
     study = study_with_errors(1e-3 * H**2 + 1e-11)
     number = stops_after(study)
     assert number is not None and number < len(STEPS)
-    rows = judged_rows(RefinementStudy(study.runs[:number], None), **SHARP)
+    rows = judged_rows(RefinementStudy(study.runs[:number]), **SHARP)
     assert {rows["position_limit"].verdict, rows["attitude_limit"].verdict} == {"disagrees"}
 
 
@@ -133,7 +134,7 @@ def test_no_finer_step_lowers_a_bound_by_more_than_the_margin(coefficients, size
     if number is None:
         return
     stopped, *finer = (
-        judged_rows(RefinementStudy(study.runs[:n], None), **SHARP) for n in range(number, len(STEPS) + 1)
+        judged_rows(RefinementStudy(study.runs[:n]), **SHARP) for n in range(number, len(STEPS) + 1)
     )
     for quantity in ("position_limit", "attitude_limit"):
         for rows in finer:
@@ -174,7 +175,7 @@ def test_sampled_rates_that_are_scaled_late_are_reported():
     wrong = {}
     for name, motions in (("as sampled", sampled), ("scaled", scaled)):
         runs = [replace(run, trajectory=motion) for run, motion in zip(study.runs, motions, strict=True)]
-        rows = judge_trajectory(WHO, s.model, truth, integrator, RefinementStudy(runs, None)).rows
+        rows = judge_trajectory(WHO, s.model, truth, integrator, RefinementStudy(runs)).rows
         wrong[name] = {r.quantity for r in rows if r.level == "trajectory" and r.verdict == "disagrees"}
     assert wrong == {"as sampled": set(), "scaled": {"velocity_limit", "angular_velocity_limit"}}
 

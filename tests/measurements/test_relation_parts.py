@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from plumbline.engines.no_answer import NoAnswer
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.relation_rows import judge_relations
 from plumbline.judging.rows import RowContext
@@ -83,19 +84,19 @@ def test_a_relation_is_as_far_off_as_its_worst_quantity_over_both_bounds(quantit
     # off is rounded where it is added: by half a unit of a quantity whose bound is 540 units and more
     assert found.ratio == pytest.approx(by, rel=1e-3)
     assert (found.quantity, found.worst_state, found.state_count) == (quantity, 2, 3)
-    assert (found.relation, found.integrator, found.steps, found.refusal_reason) == ("as itself", "-", 0, "")
+    assert (found.relation, found.integrator, found.steps, found.no_answer) == ("as itself", "-", 0, None)
 
 
 def test_equal_answers_and_refused_ones():
     assert self_relation_result().ratio == 0.0
     some = self_relation_result((0, "acceleration", 5.0), (1, "acceleration", 3.0), refuse=(0,))
-    assert (some.state_count, some.worst_state) == (2, 1) and some.refusal_reason == "not state 0"
+    assert (some.state_count, some.worst_state) == (2, 1) and some.no_answer is None
     assert some.ratio == pytest.approx(3, rel=1e-3)  # rounded as above
     mine = self_relation_result((2, "acceleration", 5.0), (1, "acceleration", 3.0), refuse_here=(2,))
-    assert (mine.state_count, mine.worst_state, mine.refusal_reason) == (2, 1, "nor state 2")
+    assert (mine.state_count, mine.worst_state, mine.no_answer) == (2, 1, None)
     none = self_relation_result(refuse=(0, 1, 2))
     assert (none.ratio, none.quantity, none.worst_state, none.state_count) == (None, "", 0, 0)
-    assert none.refusal == "unsupported"
+    assert none.no_answer.is_refusal
 
     def refusing(_model, _states):
         raise Unsupported("never")
@@ -110,7 +111,7 @@ def test_an_option_by_which_the_engine_fails_is_a_failure_of_its_own_row():
     answers = load_adapter("reference").evaluate(MODEL, STATES)
     bounds = [state_rounding_bound(MODEL, state) for state in STATES]
     found = check_state_relation(Relation("by it"), answers, failing, MODEL, STATES, bounds, bounds)
-    assert (found.relation, found.ratio, found.refusal) == ("by it", None, "failed")
+    assert (found.relation, found.ratio, found.no_answer.is_refusal) == ("by it", None, False)
     (row,) = judge_relations(WHO, [found]).rows
     assert row.verdict == "failed" and "no such option" in row.reason
     assert row.extra["place"].startswith("AttributeError in ") and row.extra["place"].endswith(" > failing")
@@ -157,7 +158,6 @@ def test_runs_are_measured_by_length_turn_and_speed():
         1,
         integrator="trapezoidal",
         steps=64,
-        refusal_reason="",
         resolution=0.25,
         end_time=8.0,
     )
@@ -210,10 +210,9 @@ def test_rows_say_what_held_what_did_not_and_what_was_refused():
     )
     lost = refused_result("by sparse", METHOD, EngineFailure("it stopped"))
     never = refused_result("by sparse", METHOD, Unsupported("no such solver"))
-    assert lost == RelationResult(
-        "by sparse", None, "", 0, 0, "it stopped", "failed", "trapezoidal", 0, 0.0, 0.0, place="EngineFailure"
-    )
-    assert (one.refusal_reason, one.integrator, one.steps) == ("", "-", 0)
+    stopped = NoAnswer("it stopped", False, place="EngineFailure")
+    assert lost == RelationResult("by sparse", None, no_answer=stopped, integrator="trapezoidal")
+    assert (one.no_answer, one.integrator, one.steps) == (None, "-", 0)
     rows = judge_relations(
         WHO, [one, off, replace(one, ratio=1.0), run, replace(run, ratio=7.0), lost, never]
     ).rows

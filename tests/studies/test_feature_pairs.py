@@ -91,9 +91,7 @@ def wrong_rows(engine, name, feature):
     changed = without_feature(scenario.model, feature)
     answers = load_adapter(engine).evaluate(changed, [complete_state(changed, one) for one in states])
     context = RowContext(name, "", engine, engine, "0")
-    rows = judge_states(
-        context, state_truth(scenario.model, states), Evaluation(answers, None, None, 0.0)
-    ).rows
+    rows = judge_states(context, state_truth(scenario.model, states), Evaluation(answers)).rows
     return [row.quantity for row in rows if row.verdict == Verdict.DISAGREES]
 
 
