@@ -45,12 +45,16 @@ def test_states_of_random_loops_are_right(engine, closing, seed):
     for state, found in zip(states, load_adapter(engine).evaluate(model, states), strict=True):
         truth, bound = certify_state(model, state).quantities, state_rounding_bound(model, state)
         assert_within_bound(found, truth, bound)
-        for name, scale in bound.scale.items():
-            assert name == "mass_matrix" or np.max(bound.tolerance(name)) < 1e-9 * np.max(scale), name
+        used = {}  # of the bounds
         for name in VECTORS:
             value = getattr(truth, name)
-            off = np.max(sizes(getattr(found, name) - value))
-            assert off <= 1e-10 * np.max(np.abs(value)), name
+            off = sizes(getattr(found, name) - value)
+            assert np.max(off) <= 1e-10 * np.max(np.abs(value)), name
+            used[name] = np.max(off / bound.tolerance(name))
+        for name, scale in bound.scale.items():
+            # where rows nearly depend on each other, what engines are off by grows as the bound does
+            is_sharp = np.max(bound.tolerance(name)) < 1e-9 * np.max(scale) or used.get(name, 0.0) > 1e-4
+            assert name == "mass_matrix" or is_sharp, name
 
 
 @pytest.mark.parametrize("engine", ["exudyn-tree", "pinocchio-aba", "reference-printed"])
