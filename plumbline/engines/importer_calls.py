@@ -87,5 +87,5 @@ def evaluate_model_file(
         label = f"{name}, state {index}"
         check_record(answer, ModelQuantities, {"n": len(state.velocities)}, label, ("acceleration",))
         for body, pose in answer.poses.items():
-            check_numbers(pose, "3 4", {}, f"{label}: pose of {body}", is_optional=True)
+            check_numbers(pose, "3 4", {}, f"{label}: pose of {body}")
     return answers

@@ -30,6 +30,7 @@ from plumbline.processes.exceptions import PlumblineError
 from plumbline.processes.isolation import ScratchFolder
 from plumbline.processes.worker_pool import Limits, Task, WorkerPool
 from plumbline.reproduce.render import template_environment
+from plumbline.scenario.line_and_column_errors import Problem
 
 FORMS = ("mujoco", "pinocchio", "exudyn", "drake", "dart")
 SHRINKING_SECONDS = 60.0
@@ -121,7 +122,10 @@ def write_model_script(
     with ScratchFolder("plumbline-script-") as scratch, WorkerPool(1, plan.limits) as workers:
         bench = _Bench(plan, scratch, workers)
         original = bench.judged(Path(shown))
-        if original is None or not _differs(original):
+        if original is None:
+            problems = [str(problem) for problem in bench.problems]
+            raise NoModelScript("; ".join(problems) or f"{importer} gives no answer on {shown}")
+        if not _differs(original):
             raise NoModelScript(f"{importer} does not differ on {shown}")
         wanted = _signature(original.explanations.get(importer))
 
@@ -173,6 +177,7 @@ class _Bench:
         self.engines = describe_importers(plan, workers)
         self.info = self.engines[self.importer]
         self.run: FileRun
+        self.problems = list[Problem]()  # of the file that was judged last
         self.folders = itertools.count()
 
     def call(self, function: Any, *arguments: Any) -> Any:
@@ -194,7 +199,7 @@ class _Bench:
         plan = replace(self.plan, root=None) if is_inside else self.plan
         run = FileRun(plan, self.engines, str(path), self.scratch / str(next(self.folders)))
         run_files([run], self.workers, lambda *_: None)
-        found = run.follow(run.result)
+        found, self.problems = run.follow(run.result), run.problems
         if not found or not run.answers[self.importer].quantities or not found[0].model.joints:
             return None
         self.run = run
@@ -298,6 +303,8 @@ def _shown_numbers(
         return
     states = _simple_states(reading)
     answers = bench.call(evaluate_model_file, bench.name, bench.run.prepared.file, tuple(states))
+    if answers is None:
+        return
     applied = all(answer.passive_force is not None for answer in answers)
     judged, theirs = (m if applied else without_passive_forces(m) for m in (model, reading))
     truths = certify_states(judged, _simple_states(model))

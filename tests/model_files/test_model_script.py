@@ -1,6 +1,7 @@
 """Scripts of importers' differences: small files, at most 40 lines, and they print what they claim."""
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -164,6 +165,20 @@ def test_an_importer_that_agrees_has_no_script(tmp_path):
     path.write_text(MJCF)
     with pytest.raises(NoModelScript, match="does not differ"):
         write_model_script(plan_of(path, "mujoco"), "mujoco", seconds=1)
+
+
+def end_the_worker(*_):
+    os._exit(1)
+
+
+def test_a_file_that_is_gone_and_a_worker_that_is_lost_are_named(tmp_path, monkeypatch):
+    path = tmp_path / "moon.xml"
+    with pytest.raises(NoModelScript, match=r"moon\.xml.*No such file"):
+        write_model_script(plan_of(path, "pinocchio"), "pinocchio", seconds=0)
+    path.write_text(MJCF)
+    monkeypatch.setattr(model_script, "evaluate_model_file", end_the_worker)
+    with pytest.raises(NoModelScript, match="does not show"):
+        write_model_script(plan_of(path, "pinocchio"), "pinocchio", seconds=0)
 
 
 def test_shrinking_keeps_what_is_looked_for_and_drops_the_rest():
