@@ -68,9 +68,7 @@ def _invariant_row(study: RefinementAnalysis, quantity: str, unit: str, samples:
         failure = str(error)
     if drift[end] <= floor:
         reason = f"{name} {with_unit(drift[end], unit)}: rounding"
-        return row(
-            Verdict.AGREES, reason, end, floor, ratio=drift[end] / floor, limit_tolerance=tolerance[end]
-        )
+        return row(Verdict.AGREES, reason, end, floor, limit_tolerance=tolerance[end])
     if failure:
         return row(Verdict.UNRESOLVED, failure, end, floor)
     limit_drift = np.maximum.accumulate(np.max(np.linalg.norm(limit.y, axis=-1), axis=1))

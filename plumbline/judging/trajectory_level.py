@@ -233,7 +233,7 @@ def _rows_against_truth(study: RefinementAnalysis, name: str) -> list[Row]:
         reason,
         value=off[at],
         tolerance=tolerance[at],
-        ratio=off[at] / tolerance[at],
+        ratio=off[at] / tolerance[at] if tolerance[at] > 0 else None,  # 0 of what nothing moves
         derivation=f"up to t = {end:g} s: limit ({how}) ± {limit_uncertainty[at]:.2g}, "
         f"truth ({study.truth.method}) ± {truth_uncertainty[at]:.2g}, "
         f"rounding {study.rounding_description} × {with_unit(study.motion_scales[name], unit, 3)} = "

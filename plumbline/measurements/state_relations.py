@@ -399,7 +399,8 @@ def check_state_relation(
             difference = theirs[q] - mine[q]
             worst = max(worst, (_largest_ratio(difference, allowed), q, index))
             unexplained = max(unexplained, _largest_ratio(difference - missing.get(q, 0.0), allowed))
-    if refused and not count:
+    if not count:
+        assert refused is not None
         return RelationResult(relation.name, None, no_answer=NoAnswer.by(refused))
     left = unexplained if relation.missing_term else None
     return RelationResult(relation.name, *worst, count, unexplained=left)

@@ -161,7 +161,7 @@ class Trajectory:
     v: Float[Array, "samples bodies 3"]  # m/s, ṙ
     pdot: Float[Array, "samples bodies 4"]  # 1/s; ½ L(p)ᵀ ω′ where the engine holds ω′
     steps: int  # steps the integrator took
-    # rad or m: joint coordinates at t[0], angles unwrapped; None: angles are principal values there
+    # rad or m: joint coordinates at t[0], angles unwrapped; None: principal values there, but with a pitch
     initial_x: Float[Array, "bodies coordinates"] | None = None
     # of a run that is extrapolated from softer ones, the same by an order less: their difference is how
     # uncertain it is

@@ -605,7 +605,7 @@ def joint_coordinates(
 
 
 def with_joint_coordinates(model: Model, state: State) -> State:
-    """Compute the joint coordinates of a state from the motion of its bodies; angles in (−π, π].
+    """Compute the joint coordinates of a state from the motion of its bodies, as `coordinates_of_joints`.
 
     Args:
         model: a tree.
@@ -624,7 +624,9 @@ def coordinates_of_joints(
     Float[Array, "... joints coordinates"],
     Float[Array, "... joints coordinates"],
 ]:
-    """Compute coordinates of joints from the motion of the bodies; angles in (−π, π].
+    """Compute coordinates of joints from the motion of the bodies.
+
+    Angles are in (−π, π]; of joints with a pitch they count full turns.
 
     Args:
         model: its numbers and the state may have the same leading axes.

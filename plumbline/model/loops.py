@@ -670,9 +670,6 @@ def determinate_projectors(model: Model, state: State) -> Float[Array, "joints 6
 def wrench_length(model: Model) -> float:
     """Return the length that makes moments comparable with forces.
 
-    Args:
-        model: with loops.
-
     Returns:
         ℓ [m], the mean distance of joints from centres of mass.
 

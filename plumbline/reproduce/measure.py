@@ -397,7 +397,7 @@ class ConvergenceMeasure:
             times,
             ordered="order" in wanted and "order" in rows,
             drifts=tuple(series) if of_invariants else (),
-            sizes=(truth.length, analysis.invariant_scales["gap_rate"]),
+            sizes=(truth.length, analysis.invariant_scales["gap_rate"] or 1.0),
             eliminated={q: analysis.extrapolated_limit(ys).eliminated_powers for q, ys in series.items()},
         )
 

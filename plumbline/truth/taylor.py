@@ -41,6 +41,7 @@ from plumbline.model.loops import CutMechanism, cut_open, independent_rows
 from plumbline.processes.processor import processor_features
 from plumbline.processes.user_cache import content_key, recall, remember
 from plumbline.truth import import_truth_tool
+from reference_impl import joint_kinds
 
 Precision = Literal["double", "extended", "quad", "octuple"]
 OCTUPLE_BITS, OCTUPLE_DIGITS = 237, 75
@@ -339,7 +340,7 @@ def _compiled_integrator(structure: Structure, precision: Precision, order: int 
     It is remembered with its machine code: to read it takes a third to a quarter of the time of compiling it.
     """
     hy = load_heyoka()
-    sources = (__file__, tree.__file__, arithmetic.__file__)
+    sources = (__file__, tree.__file__, arithmetic.__file__, joint_kinds.__file__)
     code = b"".join(Path(file).read_bytes() for file in sources)
     key = content_key(
         "Taylor", code, hy.__version__, processor_features(), repr((structure, precision, order))

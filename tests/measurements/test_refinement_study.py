@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from plumbline.engines.engine_calls import RefinementStudy, run_refinement
+from plumbline.engines.engine_calls import RefinementRun, RefinementStudy, run_refinement
 from plumbline.engines.no_answer import NoAnswer
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.trajectory_level import judge_trajectory
@@ -23,6 +23,7 @@ from plumbline.measurements.refinement_study import (
     scaled_states,
 )
 from plumbline.model.datatypes import Integrator
+from plumbline.model.kinematics import complete_state
 from plumbline.truth.ground_truth import RUN_ROUNDING, motion_truth
 from tests.helpers.catalogue import catalogue_scenario
 from tests.judging.test_trajectory_verdicts import (
@@ -185,6 +186,18 @@ def test_runs_of_what_nothing_moves_differ_by_rounding_unless_they_move(drift, i
     r = np.broadcast_to([0.1, 0.2, -0.3], (9, 1, 3))
     runs = scaled_states([r] * 4, [drift * k + 0 * r for k in range(4)], 0.5, 0.0)
     assert observed_order(runs, RUN_ROUNDING / 8, 4).is_at_rounding_floor is is_rounding
+
+
+def test_rows_of_what_nothing_moves_have_no_ratio_of_zeros():
+    s = catalogue_scenario("tumbling-ball")
+    model = s.model.changed(**{name: 0 * getattr(s.model, name) for name in ("gravity", "force", "moment")})
+    still = complete_state(model, replace(s.state, omega=0 * s.state.omega))
+    truth = motion_truth(model, still, s.times, None)
+    runs = [RefinementRun(h, replace(truth.trajectory, steps=64)) for h in (0.02, 0.01, 0.005, 0.0025)]
+    integrator = load_adapter("mujoco").integrator("RK4")
+    rows = judge_trajectory(WHO, model, truth, integrator, RefinementStudy(runs)).rows
+    assert {row.verdict for row in rows} <= {"agrees", "information"} and len(rows) >= 8
+    assert not any(np.isnan(row.ratio) for row in rows if row.ratio is not None)
 
 
 def test_the_rule_cannot_see_the_truth():

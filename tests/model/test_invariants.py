@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from plumbline.model.datatypes import State, Trajectory
+from plumbline.model.datatypes import JOINT_ELEMENTS, State, Trajectory
 from plumbline.model.invariants import (
     INVARIANT_UNITS,
     attitude_error,
     compute_invariants,
+    element_energies,
     first_departure,
     inertia_ratio,
     kinetic_energy,
@@ -219,6 +220,26 @@ def test_the_energy_of_a_spring_counts_full_turns():
     assert np.max(np.abs(compute_invariants(model, run).energy_drift)) < 1e-10
     lost = compute_invariants(model, replace(run, initial_x=None)).energy_drift
     assert np.max(np.abs(lost)) > 10
+
+
+def test_a_spring_on_a_closing_joint_with_a_pitch_counts_full_turns():
+    """The body screws along z; what it slides says how often it has turned, whatever the run begins with."""
+    pitch, stiffness, rest = 0.3, 2.5, 1.0
+    model = replace(
+        tree_from_seed(0, 1, ("cylindrical",), loads=False),
+        kind=("cylindrical", "helical"), body=np.array([[-1, 0], [-1, 0]]), point=np.zeros((2, 2, 3)),
+        turn=np.tile([1.0, 0, 0, 0], (2, 2, 1)), length=np.array([0.0, pitch]), gravity=np.zeros(3),
+        **{name: np.zeros((2, 2)) for name in JOINT_ELEMENTS},
+    )  # fmt: skip
+    model = model.changed(stiffness=np.diag([0.0, stiffness])[:, ::-1], rest=np.diag([0.0, rest])[:, ::-1])
+    angle = np.linspace(4.0, 14.0, 49)
+    p = np.stack([np.cos(angle / 2), 0 * angle, 0 * angle, np.sin(angle / 2)], -1)[:, None]
+    r, omega = np.zeros((2, 49, 1, 3))
+    r[:, 0, 2], omega[..., 2] = pitch * angle, 1.0
+    run = Trajectory(angle - 4.0, r, p, pitch * omega, quaternion_rate(p, omega), 1)
+    np.testing.assert_allclose(
+        element_energies(model, run, omega).springs, stiffness * (angle - rest) ** 2 / 2, rtol=1e-12
+    )
 
 
 OPTIONS = ({}, {"loads": True}, {"drag": True})
