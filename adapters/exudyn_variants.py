@@ -492,10 +492,10 @@ _is_rod: Callable[[JointKind], bool] = attrgetter("holds_distance")
 
 VARIANTS = (
     *(
-        _spelling(f"itemInterface.{kind}", _has_no_axes, add_body=_node(kind, of, rates))
-        for kind, of, rates in (
-            ("NodeRigidBodyRxyz", _angles, _angle_rates),
-            ("NodeRigidBodyRotVecLG", rotation_vector, lambda _: np.eye(3)),
+        _spelling(name, _has_no_axes, add_body=_node(name.removeprefix("itemInterface."), of, rates))
+        for name, of, rates in (  # whole names, by which scripts leave out other entries
+            ("itemInterface.NodeRigidBodyRxyz", _angles, _angle_rates),
+            ("itemInterface.NodeRigidBodyRotVecLG", rotation_vector, lambda _: np.eye(3)),
         )
     ),
     _spelling(

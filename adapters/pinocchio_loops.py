@@ -9,8 +9,7 @@ the right side −γ + μ λ in turn leads to the solution for μ = 0, also wher
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import starmap
 from typing import Any, NamedTuple
 
@@ -29,7 +28,9 @@ DEPENDENT = 1e-10
 CORNERS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # m, points that hold a frame
 
 
-welded = partial(rigid_constraints, pin.ContactType.CONTACT_6D)
+def welded(m: pin.Model, pairs: Iterable[tuple[Place, Place]]) -> tuple[Any, Any]:
+    """Weld places of joints; the name of the kind is missing in version 2, which has no constraints."""
+    return rigid_constraints(pin.ContactType.CONTACT_6D, m, pairs)
 
 
 class Loops(NamedTuple):

@@ -64,7 +64,7 @@ def add_parts(found: FoundAnswer, *parts: Callable[[], object]) -> None:
             else:
                 _add_part(found, part)
         except EndedEarly as error:
-            _note(found, FAILED_PARTS, f"{_label(part)}: {error}", "")
+            _note(found, FAILED_PARTS, f"{_words(part)}: {error}", "")
 
 
 def _add_part(found: FoundAnswer, part: Callable[[], object]) -> FoundAnswer:
@@ -78,7 +78,7 @@ def _add_part(found: FoundAnswer, part: Callable[[], object]) -> FoundAnswer:
             raise
         _note(found, MISSING_NAMES, name)
     except Exception as error:  # an engine may raise anything, and other parts are to be compared
-        _note(found, FAILED_PARTS, f"{_label(part)}: {describe_exception(error)}", place_of(error))
+        _note(found, FAILED_PARTS, f"{_words(part)}: {describe_exception(error)}", place_of(error))
     return found
 
 
@@ -87,7 +87,15 @@ def _note(found: FoundAnswer, kind: str, *words: str) -> None:
 
 
 def _label(part: Callable[[], object]) -> str:
-    """What a part does, by the name of its function and, of a partial one, the texts that it is given."""
+    """What a part does, by the name of its function, which may be partial.
+
+    The parts of one function have one label: scripts have all of its lines, and call it for all of them.
+    """
     name: str = getattr(part, "func", part).__name__
+    return name.replace("_", " ").strip()
+
+
+def _words(part: Callable[[], object]) -> str:
+    """The label, and the texts that a partial function is given."""
     texts = [text for text in getattr(part, "args", ()) if isinstance(text, str)]
-    return " ".join([name.replace("_", " ").strip(), *texts])
+    return " ".join([_label(part), *texts])

@@ -145,6 +145,10 @@ LONG_LINKS = """import exudyn.rigidBodyUtilities as utilities
 real = utilities.HTtranslateZ
 utilities.HTtranslateZ = lambda z: real(1.0001 * z)
 """
+FAR_MIDDLES = """import pinocchio
+real = pinocchio.interpolate
+pinocchio.interpolate = lambda model, q, then, share: real(model, q, then, 1.0001 * share)
+"""
 HEAVY_STEP = """import mujoco
 real = mujoco.mj_step2
 def heavy(m, d):
@@ -157,6 +161,8 @@ SURFACE_DEFECTS = [  # engine, scenario, quantity, call, the defect; none: one o
     ("pinocchio", "furuta", "inverse_dynamics",
      "computeJointTorqueRegressor, Data.jointTorqueRegressor", HEAVY_REGRESSOR),
     ("exudyn", "furuta", "body_position", "rigidBodyUtilities.HTtranslateZ", LONG_LINKS),
+    # one of several parts that a function is called for
+    ("pinocchio", "furuta", "frame_position", "interpolate", FAR_MIDDLES),
     ("pinocchio", "universal-pendulum", "frame_acceleration_of_composite_joints",
      "frameJacobianTimeVariation, ReferenceFrame.LOCAL_WORLD_ALIGNED, JointModelComposite", ""),
     ("exudyn-tree", "light-cart-pole", "mass_matrix_by_vectors",
