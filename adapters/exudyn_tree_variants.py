@@ -13,7 +13,7 @@ from typing import Any, cast
 
 import exudyn
 import numpy as np
-from exudyn import graphics, kinematicTree, rigidBodyUtilities, robotics
+from exudyn import kinematicTree, rigidBodyUtilities, robotics
 
 from adapters.exudyn_common import (
     EXPLICIT,
@@ -38,7 +38,7 @@ utilities: Any = rigidBodyUtilities  # as below, functions are untyped
 trees: Any = kinematicTree
 robots: Any = robotics
 # To make the shapes of links, which nothing here draws, takes longer than the tree. One shape replaces all.
-_SHAPE = graphics.Lines([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+_SHAPE = {"type": "Line", "color": [0.0, 0.0, 0.0, 1.0], "data": [0.0] * 6}
 _UNDRAWN = robots.VRobotLink(showMBSjoint=False, showCOM=False, graphicsData=[_SHAPE])
 LONG_STEP = 2.0**20  # s: of one step of Euler's method, in which v₁ = v₀ + h a to the rounding of h a
 

@@ -1,6 +1,7 @@
 """Other versions of an engine: names, the other environment's process, and what is supported."""
 
 import ctypes
+import importlib
 import operator
 import os
 import re
@@ -19,7 +20,7 @@ from plumbline.engines import engine_calls, environments
 from plumbline.engines.registry import ENGINES
 from plumbline.judging import known_issues
 from plumbline.judging.rows import WRONG_CALL, RowContext
-from plumbline.processes.remote_python import call_remote
+from plumbline.processes.remote_python import call_fresh, call_remote
 from plumbline.processes.worker_pool import Limits, Task, WorkerPool
 from plumbline.truth.certified_state import certify_state
 from tests.helpers.catalogue import catalogue_scenario
@@ -135,6 +136,52 @@ def test_an_engine_gives_the_same_answer_in_another_environment():
     assert np.array_equal(here.mass_matrix, away.mass_matrix)
 
 
+LATER_NAMES = {  # of an engine's module, which adapters use and the oldest version that they take lacks
+    "mujoco": (
+        "MjSpec.attach mj_copyData mj_copyState mj_extractState mjtCtrlInput mjtMeshInertia mjtSameFrame "
+        "mjtSleepPolicy"
+    ),
+    "pinocchio": (
+        "ConstraintCholeskyDecomposition ConstraintModel ContactType Convention FrameAnchorConstraintModel "
+        "Inertia.FromPseudoInertia JointModelHelicalUnaligned JointModelUniversal ModelPool ProximalSettings "
+        "PointAnchorConstraintModel PseudoInertia RigidConstraintModel StdVec_ConstraintData Symmetric3 "
+        "StdVec_ConstraintModel StdVec_RigidConstraintData StdVec_RigidConstraintModel abaInParallel "
+        "buildModelFromMJCF classicAcceleration compactTangentMap computeConstraintDynamicsDerivatives "
+        "computeJointKinematicHessians computeKineticEnergyRegressor computeMechanicalEnergy "
+        "computePotentialEnergyRegressor constraintDynamics convertToRigidConstraintModel lieGroup "
+        "getConstraintJacobian getConstraintsJacobian getPointClassicAccelerationDerivatives "
+        "getPointVelocityDerivatives getTangentToConfigurationSparsitySegment initConstraintDynamics "
+        "rneaInParallel tangentMap tangentMapProduct tangentMapTransposeProduct transformJointIntoMimic"
+    ),
+    "exudyn": "ComputeItemType MainSystem.CreateCoordinateConstraint config graphics",
+}
+
+
+def acceleration_without(engine, names, column, model, state):
+    """Evaluate a state in a process where these names of the engine's module are missing."""
+    module = importlib.import_module(engine)
+    for name in names.split():
+        owner, _, last = name.rpartition(".")
+        delattr(getattr(module, owner) if owner else module, last)
+        if f"{engine}.{name}" in sys.modules:
+            sys.modules[f"{engine}.{name}"] = None  # or it would be imported again
+    found = engine_calls.evaluate_states(column, model, [state], [])
+    assert not found.no_answer, found.no_answer.message
+    return found.quantities[0].acceleration
+
+
+@pytest.mark.parametrize(
+    ("engine", "column"),
+    [("mujoco", "mujoco"), ("pinocchio", "pinocchio"), ("pinocchio", "pinocchio-aba"), ("exudyn", "exudyn"),
+     ("exudyn", "exudyn-tree")],
+)  # fmt: skip
+def test_columns_load_without_the_names_of_later_versions(engine, column):
+    s = catalogue_scenario("tumbling-ball")
+    asked = engine, LATER_NAMES[engine], column, s.model, s.state
+    found = call_fresh(PYTHON, acceleration_without, *asked)
+    np.testing.assert_allclose(found, certify_state(s.model, s.state).quantities.acceleration, rtol=1e-9)
+
+
 # --- real versions: fetched once, then from the cache ------------------------------------------
 
 OLDER_VERSIONS = [
@@ -193,6 +240,18 @@ def test_the_supported_versions_work_beside_the_installed_ones(tmp_path):
     }
     orders = [r.order for r in wrong if (r.level, r.integrator, r.quantity) == ("trajectory", "RK4", "order")]
     assert len(orders) == 6 and all(1.9 < order < 2.1 for order in orders)
+
+
+@pytest.mark.full
+@pytest.mark.timeout(600)
+def test_state_quantities_of_the_oldest_versions_agree():
+    oldest = ["mujoco@3.2.0", "pinocchio@2.6.21", "pinocchio-aba@2.6.21", "exudyn@1.7.0", "exudyn-tree@1.7.0"]
+    result = run_scenarios(["tumbling-ball", "furuta"], oldest, "state", limits=Limits(600))
+    for name in oldest:
+        assert result.engines[name].missing is None
+        agree = [r for r in result.rows if (r.engine, r.level, r.verdict) == (name, "state", "agrees")]
+        assert len(agree) >= 10, name
+    assert not [r.key for r in result.rows if r.level == "state" and r.verdict in ("disagrees", "failed")]
 
 
 # What the engines' changelogs say to be mended since: scenario, version before, words of the call, rows.
