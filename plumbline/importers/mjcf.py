@@ -281,13 +281,15 @@ class DefaultClasses:
         self.classes: dict[str, list[Element]] = {}  # name → the elements <default>, the own one first
         self.class_of: dict[int, str] = {}  # id of an element of the worldbody → its class
         tops = root.find_all("default")[::-1]  # each is the class of all elements, whatever its name
-        stack = [(top, tops) for top in tops]
-        self.classes["main"] = tops
+        stack = [
+            (top, tops[place:]) for place, top in enumerate(tops)
+        ]  # a class copies what is set before it
         while stack:
             element, chain = stack.pop()
             if "class" in element.attributes:
                 self.classes[element.attributes["class"]] = chain
             stack.extend((child, [child, *chain]) for child in element.find_all("default"))
+        self.classes |= {top.attributes.get("class", "main"): tops for top in tops} | {"main": tops}
         for world in root.find_all("worldbody"):
             walk: list[tuple[Element, str]] = [(world, "main")]
             while walk:

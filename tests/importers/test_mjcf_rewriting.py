@@ -9,7 +9,7 @@ from plumbline.importers.xml_tree import write_xml
 from plumbline.judging.rows import RowContext
 from plumbline.model_files.model_rows import rewriting_row
 from plumbline.model_files.prepared_file import prepare_file
-from tests.helpers.importer_columns import prepared_file
+from tests.helpers.importer_columns import prepared_file, read_by_mujoco
 from tests.helpers.random_robots import random_mjcf
 
 ROBOT = """<mujoco model="m"><compiler angle="degree" eulerseq="zyX"/>
@@ -138,3 +138,19 @@ def test_files_with_what_is_not_covered_have_no_rewriting(tmp_path):
     path = tmp_path / "robot.xml"
     path.write_text(text)
     assert rewritings(prepare_file(str(path), tmp_path).tree) == {}
+
+
+TWO_DEFAULTS = """<mujoco>
+<default><default class="a"><joint damping="1"/></default></default>
+<default class="main"><joint armature="5"/><default class="b"><joint damping="2"/></default></default>
+<worldbody><body name="b"><joint name="j" class="a" axis="0 1 0"/><joint name="k"/><joint name="l" class="b"/>
+<inertial pos="0 0 -1" mass="2" diaginertia="1 1 1"/></body></worldbody></mujoco>
+"""
+
+
+def test_a_class_inherits_from_the_defaults_before_it(tmp_path):
+    _, row = judged(tmp_path, TWO_DEFAULTS)
+    assert row.verdict == "agrees", row.reason
+    joints = read_by_mujoco(prepared_file(tmp_path, TWO_DEFAULTS)[1]).joints
+    assert [joint.armature for joint in joints] == [0.0, 5.0, 5.0]
+    assert [joint.fields["armature"].line for joint in joints if "armature" in joint.fields] == [3, 3]
