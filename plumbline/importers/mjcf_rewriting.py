@@ -122,6 +122,7 @@ def _introduce_frames(root: Element) -> bool:
 
 def _flatten_frames(root: Element) -> bool:
     """Apply each frame's pose to what is in it."""
+    _expand_defaults(root)  # a geom's own pose may be of a default class
     compiler, changed = _Compiler(root), False
     for holder in world_elements(root):  # a frame in a frame is met again in its holder's list
         while (frame := holder.find("frame")) is not None:
@@ -130,9 +131,6 @@ def _flatten_frames(root: Element) -> bool:
             for child in frame.children:
                 if child.tag not in _POSED:
                     raise _NoRewriting(child.tag)
-                if "childclass" in frame.attributes:
-                    name = "class" if child.tag in _EXPANDED else "childclass"
-                    child.attributes.setdefault(name, frame.attributes["childclass"])
                 compiler.move(child, *compiler.pose(frame))
             holder.children[place : place + 1] = frame.children
     return changed
@@ -190,7 +188,6 @@ def _set_inertia(inertial: Element, J: Array) -> None:
 
 def _replace_geoms(root: Element) -> bool:
     """Write the inertia of bodies that have it of their geoms, by the formulas of solid bodies."""
-    _expand_defaults(root)
     _flatten_frames(root)
     compiler, changed = _Compiler(root), False
     if compiler.settings.get("inertiafromgeom", "auto") != "auto" or "inertiagrouprange" in compiler.settings:
@@ -328,8 +325,6 @@ class _Compiler:
             ends = _numbers(element, "fromto").reshape(2, 3)
             element.attributes["fromto"] = _text(position + ends @ A.T)
             return
-        if element.tag == "geom" and "class" in element.attributes:
-            raise _NoRewriting("a geom whose class may have a pose")
         inner, own = self.pose(element)
         for name in ORIENTATIONS:
             element.attributes.pop(name, None)

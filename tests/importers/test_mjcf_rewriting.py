@@ -154,3 +154,20 @@ def test_a_class_inherits_from_the_defaults_before_it(tmp_path):
     joints = read_by_mujoco(prepared_file(tmp_path, TWO_DEFAULTS)[1]).joints
     assert [joint.armature for joint in joints] == [0.0, 5.0, 5.0]
     assert [joint.fields["armature"].line for joint in joints if "armature" in joint.fields] == [3, 3]
+
+
+@pytest.mark.parametrize(
+    "default",
+    [
+        '<geom type="capsule" size=".1 .3" euler="0 90 0" pos="0.2 0 0"/>',
+        '<default class="v"><geom type="capsule" size=".1 .2" quat="0.7 0 0.7 0"/></default>',
+        '<geom type="capsule" fromto="0 0 0 0 0.2 1" size=".1"/>',
+    ],
+)
+def test_frames_are_flattened_around_geoms_that_inherit_a_pose(tmp_path, default):
+    name = 'childclass="v"' if "class" in default else ""
+    text = f"""<mujoco><default>{default}</default><worldbody><body name="b"><joint name="j" axis="0 1 0"/>
+<frame pos="1 0 1" euler="0 10 20" {name}><geom/></frame></body></worldbody></mujoco>"""
+    written, row = judged(tmp_path, text)
+    assert "frames flattened" in written
+    assert row.verdict == "agrees" and "refuses" not in row.reason, row.reason
