@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from plumbline.engines.importer_calls import read_model_file
+from plumbline.importers.mjcf import body_elements
 from plumbline.importers.mjcf_rewriting import rewritings
 from plumbline.importers.xml_tree import write_xml
 from plumbline.judging.rows import RowContext
@@ -171,3 +172,36 @@ def test_frames_are_flattened_around_geoms_that_inherit_a_pose(tmp_path, default
     written, row = judged(tmp_path, text)
     assert "frames flattened" in written
     assert row.verdict == "agrees" and "refuses" not in row.reason, row.reason
+
+
+def test_joints_in_frames_keep_their_order(tmp_path):
+    text = """<mujoco><worldbody><body name="b"><frame euler="0 0 30"><joint name="j1" axis="0 1 0"/></frame>
+<frame pos="0 0 1"><body name="c"><joint name="k"/><geom size="0.1"/></body></frame>
+<frame euler="0 0 60"><joint name="j2" axis="1 0 0"/></frame><body name="d"/>
+<inertial pos="0 0 1" mass="1" diaginertia="1 1 1"/></body></worldbody></mujoco>"""
+    written, row = judged(tmp_path, text)
+    assert row.verdict == "agrees", row.reason
+    body = next(body_elements(written["other names and order"]))
+    assert [child.tag for child in body.children] == ["frame", "body", "frame", "frame", "inertial"]
+
+
+ALIGNED = """<mujoco><compiler alignfree="true"/>
+<default><default class="f"><joint type="free"/></default></default>
+<worldbody>
+<body name="a"><freejoint/><inertial pos="0.1 0 0" mass="2" diaginertia="1 2.5 2"/></body>
+<body name="b"><joint class="f"/><geom pos="0 0 1" size=".3 .2 .1" type="box"/></body>
+</worldbody></mujoco>
+"""
+
+
+def test_inertias_that_a_body_frame_is_aligned_with_are_not_written_otherwise(tmp_path):
+    inertias = {"inertias re-expressed", "geoms replaced by their inertials"}
+    written, row = judged(tmp_path, ALIGNED)
+    assert row.verdict == "agrees" and not inertias & written.keys(), row.reason
+    written, row = judged(tmp_path, ALIGNED.replace("<freejoint/>", '<freejoint align="false"/>'))
+    assert row.verdict == "agrees" and inertias & written.keys() == {"inertias re-expressed"}, row.reason
+    text = ALIGNED.replace('<compiler alignfree="true"/>', "").replace(
+        "<freejoint/>", '<freejoint align="true"/>'
+    )
+    written, row = judged(tmp_path, text)
+    assert row.verdict == "agrees" and inertias & written.keys() == {"geoms replaced by their inertials"}
