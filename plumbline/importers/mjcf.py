@@ -24,7 +24,7 @@ _JOINT_FEATURES = {  # attribute: what is not compared of it, and with how many 
     "range": ("limit", 1), "frictionloss": ("friction", 1), "springyield": ("yield of a spring", 1),
     "damping": ("damping that is not linear", 2), "stiffness": ("stiffness that is not linear", 2),
 }  # fmt: skip
-_ASSET_FOLDERS = {"mesh": "meshdir", "hfield": "meshdir", "skin": "meshdir", "texture": "texturedir"}
+_ASSET_FOLDERS = {"texture": "texturedir"} | dict.fromkeys(("mesh", "hfield", "skin", "flexcomp"), "meshdir")
 _FILES = {"file", "fileright", "fileleft", "fileup", "filedown", "filefront", "fileback"}
 _SECTIONS = ("actuator", "tendon", "equality", "contact", "sensor", "keyframe", "deformable", "extension")
 _STRIPPED = ("contact", "sensor", "keyframe", "visual", "custom")  # what refers to geometry
@@ -32,7 +32,7 @@ _GEOMETRY = ("geom", "light", "camera")
 _FRAMES = ("frame", "replicate")  # whose content belongs to the body around them
 
 
-def expand_includes(root: Element, path: Path, root_folder: Path, shown: str) -> None:
+def expand_includes(root: Element, root_folder: Path, shown: str) -> None:
     """Put the content of included files in place of each <include>.
 
     Args:
@@ -43,7 +43,7 @@ def expand_includes(root: Element, path: Path, root_folder: Path, shown: str) ->
         ModelFileError: an included file is missing, outside the folder, or included in a circle.
 
     """
-    included: set[Path] = {path.resolve()}
+    included: set[Path] = {Path(shown).resolve()}
     stack = [root]
     while stack:
         element = stack.pop()
@@ -53,14 +53,13 @@ def expand_includes(root: Element, path: Path, root_folder: Path, shown: str) ->
             if child.tag != "include":
                 place += 1
                 continue
-            target = _include_target(child, path.parent, root_folder)
+            name, target = _include_target(child, shown, root_folder)
             if target in included:
                 message = f"includes {child.attributes['file']!r} twice or in a circle"
                 raise ModelFileError([child.problem(message, "file", "a file that is included once")])
             included.add(target)
             if len(included) > MAX_INCLUDES:
                 raise ModelFileError([child.problem(f"there are more than {MAX_INCLUDES} includes")])
-            name = str(Path(shown).parent / child.attributes["file"])
             element.children[place : place + 1] = read_xml(target, name).children
         stack.extend(element.children)
     if len(included) > 1:  # one world, as before: Pinocchio reads the bodies of two worlds twice
@@ -69,16 +68,19 @@ def expand_includes(root: Element, path: Path, root_folder: Path, shown: str) ->
         root.children = [c for c in root.children if c is first or c.tag != "worldbody"]
 
 
-def _include_target(element: Element, folder: Path, root_folder: Path) -> Path:
+def _include_target(element: Element, shown: str, root_folder: Path) -> tuple[str, Path]:
+    """The included file as it is named in messages, and its path."""
     name = element.attributes.get("file", "")
-    target = resolve_inside(folder / name, root_folder)
+    places = [str(Path(file).parent / name) for file in (shown, element.source.file)]  # in MuJoCo's order
+    place = next(filter(isfile, places), places[0])
+    target = resolve_inside(Path(place), root_folder)
     if target is None:
         message = f"{shorten(repr(name))} is outside {root_folder}"
         hint = "name a folder that holds both with --root"
         raise ModelFileError([element.problem(message, "file", hint=hint)])
     if not isfile(target):
         raise ModelFileError([element.problem(f"there is no file {shorten(repr(name))}", "file")])
-    return target
+    return place, target
 
 
 def resolve_inside(path: Path, folder: Path) -> Path | None:
@@ -166,26 +168,37 @@ def make_paths_absolute(root: Element, folder: Path) -> None:
     for element, attribute, path in asset_files(root, folder):
         element.attributes[attribute] = str(path)
     for compiler in root.find_all("compiler"):
-        for name in ("meshdir", "texturedir", "assetdir"):
+        for name in ("meshdir", "texturedir", "assetdir", "strippath"):
             compiler.attributes.pop(name, None)
 
 
 def asset_files(root: Element, folder: Path) -> Iterator[tuple[Element, str, Path]]:
-    """Go through the files that a MJCF refers to, besides includes.
+    """Go through the files that a MJCF refers to, besides includes, as MuJoCo finds them.
+
+    Args:
+        folder: of the file that includes the others.
 
     Yields:
         Element, attribute, path.
 
     """
-    folders: dict[str, str] = {}
+    settings: dict[str, str] = {}
     for compiler in root.find_all("compiler"):
-        folders |= {k: v for k, v in compiler.attributes.items() if k.endswith("dir")}
+        if (both := compiler.attributes.get("assetdir")) is not None:
+            settings |= {"meshdir": both, "texturedir": both}
+        settings |= compiler.attributes
     for element in root.walk():
-        kind = _ASSET_FOLDERS.get(element.tag, "")
-        below = folders.get(kind, folders.get("assetdir", "")) if kind else ""
+        below = settings.get(_ASSET_FOLDERS.get(element.tag, ""), "")
         for attribute in sorted(_FILES & element.attributes.keys()):
+            name = element.attributes[attribute]
+            beside = Path(element.source.file).parent.resolve() / name  # the file that names it
+            path = beside if element.tag == "model" else folder / below / name
+            if element.tag in _ASSET_FOLDERS and settings.get("strippath") == "true":
+                path = folder / below / name.replace("\\", "/").rpartition("/")[2]
+            elif element.source.file != root.source.file and not isfile(path) and isfile(beside):
+                path = beside
             if element.tag != "include":
-                yield element, attribute, folder / below / element.attributes[attribute]
+                yield element, attribute, path
 
 
 def strip_geometry(root: Element) -> None:

@@ -154,7 +154,7 @@ def prepare_file(
     is_copied = strip
     if kind == "mjcf":
         count = sum(1 for element in tree.walk() if element.tag == "include")
-        mjcf.expand_includes(tree, path, folder, shown)
+        mjcf.expand_includes(tree, folder, shown)
         is_copied |= mjcf.name_elements(tree) or count > 0
         if strip:
             mjcf.strip_geometry(tree)

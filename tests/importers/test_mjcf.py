@@ -2,6 +2,7 @@
 
 from functools import partial
 
+import mujoco
 import pytest
 
 from plumbline.importers.xml_tree import ModelFileError
@@ -169,3 +170,59 @@ def test_the_root_is_the_nearest_package(tmp_path):
     assert package_folder(folder / "robot.urdf") == folder.resolve()
     (tmp_path / "package" / "package.xml").write_text("<package/>")
     assert package_folder(folder / "robot.urdf") == folder.parent.resolve()
+
+
+MESHES = """<mujoco>COMPILER<asset><mesh name="x" file="NAME"/></asset>
+<worldbody><body name="b"><joint axis="0 1 0"/><geom type="mesh" mesh="x"/></body></worldbody></mujoco>
+"""
+TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
+
+
+def load_with_its_copy(folder, text):
+    """Load a file that has the text in MuJoCo, and the copy of it in which all joints have names."""
+    (folder / "robot.xml").write_text(text)
+    mujoco.MjModel.from_xml_path(str(folder / "robot.xml"))
+    (folder / "copy").mkdir()
+    mujoco.MjModel.from_xml_path(prepare_file(str(folder / "robot.xml"), folder / "copy").file.path)
+
+
+@pytest.mark.parametrize(
+    ("compiler", "name", "place"),
+    [
+        ('strippath="true" meshdir="m"', "foo/bar/x.obj", "m/x.obj"),
+        ('strippath="true" meshdir="m"', "x.obj", "m/x.obj"),
+        ('strippath="true"', "foo\\x.obj", "x.obj"),
+        ('strippath="true"/><compiler strippath="false"', "foo/x.obj", "foo/x.obj"),
+        ('meshdir="nowhere"/><compiler assetdir="m"', "x.obj", "m/x.obj"),
+        ('meshdir="m" assetdir="nowhere"', "x.obj", "m/x.obj"),
+    ],
+)
+def test_a_mesh_is_where_mujoco_looks(tmp_path, compiler, name, place):
+    text = MESHES.replace("COMPILER", f"<compiler {compiler}/>").replace("NAME", name)
+    (tmp_path / place).parent.mkdir(exist_ok=True)
+    (tmp_path / place).write_text(TETRAHEDRON)
+    load_with_its_copy(tmp_path, text)
+
+
+@pytest.mark.parametrize("place", ["sub/t/x.obj", "m/x.obj"])
+def test_files_beside_an_included_file_are_found(tmp_path, monkeypatch, place):
+    monkeypatch.chdir(tmp_path)
+    for folder in ("sub/t", "m"):
+        (tmp_path / folder).mkdir(parents=True)
+    inner = MESHES.replace("COMPILER", "").replace("NAME", "x.obj").replace("mujoco>", "mujocoinclude>")
+    (tmp_path / "sub" / "t" / "b.xml").write_text(inner)
+    (tmp_path / "sub" / "a.xml").write_text('<mujocoinclude><include file="t/b.xml"/></mujocoinclude>')
+    text = '<mujoco><compiler meshdir="m"/><include file="sub/a.xml"/></mujoco>'
+    (tmp_path / place).write_text(TETRAHEDRON)
+    load_with_its_copy(tmp_path, text)
+    found = prepare_file("robot.xml", tmp_path / "copy").tree
+    assert {element.source.file for element in found.walk() if element.tag == "mesh"} == {"sub/t/b.xml"}
+
+
+def test_the_mesh_of_a_flex_is_in_the_folder_of_meshes(tmp_path):
+    (tmp_path / "m").mkdir()
+    (tmp_path / "m" / "x.obj").write_text(TETRAHEDRON)
+    flex = '<flexcomp name="f" type="mesh" file="x.obj" dim="2" mass="1" rigid="true"/>'
+    body = '<body name="b"><joint axis="0 1 0"/><geom size="0.1"/></body>'
+    text = f'<mujoco><compiler meshdir="m"/><worldbody>{body}{flex}</worldbody></mujoco>'
+    load_with_its_copy(tmp_path, text)
