@@ -227,9 +227,12 @@ def strip_geometry(root: Element) -> None:
         asset.children = [
             c for c in asset.children if c.tag not in _ASSET_FOLDERS or (c.tag, _asset_name(c)) in used
         ]
-        for material in asset.find_all("material"):
-            material.attributes.pop("texture", None)
-            material.children = []
+    for deformable in root.find_all("deformable"):
+        deformable.children = [child for child in deformable.children if child.tag != "skin"]
+    for element in root.walk():
+        if element.tag in ("material", "light"):  # materials of default classes too
+            element.attributes.pop("texture", None)
+            element.children = []
 
 
 def _asset_name(element: Element) -> str:

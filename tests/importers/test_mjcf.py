@@ -9,7 +9,7 @@ from plumbline.importers.xml_tree import ModelFileError
 from plumbline.judging.rows import Verdict
 from plumbline.model_files.model_run import ModelPlan, run_model_files
 from plumbline.model_files.prepared_file import package_folder, prepare_file
-from tests.helpers.importer_columns import read_by_mujoco
+from tests.helpers.importer_columns import prepared_file, read_by_mujoco
 from tests.helpers.refusals import refusal
 
 MAIN = """<mujoco model="m">
@@ -226,3 +226,14 @@ def test_the_mesh_of_a_flex_is_in_the_folder_of_meshes(tmp_path):
     body = '<body name="b"><joint axis="0 1 0"/><geom size="0.1"/></body>'
     text = f'<mujoco><compiler meshdir="m"/><worldbody>{body}{flex}</worldbody></mujoco>'
     load_with_its_copy(tmp_path, text)
+
+
+def test_stripping_leaves_no_name_of_a_texture_and_no_skin(tmp_path):
+    text = """<mujoco><default><material texture="t"/>
+<default class="c"><material><layer texture="t" role="rgb"/></material></default></default>
+<asset><texture name="t" type="2d" file="no.png"/><material name="m"/><material name="n" class="c"/></asset>
+<worldbody><body name="b"><joint name="j" axis="0 1 0"/><geom size=".1" pos="0 0 1" material="m"/>
+<light texture="t" type="image" name="l"/></body></worldbody>
+<deformable><skin file="missing.skn"/></deformable></mujoco>"""
+    _, prepared = prepared_file(tmp_path, text, strip=True)
+    assert [body.name for body in read_by_mujoco(prepared).bodies] == ["b"]
