@@ -245,9 +245,6 @@ def with_sources(model: NeutralModel, root: Element) -> NeutralModel:
     Args:
         root: the file's root element, with all names.
 
-    Returns:
-        The model with sources, and with the features that are not compared.
-
     """
     bodies = {e.attributes["name"]: e for e in body_elements(root)}
     defaults = DefaultClasses(root)
@@ -255,6 +252,16 @@ def with_sources(model: NeutralModel, root: Element) -> NeutralModel:
     found = [_body_with_sources(body, bodies, defaults, default_source) for body in model.bodies]
     options = [e for o in root.find_all("option") for e in (*o.find_all("flag"), o)]
     gravity = next((e.source for e in options if "gravity" in e.attributes), default_source)
+    return replace(model, bodies=tuple(found), gravity_source=gravity)
+
+
+def features_not_compared(root: Element) -> tuple[Feature, ...]:
+    """List what a file has that is not compared.
+
+    Args:
+        root: the file's root element, with all names and its geometry.
+
+    """
     features = [
         Feature(section.tag, _name_of(element), element.source)
         for section in root.children
@@ -266,8 +273,7 @@ def with_sources(model: NeutralModel, root: Element) -> NeutralModel:
         for element in world_elements(root)
         if element.tag == "flexcomp"
     ]
-    features += _joint_features(root, defaults)
-    return replace(model, bodies=tuple(found), not_compared=tuple(features), gravity_source=gravity)
+    return (*features, *_joint_features(root, DefaultClasses(root)))
 
 
 def _name_of(element: Element) -> str:

@@ -70,6 +70,22 @@ def test_features_that_are_not_compared_are_listed_with_their_lines(model):
     assert found == {("actuator", "drive", 11), ("limit", "elbow", 6)}
 
 
+LISTED = """<mujoco><worldbody>
+<body name="b"><joint name="j"/><inertial pos="0 0 -1" mass="2" diaginertia="1 1 1"/></body></worldbody>
+<contact><exclude body1="b" body2="world"/></contact>
+<sensor><jointpos joint="j"/></sensor>
+<keyframe><key qpos="1"/></keyframe>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize("strip", [False, True])
+def test_what_is_not_compared_is_listed_without_geometry_too(tmp_path, strip):
+    _, prepared = prepared_file(tmp_path, LISTED, strip=strip)
+    found = read_by_mujoco(prepared).not_compared
+    assert [(f.what, f.source.line) for f in found] == [("contact", 3), ("sensor", 4), ("keyframe", 5)]
+
+
 def test_gravity_that_a_flag_switches_off_is_zero(model):
     assert not model.gravity.any()
     assert model.gravity_source.line == 9
