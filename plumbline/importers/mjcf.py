@@ -12,7 +12,7 @@ from os.path import isfile
 from pathlib import Path
 
 from plumbline.importers.neutral_model import ElementaryJoint, Feature, NeutralBody, NeutralModel, Source
-from plumbline.importers.xml_tree import Element, ModelFileError, read_xml
+from plumbline.importers.xml_tree import Element, ModelFileError, parse_numbers, read_xml
 from plumbline.scenario.line_and_column_errors import shorten
 
 MAX_INCLUDES = 200
@@ -26,6 +26,7 @@ _JOINT_FEATURES = {  # attribute: what is not compared of it, and with how many 
 }  # fmt: skip
 _ASSET_FOLDERS = {"texture": "texturedir"} | dict.fromkeys(("mesh", "hfield", "skin", "flexcomp"), "meshdir")
 _FILES = {"file", "fileright", "fileleft", "fileup", "filedown", "filefront", "fileback"}
+_FLUID = ("density", "viscosity")  # without either there is no force of it
 _SECTIONS = ("actuator", "tendon", "equality", "contact", "sensor", "keyframe", "deformable", "extension")
 _STRIPPED = ("contact", "sensor", "keyframe", "visual", "custom")  # what refers to geometry
 _GEOMETRY = ("geom", "light", "camera")
@@ -269,10 +270,13 @@ def features_not_compared(root: Element) -> tuple[Feature, ...]:
         for element in section.children
     ]
     features += [
-        Feature("flex", _name_of(element), element.source)
+        Feature("flex" if element.tag == "flexcomp" else "mocap body", _name_of(element), element.source)
         for element in world_elements(root)
-        if element.tag == "flexcomp"
+        if element.tag == "flexcomp" or element.attributes.get("mocap") == "true"
     ]
+    options = {name: e for e in root.find_all("option") for name in e.attributes}  # the last of each
+    fluid = [e for n, e in options.items() if n in _FLUID and parse_numbers(e, n, 1, []) != [0.0]]
+    features += [Feature("fluid", "", element.source) for element in fluid[:1]]
     return (*features, *_joint_features(root, DefaultClasses(root)))
 
 

@@ -253,3 +253,21 @@ def test_stripping_leaves_no_name_of_a_texture_and_no_skin(tmp_path):
 <deformable><skin file="missing.skn"/></deformable></mujoco>"""
     _, prepared = prepared_file(tmp_path, text, strip=True)
     assert [body.name for body in read_by_mujoco(prepared).bodies] == ["b"]
+
+
+FLUID = """<mujoco>
+<option density="1000" viscosity="0.1"/>
+<option density="0" wind="1 0 0"/>
+<worldbody>
+<body name="held" mocap="true"><geom size=".1"/></body>
+<body name="b"><joint name="j"/><inertial pos="0 0 -1" mass="2" diaginertia="1 1 1"/></body>
+</worldbody></mujoco>
+"""
+
+
+def test_fluids_and_bodies_that_a_user_moves_are_listed(tmp_path):
+    _, prepared = prepared_file(tmp_path, FLUID)
+    found = read_by_mujoco(prepared).not_compared
+    assert [(f.what, f.name, f.source.line) for f in found] == [("mocap body", "held", 5), ("fluid", "", 2)]
+    _, prepared = prepared_file(tmp_path, FLUID.replace("0.1", "0"))
+    assert [f.what for f in read_by_mujoco(prepared).not_compared] == ["mocap body"]
