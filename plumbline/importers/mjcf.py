@@ -249,11 +249,22 @@ def with_sources(model: NeutralModel, root: Element) -> NeutralModel:
     """
     bodies = {e.attributes["name"]: e for e in body_elements(root)}
     defaults = DefaultClasses(root)
-    default_source = Source(root.source.file, 0)
-    found = [_body_with_sources(body, bodies, defaults, default_source) for body in model.bodies]
-    options = [e for o in root.find_all("option") for e in (*o.find_all("flag"), o)]
-    gravity = next((e.source for e in options if "gravity" in e.attributes), default_source)
+    nowhere = Source(root.source.file, 0)
+    found = [_body_with_sources(body, bodies, defaults, nowhere) for body in model.bodies]
+    setter = disabling_flag(root, "gravity") or _last_options(root).get("gravity")
+    gravity = setter.source if setter else nowhere
     return replace(model, bodies=tuple(found), gravity_source=gravity)
+
+
+def _last_options(root: Element) -> dict[str, Element]:
+    """Find the element <option> that sets each option: the last one does."""
+    return {name: option for option in root.find_all("option") for name in option.attributes}
+
+
+def disabling_flag(root: Element, name: str) -> Element | None:
+    """Find the element <flag> that switches something off; None where it is on."""
+    flags = [f for o in root.find_all("option") for f in o.find_all("flag") if name in f.attributes]
+    return flags[-1] if flags and flags[-1].attributes[name] == "disable" else None
 
 
 def features_not_compared(root: Element) -> tuple[Feature, ...]:
@@ -274,8 +285,7 @@ def features_not_compared(root: Element) -> tuple[Feature, ...]:
         for element in world_elements(root)
         if element.tag == "flexcomp" or element.attributes.get("mocap") == "true"
     ]
-    options = {name: e for e in root.find_all("option") for name in e.attributes}  # the last of each
-    fluid = [e for n, e in options.items() if n in _FLUID and parse_numbers(e, n, 1, []) != [0.0]]
+    fluid = [e for n, e in _last_options(root).items() if n in _FLUID and parse_numbers(e, n, 1, []) != [0.0]]
     features += [Feature("fluid", "", element.source) for element in fluid[:1]]
     return (*features, *_joint_features(root, DefaultClasses(root)))
 

@@ -91,6 +91,22 @@ def test_gravity_that_a_flag_switches_off_is_zero(model):
     assert model.gravity_source.line == 9
 
 
+@pytest.mark.parametrize(
+    ("options", "gravity", "line"),
+    [
+        ('<option gravity="0 0 -9.81"/>\n<option gravity="0 0 -2"/>', -2.0, 3),
+        ('<option gravity="0 0 -2">\n<flag gravity="enable"/></option>', -2.0, 2),
+        ('<option><flag gravity="disable"/></option>\n<option><flag gravity="enable"/></option>', -9.81, 0),
+        ('<option><flag gravity="enable"/></option>\n<option><flag gravity="disable"/></option>', 0.0, 3),
+        ('<option density="0"/>', -9.81, 0),
+    ],
+)
+def test_gravity_has_the_place_of_the_option_that_holds(tmp_path, options, gravity, line):
+    _, prepared = prepared_file(tmp_path, LISTED.replace("<mujoco>", f"<mujoco>\n{options}\n"))
+    model = read_by_mujoco(prepared)
+    assert model.gravity[2] == gravity and model.gravity_source.line == line
+
+
 def test_stripping_keeps_geometry_that_defines_the_mass(tmp_path):
     text = MAIN.replace('<include file="parts/arm.xml"/>', ARM.replace("mujocoinclude", "frame"))
     text = text.replace("<frame>", "").replace("</frame>", "")
