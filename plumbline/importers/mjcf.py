@@ -341,23 +341,25 @@ class DefaultClasses:
             The elements, that of the nearest class first.
 
         """
-        return self.classes.get(self.class_of.get(id(element), "main"), [])
+        own = element.attributes.get("class", "main")  # outside of the worldbody
+        return self.classes.get(self.class_of.get(id(element), own), [])
 
-    def setter(self, joint: Element, attribute: str) -> Element | None:
+    def setter(self, element: Element, attribute: str, kind: str = "joint") -> Element | None:
         """Find the element that sets an attribute.
 
         Args:
-            joint: an element <joint> or <freejoint>.
+            element: a <joint> or <freejoint>, or one of another kind.
+            kind: what default classes call such elements.
 
         Returns:
-            The joint, or the <joint> of a default class; None where the file does not set it.
+            The element, or that of a default class; None where the file does not set it.
 
         """
-        if attribute in joint.attributes:
-            return joint
-        if joint.tag == "freejoint":
+        if attribute in element.attributes:
+            return element
+        if element.tag == "freejoint":
             return None
-        defaults = (element.find("joint") for element in self.chain(joint))
+        defaults = (holder.find(kind) for holder in self.chain(element))
         return next((d for d in defaults if d is not None and attribute in d.attributes), None)
 
 
