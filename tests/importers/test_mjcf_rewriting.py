@@ -128,6 +128,20 @@ def test_a_simulated_defect_of_the_compiler_is_reported_with_the_rewriting(tmp_p
     assert ", as written " in row.reason
 
 
+def refuse_frames(tree):
+    """A file that MuJoCo refuses where bodies have frames around them."""
+    for element in tree.walk():
+        if element.tag == "frame" and not element.attributes.get("childclass"):
+            element.attributes["pos"] = "0"
+
+
+def test_a_rewriting_that_is_refused_hides_behind_no_other(tmp_path):
+    _, row = judged(tmp_path, ROBOT, refuse_frames)
+    assert row.verdict == "information"
+    assert "the same model of 6 equivalent rewritings" in row.reason
+    assert "it refuses the file with frames around bodies: " in row.reason
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_random_robots_compile_alike(tmp_path, seed):
     _, row = judged(tmp_path, random_mjcf(np.random.default_rng(seed), 6))
