@@ -12,7 +12,7 @@ from os.path import isfile
 from pathlib import Path
 
 from plumbline.importers.neutral_model import ElementaryJoint, Feature, NeutralBody, NeutralModel, Source
-from plumbline.importers.xml_tree import Element, ModelFileError, read_xml
+from plumbline.importers.xml_tree import Element, ModelFileError, parse_numbers, read_xml
 from plumbline.scenario.line_and_column_errors import shorten
 
 MAX_INCLUDES = 200
@@ -24,15 +24,16 @@ _JOINT_FEATURES = {  # attribute: what is not compared of it, and with how many 
     "range": ("limit", 1), "frictionloss": ("friction", 1), "springyield": ("yield of a spring", 1),
     "damping": ("damping that is not linear", 2), "stiffness": ("stiffness that is not linear", 2),
 }  # fmt: skip
-_ASSET_FOLDERS = {"mesh": "meshdir", "hfield": "meshdir", "skin": "meshdir", "texture": "texturedir"}
+_ASSET_FOLDERS = {"texture": "texturedir"} | dict.fromkeys(("mesh", "hfield", "skin", "flexcomp"), "meshdir")
 _FILES = {"file", "fileright", "fileleft", "fileup", "filedown", "filefront", "fileback"}
+_FLUID = ("density", "viscosity")  # without either there is no force of it
 _SECTIONS = ("actuator", "tendon", "equality", "contact", "sensor", "keyframe", "deformable", "extension")
 _STRIPPED = ("contact", "sensor", "keyframe", "visual", "custom")  # what refers to geometry
 _GEOMETRY = ("geom", "light", "camera")
 _FRAMES = ("frame", "replicate")  # whose content belongs to the body around them
 
 
-def expand_includes(root: Element, path: Path, root_folder: Path, shown: str) -> None:
+def expand_includes(root: Element, root_folder: Path, shown: str) -> None:
     """Put the content of included files in place of each <include>.
 
     Args:
@@ -43,7 +44,7 @@ def expand_includes(root: Element, path: Path, root_folder: Path, shown: str) ->
         ModelFileError: an included file is missing, outside the folder, or included in a circle.
 
     """
-    included: set[Path] = {path.resolve()}
+    included: set[Path] = {Path(shown).resolve()}
     stack = [root]
     while stack:
         element = stack.pop()
@@ -53,14 +54,13 @@ def expand_includes(root: Element, path: Path, root_folder: Path, shown: str) ->
             if child.tag != "include":
                 place += 1
                 continue
-            target = _include_target(child, path.parent, root_folder)
+            name, target = _include_target(child, shown, root_folder)
             if target in included:
                 message = f"includes {child.attributes['file']!r} twice or in a circle"
                 raise ModelFileError([child.problem(message, "file", "a file that is included once")])
             included.add(target)
             if len(included) > MAX_INCLUDES:
                 raise ModelFileError([child.problem(f"there are more than {MAX_INCLUDES} includes")])
-            name = str(Path(shown).parent / child.attributes["file"])
             element.children[place : place + 1] = read_xml(target, name).children
         stack.extend(element.children)
     if len(included) > 1:  # one world, as before: Pinocchio reads the bodies of two worlds twice
@@ -69,16 +69,19 @@ def expand_includes(root: Element, path: Path, root_folder: Path, shown: str) ->
         root.children = [c for c in root.children if c is first or c.tag != "worldbody"]
 
 
-def _include_target(element: Element, folder: Path, root_folder: Path) -> Path:
+def _include_target(element: Element, shown: str, root_folder: Path) -> tuple[str, Path]:
+    """The included file as it is named in messages, and its path."""
     name = element.attributes.get("file", "")
-    target = resolve_inside(folder / name, root_folder)
+    places = [str(Path(file).parent / name) for file in (shown, element.source.file)]  # in MuJoCo's order
+    place = next(filter(isfile, places), places[0])
+    target = resolve_inside(Path(place), root_folder)
     if target is None:
         message = f"{shorten(repr(name))} is outside {root_folder}"
         hint = "name a folder that holds both with --root"
         raise ModelFileError([element.problem(message, "file", hint=hint)])
     if not isfile(target):
         raise ModelFileError([element.problem(f"there is no file {shorten(repr(name))}", "file")])
-    return target
+    return place, target
 
 
 def resolve_inside(path: Path, folder: Path) -> Path | None:
@@ -166,26 +169,37 @@ def make_paths_absolute(root: Element, folder: Path) -> None:
     for element, attribute, path in asset_files(root, folder):
         element.attributes[attribute] = str(path)
     for compiler in root.find_all("compiler"):
-        for name in ("meshdir", "texturedir", "assetdir"):
+        for name in ("meshdir", "texturedir", "assetdir", "strippath"):
             compiler.attributes.pop(name, None)
 
 
 def asset_files(root: Element, folder: Path) -> Iterator[tuple[Element, str, Path]]:
-    """Go through the files that a MJCF refers to, besides includes.
+    """Go through the files that a MJCF refers to, besides includes, as MuJoCo finds them.
+
+    Args:
+        folder: of the file that includes the others.
 
     Yields:
         Element, attribute, path.
 
     """
-    folders: dict[str, str] = {}
+    settings: dict[str, str] = {}
     for compiler in root.find_all("compiler"):
-        folders |= {k: v for k, v in compiler.attributes.items() if k.endswith("dir")}
+        if (both := compiler.attributes.get("assetdir")) is not None:
+            settings |= {"meshdir": both, "texturedir": both}
+        settings |= compiler.attributes
     for element in root.walk():
-        kind = _ASSET_FOLDERS.get(element.tag, "")
-        below = folders.get(kind, folders.get("assetdir", "")) if kind else ""
+        below = settings.get(_ASSET_FOLDERS.get(element.tag, ""), "")
         for attribute in sorted(_FILES & element.attributes.keys()):
+            name = element.attributes[attribute]
+            beside = Path(element.source.file).parent.resolve() / name  # the file that names it
+            path = beside if element.tag == "model" else folder / below / name
+            if element.tag in _ASSET_FOLDERS and settings.get("strippath") == "true":
+                path = folder / below / name.replace("\\", "/").rpartition("/")[2]
+            elif element.source.file != root.source.file and not isfile(path) and isfile(beside):
+                path = beside
             if element.tag != "include":
-                yield element, attribute, folder / below / element.attributes[attribute]
+                yield element, attribute, path
 
 
 def strip_geometry(root: Element) -> None:
@@ -214,9 +228,12 @@ def strip_geometry(root: Element) -> None:
         asset.children = [
             c for c in asset.children if c.tag not in _ASSET_FOLDERS or (c.tag, _asset_name(c)) in used
         ]
-        for material in asset.find_all("material"):
-            material.attributes.pop("texture", None)
-            material.children = []
+    for deformable in root.find_all("deformable"):
+        deformable.children = [child for child in deformable.children if child.tag != "skin"]
+    for element in root.walk():
+        if element.tag in ("material", "light"):  # materials of default classes too
+            element.attributes.pop("texture", None)
+            element.children = []
 
 
 def _asset_name(element: Element) -> str:
@@ -229,16 +246,34 @@ def with_sources(model: NeutralModel, root: Element) -> NeutralModel:
     Args:
         root: the file's root element, with all names.
 
-    Returns:
-        The model with sources, and with the features that are not compared.
-
     """
     bodies = {e.attributes["name"]: e for e in body_elements(root)}
     defaults = DefaultClasses(root)
-    default_source = Source(root.source.file, 0)
-    found = [_body_with_sources(body, bodies, defaults, default_source) for body in model.bodies]
-    options = [e for o in root.find_all("option") for e in (*o.find_all("flag"), o)]
-    gravity = next((e.source for e in options if "gravity" in e.attributes), default_source)
+    nowhere = Source(root.source.file, 0)
+    found = [_body_with_sources(body, bodies, defaults, nowhere) for body in model.bodies]
+    setter = disabling_flag(root, "gravity") or _last_options(root).get("gravity")
+    gravity = setter.source if setter else nowhere
+    return replace(model, bodies=tuple(found), gravity_source=gravity)
+
+
+def _last_options(root: Element) -> dict[str, Element]:
+    """Find the element <option> that sets each option: the last one does."""
+    return {name: option for option in root.find_all("option") for name in option.attributes}
+
+
+def disabling_flag(root: Element, name: str) -> Element | None:
+    """Find the element <flag> that switches something off; None where it is on."""
+    flags = [f for o in root.find_all("option") for f in o.find_all("flag") if name in f.attributes]
+    return flags[-1] if flags and flags[-1].attributes[name] == "disable" else None
+
+
+def features_not_compared(root: Element) -> tuple[Feature, ...]:
+    """List what a file has that is not compared.
+
+    Args:
+        root: the file's root element, with all names and its geometry.
+
+    """
     features = [
         Feature(section.tag, _name_of(element), element.source)
         for section in root.children
@@ -246,12 +281,13 @@ def with_sources(model: NeutralModel, root: Element) -> NeutralModel:
         for element in section.children
     ]
     features += [
-        Feature("flex", _name_of(element), element.source)
+        Feature("flex" if element.tag == "flexcomp" else "mocap body", _name_of(element), element.source)
         for element in world_elements(root)
-        if element.tag == "flexcomp"
+        if element.tag == "flexcomp" or element.attributes.get("mocap") == "true"
     ]
-    features += _joint_features(root, defaults)
-    return replace(model, bodies=tuple(found), not_compared=tuple(features), gravity_source=gravity)
+    fluid = [e for n, e in _last_options(root).items() if n in _FLUID and parse_numbers(e, n, 1, []) != [0.0]]
+    features += [Feature("fluid", "", element.source) for element in fluid[:1]]
+    return (*features, *_joint_features(root, DefaultClasses(root)))
 
 
 def _name_of(element: Element) -> str:
@@ -281,13 +317,15 @@ class DefaultClasses:
         self.classes: dict[str, list[Element]] = {}  # name → the elements <default>, the own one first
         self.class_of: dict[int, str] = {}  # id of an element of the worldbody → its class
         tops = root.find_all("default")[::-1]  # each is the class of all elements, whatever its name
-        stack = [(top, tops) for top in tops]
-        self.classes["main"] = tops
+        stack = [
+            (top, tops[place:]) for place, top in enumerate(tops)
+        ]  # a class copies what is set before it
         while stack:
             element, chain = stack.pop()
             if "class" in element.attributes:
                 self.classes[element.attributes["class"]] = chain
             stack.extend((child, [child, *chain]) for child in element.find_all("default"))
+        self.classes |= {top.attributes.get("class", "main"): tops for top in tops} | {"main": tops}
         for world in root.find_all("worldbody"):
             walk: list[tuple[Element, str]] = [(world, "main")]
             while walk:
@@ -303,23 +341,25 @@ class DefaultClasses:
             The elements, that of the nearest class first.
 
         """
-        return self.classes.get(self.class_of.get(id(element), "main"), [])
+        own = element.attributes.get("class", "main")  # outside of the worldbody
+        return self.classes.get(self.class_of.get(id(element), own), [])
 
-    def setter(self, joint: Element, attribute: str) -> Element | None:
+    def setter(self, element: Element, attribute: str, kind: str = "joint") -> Element | None:
         """Find the element that sets an attribute.
 
         Args:
-            joint: an element <joint> or <freejoint>.
+            element: a <joint> or <freejoint>, or one of another kind.
+            kind: what default classes call such elements.
 
         Returns:
-            The joint, or the <joint> of a default class; None where the file does not set it.
+            The element, or that of a default class; None where the file does not set it.
 
         """
-        if attribute in joint.attributes:
-            return joint
-        if joint.tag == "freejoint":
+        if attribute in element.attributes:
+            return element
+        if element.tag == "freejoint":
             return None
-        defaults = (element.find("joint") for element in self.chain(joint))
+        defaults = (holder.find(kind) for holder in self.chain(element))
         return next((d for d in defaults if d is not None and attribute in d.attributes), None)
 
 

@@ -122,6 +122,7 @@ def _introduce_frames(root: Element) -> bool:
 
 def _flatten_frames(root: Element) -> bool:
     """Apply each frame's pose to what is in it."""
+    _expand_defaults(root)  # a geom's own pose may be of a default class
     compiler, changed = _Compiler(root), False
     for holder in world_elements(root):  # a frame in a frame is met again in its holder's list
         while (frame := holder.find("frame")) is not None:
@@ -130,9 +131,6 @@ def _flatten_frames(root: Element) -> bool:
             for child in frame.children:
                 if child.tag not in _POSED:
                     raise _NoRewriting(child.tag)
-                if "childclass" in frame.attributes:
-                    name = "class" if child.tag in _EXPANDED else "childclass"
-                    child.attributes.setdefault(name, frame.attributes["childclass"])
                 compiler.move(child, *compiler.pose(frame))
             holder.children[place : place + 1] = frame.children
     return changed
@@ -162,9 +160,10 @@ def _change_angles(root: Element) -> bool:
 
 def _change_inertials(root: Element) -> bool:
     """Write diagonal inertias as full ones, and full ones by principal axes."""
+    _expand_defaults(root)  # a joint may be free by its class
     compiler, changed = _Compiler(root), False
     for body in body_elements(root):
-        for inertial in body.find_all("inertial"):
+        for inertial in body.find_all("inertial") if not compiler.aligns(body) else ():
             if "fullinertia" in inertial.attributes:
                 xx, yy, zz, xy, xz, yz = _numbers(inertial, "fullinertia")
                 moments, axes = np.linalg.eigh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
@@ -190,14 +189,13 @@ def _set_inertia(inertial: Element, J: Array) -> None:
 
 def _replace_geoms(root: Element) -> bool:
     """Write the inertia of bodies that have it of their geoms, by the formulas of solid bodies."""
-    _expand_defaults(root)
     _flatten_frames(root)
     compiler, changed = _Compiler(root), False
     if compiler.settings.get("inertiafromgeom", "auto") != "auto" or "inertiagrouprange" in compiler.settings:
         raise _NoRewriting("inertiafromgeom")
     for body in body_elements(root):
         geoms = body.find_all("geom")
-        if body.find("inertial") is not None or not geoms:
+        if body.find("inertial") is not None or not geoms or compiler.aligns(body):
             continue
         parts = [_solid(geom, compiler) for geom in geoms]
         if any(part is None for part in parts):
@@ -266,10 +264,11 @@ def _rename_and_reorder(root: Element) -> bool:
         for element in (body, *joint_elements(body)):
             element.attributes["name"] = RENAMED + element.attributes["name"]
     for holder in world_elements(root):
-        bodies = iter(reversed([child for child in holder.children if child.tag in ("body", "frame")]))
-        holder.children = [
-            next(bodies) if child.tag in ("body", "frame") else child for child in holder.children
+        bodies = [
+            c for c in holder.children if c.tag == "body" or (c.tag == "frame" and not joint_elements(c))
         ]
+        places = {id(child) for child in bodies}  # joints stay in their order, those in frames too
+        holder.children = [bodies.pop() if id(child) in places else child for child in holder.children]
     return True
 
 
@@ -292,6 +291,15 @@ class _Compiler:
         for element in root.find_all("compiler"):
             self.settings |= element.attributes
         self.is_degree = self.settings.get("angle", "degree") == "degree"
+
+    def aligns(self, body: Element) -> bool:
+        """Whether a body's frame becomes that of its inertia, which depends on how it is written."""
+        choices = {
+            joint.attributes.get("align", "auto")
+            for joint in joint_elements(body)
+            if joint.tag == "freejoint" or joint.attributes.get("type") == "free"
+        }
+        return "true" in choices or ("auto" in choices and self.settings.get("alignfree") == "true")
 
     def angle(self, value: float) -> float:
         """An angle in rad."""
@@ -328,8 +336,6 @@ class _Compiler:
             ends = _numbers(element, "fromto").reshape(2, 3)
             element.attributes["fromto"] = _text(position + ends @ A.T)
             return
-        if element.tag == "geom" and "class" in element.attributes:
-            raise _NoRewriting("a geom whose class may have a pose")
         inner, own = self.pose(element)
         for name in ORIENTATIONS:
             element.attributes.pop(name, None)

@@ -18,8 +18,9 @@ import numpy as np
 from plumbline.engines.importer_calls import read_model_file
 from plumbline.importers.importer import Reading
 from plumbline.importers.lumping import fixed_parts, lump_fixed_bodies
+from plumbline.importers.mjcf import DefaultClasses, disabling_flag
 from plumbline.importers.neutral_model import ElementaryJoint, Feature, NeutralBody, NeutralModel, Source
-from plumbline.importers.xml_tree import ModelFileError, parse_numbers
+from plumbline.importers.xml_tree import Element, ModelFileError, parse_numbers
 from plumbline.model.datatypes import BALL, FREE, KINDS, Array, Float, Kind, Model, State
 from plumbline.model.kinematics import mass_matrix, own_rates, quaternion_of, rate_count, rotation_matrix
 from plumbline.model.sampling import derive_seed
@@ -109,15 +110,22 @@ def read_neutral_model(
     """
     with ScratchFolder("plumbline-model-") as scratch:
         prepared = prepare_file(shown, scratch, root, base, strip=True)
-        connections = [
-            Connection(e.attributes["body1"], e.attributes.get("body2", ""), np.array(anchor), e.source)
-            for equality in prepared.tree.find_all("equality")
-            for e in equality.find_all("connect")
-            if "body1" in e.attributes and e.attributes.get("active") != "false"
-            if len(anchor := parse_numbers(e, "anchor", 3, [])) == 3
-        ]
+        connections = list(_connections(prepared.tree))
         reading, failure = _mujoco_reading(prepared) if prepared.file.format == "mjcf" else (None, "")
         return prepared.neutral_model(reading, failure), connections
+
+
+def _connections(root: Element) -> Iterator[Connection]:
+    """The equalities of points that are active."""
+    defaults = DefaultClasses(root)
+    if disabling_flag(root, "equality") or disabling_flag(root, "constraint"):
+        return
+    for e in [e for equality in root.find_all("equality") for e in equality.find_all("connect")]:
+        setter = defaults.setter(e, "active", "equality")
+        is_active = setter is None or setter.attributes["active"] != "false"
+        if is_active and {"body1", "anchor"} <= e.attributes.keys():
+            anchor = np.array(parse_numbers(e, "anchor", 3, []))
+            yield Connection(e.attributes["body1"], e.attributes.get("body2", ""), anchor, e.source)
 
 
 def _mujoco_reading(prepared: PreparedFile) -> tuple[Reading | None, str]:

@@ -42,7 +42,7 @@ from plumbline.scenario.line_and_column_errors import first_words, shorten
 
 MODEL_FAMILY = "model file"  # of the rows, in place of a scenario's family
 REFUSED = "refused: "  # before an importer's words
-IS_REFUSED = "refused"  # in ``Row.extra`` of a file that an importer refuses
+IS_REFUSED = "refused"  # in ``Row.extra`` where an importer refuses the file, or a rewriting of it
 SEED = 17
 MASS_ROUNDING = 2.0**-48  # relative, of the sum of the masses
 
@@ -192,10 +192,10 @@ def rewriting_row(context: RowContext, model: NeutralModel, rewritten: Mapping[s
 
     Returns:
         A row that agrees where all are the same model, up to `RELATIVE_CHANGE` of each number: MuJoCo
-        diagonalises inertias up to 1e-12.
+        diagonalises inertias up to 1e-12.  Information where it refuses some and the others are the same.
 
     """
-    wrong, refused = [], []
+    wrong, refused, same = [], [], []
     for name, reading in rewritten.items():
         if reading.model is None:
             refused.append(f"it refuses the file with {name}: {shorten(reading.refusal)}")
@@ -203,14 +203,15 @@ def rewriting_row(context: RowContext, model: NeutralModel, rewritten: Mapping[s
         other = replace(reading.model, bodies=tuple(names_as_written(reading.model.bodies)))
         if words := describe_difference(model, other):
             wrong.append(f"with {name}, {words}")
-    same = f"the same model of {len(rewritten)} equivalent rewritings ({', '.join(rewritten)})"
-    reason = "; ".join([*(wrong or [same]), *refused])
-    verdict = Verdict.DISAGREES if wrong else Verdict.AGREES
+        else:
+            same.append(name)
+    agreement = [f"the same model of {len(same)} equivalent rewritings ({', '.join(same)})"] if same else []
+    reason = "; ".join([*(wrong or agreement), *refused])
+    verdict = Verdict.DISAGREES if wrong else Verdict.INFORMATION if refused else Verdict.AGREES
     if wrong:
         reason = f"{context.title} {context.version} compiles equivalent files to different models: {reason}"
-    if len(refused) == len(rewritten):
-        verdict = Verdict.INFORMATION
-    return _row(context, "rewritings", verdict, reason, "1", value=float(len(wrong)), tolerance=0.0)
+    row = _row(context, "rewritings", verdict, reason, "1", value=float(len(wrong)), tolerance=0.0)
+    return replace(row, extra={IS_REFUSED: 1.0}) if refused else row
 
 
 def _quantity_row(context: RowContext, quantity: str, unit: str, worst: Mismatch, count: int) -> Row:

@@ -14,7 +14,7 @@ from urllib.parse import unquote
 from plumbline.importers import mjcf
 from plumbline.importers.importer import Base, Format, ModelFile, Reading
 from plumbline.importers.mjcf_rewriting import rewritings
-from plumbline.importers.neutral_model import NeutralModel, Source, extreme_numbers, zero_directions
+from plumbline.importers.neutral_model import Feature, NeutralModel, Source, extreme_numbers, zero_directions
 from plumbline.importers.urdf import read_urdf
 from plumbline.importers.xml_tree import Element, ModelFileError, read_xml, write_xml, write_xml_in_place
 from plumbline.processes.user_cache import naming_file
@@ -38,6 +38,7 @@ class PreparedFile:
     file: ModelFile
     urdf_model: NeutralModel | None  # the own reading; None for MJCF, which MuJoCo compiles in a worker
     lines: Mapping[int, Sequence[Element]]  # that begin in each line of the file that importers open
+    not_compared: tuple[Feature, ...] = ()  # of an MJCF, its geometry included
 
     def neutral_model(self, reading: Reading | None, failure: str = "") -> NeutralModel:
         """Return what the file says.
@@ -62,7 +63,7 @@ class PreparedFile:
             raise ModelFileError([place.problem(message)])
         if model is None:
             assert reading is not None and reading.model is not None
-            model = mjcf.with_sources(reading.model, self.tree)
+            model = replace(mjcf.with_sources(reading.model, self.tree), not_compared=self.not_compared)
         problems = [
             place.problem(f"{what} is {value:g}", valid)
             for what, value, valid, place in [*extreme_numbers(model)] or [*zero_directions(model)]
@@ -151,11 +152,12 @@ def prepare_file(
         hint = "leave --base out, or add or remove the <freejoint> in the file"
         message = "an MJCF file says itself whether its base moves"
         raise ModelFileError([Source(shown, 1).problem(message, hint=hint)])
-    is_copied = strip
+    is_copied, features = strip, tuple[Feature, ...]()
     if kind == "mjcf":
         count = sum(1 for element in tree.walk() if element.tag == "include")
-        mjcf.expand_includes(tree, path, folder, shown)
+        mjcf.expand_includes(tree, folder, shown)
         is_copied |= mjcf.name_elements(tree) or count > 0
+        features = mjcf.features_not_compared(tree)
         if strip:
             mjcf.strip_geometry(tree)
     elif strip:
@@ -175,7 +177,8 @@ def prepare_file(
     else:
         for element in tree.walk():
             lines.setdefault(element.source.line, []).append(element)
-    return PreparedFile(shown, tree, ModelFile(str(opened), kind, chosen, str(folder)), model, lines)
+    file = ModelFile(str(opened), kind, chosen, str(folder))
+    return PreparedFile(shown, tree, file, model, lines, features)
 
 
 def package_folder(path: Path) -> Path:

@@ -2,13 +2,14 @@
 
 from functools import partial
 
+import mujoco
 import pytest
 
 from plumbline.importers.xml_tree import ModelFileError
 from plumbline.judging.rows import Verdict
 from plumbline.model_files.model_run import ModelPlan, run_model_files
 from plumbline.model_files.prepared_file import package_folder, prepare_file
-from tests.helpers.importer_columns import read_by_mujoco
+from tests.helpers.importer_columns import prepared_file, read_by_mujoco
 from tests.helpers.refusals import refusal
 
 MAIN = """<mujoco model="m">
@@ -69,9 +70,41 @@ def test_features_that_are_not_compared_are_listed_with_their_lines(model):
     assert found == {("actuator", "drive", 11), ("limit", "elbow", 6)}
 
 
+LISTED = """<mujoco><worldbody>
+<body name="b"><joint name="j"/><inertial pos="0 0 -1" mass="2" diaginertia="1 1 1"/></body></worldbody>
+<contact><exclude body1="b" body2="world"/></contact>
+<sensor><jointpos joint="j"/></sensor>
+<keyframe><key qpos="1"/></keyframe>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize("strip", [False, True])
+def test_what_is_not_compared_is_listed_without_geometry_too(tmp_path, strip):
+    _, prepared = prepared_file(tmp_path, LISTED, strip=strip)
+    found = read_by_mujoco(prepared).not_compared
+    assert [(f.what, f.source.line) for f in found] == [("contact", 3), ("sensor", 4), ("keyframe", 5)]
+
+
 def test_gravity_that_a_flag_switches_off_is_zero(model):
     assert not model.gravity.any()
     assert model.gravity_source.line == 9
+
+
+@pytest.mark.parametrize(
+    ("options", "gravity", "line"),
+    [
+        ('<option gravity="0 0 -9.81"/>\n<option gravity="0 0 -2"/>', -2.0, 3),
+        ('<option gravity="0 0 -2">\n<flag gravity="enable"/></option>', -2.0, 2),
+        ('<option><flag gravity="disable"/></option>\n<option><flag gravity="enable"/></option>', -9.81, 0),
+        ('<option><flag gravity="enable"/></option>\n<option><flag gravity="disable"/></option>', 0.0, 3),
+        ('<option density="0"/>', -9.81, 0),
+    ],
+)
+def test_gravity_has_the_place_of_the_option_that_holds(tmp_path, options, gravity, line):
+    _, prepared = prepared_file(tmp_path, LISTED.replace("<mujoco>", f"<mujoco>\n{options}\n"))
+    model = read_by_mujoco(prepared)
+    assert model.gravity[2] == gravity and model.gravity_source.line == line
 
 
 def test_stripping_keeps_geometry_that_defines_the_mass(tmp_path):
@@ -169,3 +202,88 @@ def test_the_root_is_the_nearest_package(tmp_path):
     assert package_folder(folder / "robot.urdf") == folder.resolve()
     (tmp_path / "package" / "package.xml").write_text("<package/>")
     assert package_folder(folder / "robot.urdf") == folder.parent.resolve()
+
+
+MESHES = """<mujoco>COMPILER<asset><mesh name="x" file="NAME"/></asset>
+<worldbody><body name="b"><joint axis="0 1 0"/><geom type="mesh" mesh="x"/></body></worldbody></mujoco>
+"""
+TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
+
+
+def load_with_its_copy(folder, text):
+    """Load a file that has the text in MuJoCo, and the copy of it in which all joints have names."""
+    (folder / "robot.xml").write_text(text)
+    mujoco.MjModel.from_xml_path(str(folder / "robot.xml"))
+    (folder / "copy").mkdir()
+    mujoco.MjModel.from_xml_path(prepare_file(str(folder / "robot.xml"), folder / "copy").file.path)
+
+
+@pytest.mark.parametrize(
+    ("compiler", "name", "place"),
+    [
+        ('strippath="true" meshdir="m"', "foo/bar/x.obj", "m/x.obj"),
+        ('strippath="true" meshdir="m"', "x.obj", "m/x.obj"),
+        ('strippath="true"', "foo\\x.obj", "x.obj"),
+        ('strippath="true"/><compiler strippath="false"', "foo/x.obj", "foo/x.obj"),
+        ('meshdir="nowhere"/><compiler assetdir="m"', "x.obj", "m/x.obj"),
+        ('meshdir="m" assetdir="nowhere"', "x.obj", "m/x.obj"),
+    ],
+)
+def test_a_mesh_is_where_mujoco_looks(tmp_path, compiler, name, place):
+    text = MESHES.replace("COMPILER", f"<compiler {compiler}/>").replace("NAME", name)
+    (tmp_path / place).parent.mkdir(exist_ok=True)
+    (tmp_path / place).write_text(TETRAHEDRON)
+    load_with_its_copy(tmp_path, text)
+
+
+@pytest.mark.parametrize("place", ["sub/t/x.obj", "m/x.obj"])
+def test_files_beside_an_included_file_are_found(tmp_path, monkeypatch, place):
+    monkeypatch.chdir(tmp_path)
+    for folder in ("sub/t", "m"):
+        (tmp_path / folder).mkdir(parents=True)
+    inner = MESHES.replace("COMPILER", "").replace("NAME", "x.obj").replace("mujoco>", "mujocoinclude>")
+    (tmp_path / "sub" / "t" / "b.xml").write_text(inner)
+    (tmp_path / "sub" / "a.xml").write_text('<mujocoinclude><include file="t/b.xml"/></mujocoinclude>')
+    text = '<mujoco><compiler meshdir="m"/><include file="sub/a.xml"/></mujoco>'
+    (tmp_path / place).write_text(TETRAHEDRON)
+    load_with_its_copy(tmp_path, text)
+    found = prepare_file("robot.xml", tmp_path / "copy").tree
+    assert {element.source.file for element in found.walk() if element.tag == "mesh"} == {"sub/t/b.xml"}
+
+
+def test_the_mesh_of_a_flex_is_in_the_folder_of_meshes(tmp_path):
+    (tmp_path / "m").mkdir()
+    (tmp_path / "m" / "x.obj").write_text(TETRAHEDRON)
+    flex = '<flexcomp name="f" type="mesh" file="x.obj" dim="2" mass="1" rigid="true"/>'
+    body = '<body name="b"><joint axis="0 1 0"/><geom size="0.1"/></body>'
+    text = f'<mujoco><compiler meshdir="m"/><worldbody>{body}{flex}</worldbody></mujoco>'
+    load_with_its_copy(tmp_path, text)
+
+
+def test_stripping_leaves_no_name_of_a_texture_and_no_skin(tmp_path):
+    text = """<mujoco><default><material texture="t"/>
+<default class="c"><material><layer texture="t" role="rgb"/></material></default></default>
+<asset><texture name="t" type="2d" file="no.png"/><material name="m"/><material name="n" class="c"/></asset>
+<worldbody><body name="b"><joint name="j" axis="0 1 0"/><geom size=".1" pos="0 0 1" material="m"/>
+<light texture="t" type="image" name="l"/></body></worldbody>
+<deformable><skin file="missing.skn"/></deformable></mujoco>"""
+    _, prepared = prepared_file(tmp_path, text, strip=True)
+    assert [body.name for body in read_by_mujoco(prepared).bodies] == ["b"]
+
+
+FLUID = """<mujoco>
+<option density="1000" viscosity="0.1"/>
+<option density="0" wind="1 0 0"/>
+<worldbody>
+<body name="held" mocap="true"><geom size=".1"/></body>
+<body name="b"><joint name="j"/><inertial pos="0 0 -1" mass="2" diaginertia="1 1 1"/></body>
+</worldbody></mujoco>
+"""
+
+
+def test_fluids_and_bodies_that_a_user_moves_are_listed(tmp_path):
+    _, prepared = prepared_file(tmp_path, FLUID)
+    found = read_by_mujoco(prepared).not_compared
+    assert [(f.what, f.name, f.source.line) for f in found] == [("mocap body", "held", 5), ("fluid", "", 2)]
+    _, prepared = prepared_file(tmp_path, FLUID.replace("0.1", "0"))
+    assert [f.what for f in read_by_mujoco(prepared).not_compared] == ["mocap body"]

@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 
 from plumbline.engines.importer_calls import read_model_file
+from plumbline.importers.mjcf import body_elements
 from plumbline.importers.mjcf_rewriting import rewritings
 from plumbline.importers.xml_tree import write_xml
 from plumbline.judging.rows import RowContext
 from plumbline.model_files.model_rows import rewriting_row
 from plumbline.model_files.prepared_file import prepare_file
-from tests.helpers.importer_columns import prepared_file
+from tests.helpers.importer_columns import prepared_file, read_by_mujoco
 from tests.helpers.random_robots import random_mjcf
 
 ROBOT = """<mujoco model="m"><compiler angle="degree" eulerseq="zyX"/>
@@ -127,6 +128,20 @@ def test_a_simulated_defect_of_the_compiler_is_reported_with_the_rewriting(tmp_p
     assert ", as written " in row.reason
 
 
+def refuse_frames(tree):
+    """A file that MuJoCo refuses where bodies have frames around them."""
+    for element in tree.walk():
+        if element.tag == "frame" and not element.attributes.get("childclass"):
+            element.attributes["pos"] = "0"
+
+
+def test_a_rewriting_that_is_refused_hides_behind_no_other(tmp_path):
+    _, row = judged(tmp_path, ROBOT, refuse_frames)
+    assert row.verdict == "information"
+    assert "the same model of 6 equivalent rewritings" in row.reason
+    assert "it refuses the file with frames around bodies: " in row.reason
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_random_robots_compile_alike(tmp_path, seed):
     _, row = judged(tmp_path, random_mjcf(np.random.default_rng(seed), 6))
@@ -138,3 +153,69 @@ def test_files_with_what_is_not_covered_have_no_rewriting(tmp_path):
     path = tmp_path / "robot.xml"
     path.write_text(text)
     assert rewritings(prepare_file(str(path), tmp_path).tree) == {}
+
+
+TWO_DEFAULTS = """<mujoco>
+<default><default class="a"><joint damping="1"/></default></default>
+<default class="main"><joint armature="5"/><default class="b"><joint damping="2"/></default></default>
+<worldbody><body name="b"><joint name="j" class="a" axis="0 1 0"/><joint name="k"/><joint name="l" class="b"/>
+<inertial pos="0 0 -1" mass="2" diaginertia="1 1 1"/></body></worldbody></mujoco>
+"""
+
+
+def test_a_class_inherits_from_the_defaults_before_it(tmp_path):
+    _, row = judged(tmp_path, TWO_DEFAULTS)
+    assert row.verdict == "agrees", row.reason
+    joints = read_by_mujoco(prepared_file(tmp_path, TWO_DEFAULTS)[1]).joints
+    assert [joint.armature for joint in joints] == [0.0, 5.0, 5.0]
+    assert [joint.fields["armature"].line for joint in joints if "armature" in joint.fields] == [3, 3]
+
+
+@pytest.mark.parametrize(
+    "default",
+    [
+        '<geom type="capsule" size=".1 .3" euler="0 90 0" pos="0.2 0 0"/>',
+        '<default class="v"><geom type="capsule" size=".1 .2" quat="0.7 0 0.7 0"/></default>',
+        '<geom type="capsule" fromto="0 0 0 0 0.2 1" size=".1"/>',
+    ],
+)
+def test_frames_are_flattened_around_geoms_that_inherit_a_pose(tmp_path, default):
+    name = 'childclass="v"' if "class" in default else ""
+    text = f"""<mujoco><default>{default}</default><worldbody><body name="b"><joint name="j" axis="0 1 0"/>
+<frame pos="1 0 1" euler="0 10 20" {name}><geom/></frame></body></worldbody></mujoco>"""
+    written, row = judged(tmp_path, text)
+    assert "frames flattened" in written
+    assert row.verdict == "agrees" and "refuses" not in row.reason, row.reason
+
+
+def test_joints_in_frames_keep_their_order(tmp_path):
+    text = """<mujoco><worldbody><body name="b"><frame euler="0 0 30"><joint name="j1" axis="0 1 0"/></frame>
+<frame pos="0 0 1"><body name="c"><joint name="k"/><geom size="0.1"/></body></frame>
+<frame euler="0 0 60"><joint name="j2" axis="1 0 0"/></frame><body name="d"/>
+<inertial pos="0 0 1" mass="1" diaginertia="1 1 1"/></body></worldbody></mujoco>"""
+    written, row = judged(tmp_path, text)
+    assert row.verdict == "agrees", row.reason
+    body = next(body_elements(written["other names and order"]))
+    assert [child.tag for child in body.children] == ["frame", "body", "frame", "frame", "inertial"]
+
+
+ALIGNED = """<mujoco><compiler alignfree="true"/>
+<default><default class="f"><joint type="free"/></default></default>
+<worldbody>
+<body name="a"><freejoint/><inertial pos="0.1 0 0" mass="2" diaginertia="1 2.5 2"/></body>
+<body name="b"><joint class="f"/><geom pos="0 0 1" size=".3 .2 .1" type="box"/></body>
+</worldbody></mujoco>
+"""
+
+
+def test_inertias_that_a_body_frame_is_aligned_with_are_not_written_otherwise(tmp_path):
+    inertias = {"inertias re-expressed", "geoms replaced by their inertials"}
+    written, row = judged(tmp_path, ALIGNED)
+    assert row.verdict == "agrees" and not inertias & written.keys(), row.reason
+    written, row = judged(tmp_path, ALIGNED.replace("<freejoint/>", '<freejoint align="false"/>'))
+    assert row.verdict == "agrees" and inertias & written.keys() == {"inertias re-expressed"}, row.reason
+    text = ALIGNED.replace('<compiler alignfree="true"/>', "").replace(
+        "<freejoint/>", '<freejoint align="true"/>'
+    )
+    written, row = judged(tmp_path, text)
+    assert row.verdict == "agrees" and inertias & written.keys() == {"geoms replaced by their inertials"}

@@ -257,6 +257,27 @@ def test_a_loop_of_an_equality_is_closed_by_a_ball_and_the_other_equalities_are_
     assert found.exit_code == 0 and "agree" in found.stdout, found.output
 
 
+@pytest.mark.parametrize(
+    ("head", "attribute", "count"),
+    [
+        ('<default><equality active="false"/></default>', "", 0),
+        ('<default><equality active="false"/></default>', 'active="true"', 1),
+        ('<default><default class="off"><equality active="false"/></default></default>', "", 1),
+        ('<default><default class="off"><equality active="false"/></default></default>', 'class="off"', 0),
+        ('<option><flag equality="disable"/></option>', "", 0),
+        ('<option><flag constraint="disable"/></option>', "", 0),
+        ('<option><flag equality="disable"/></option><option><flag equality="enable"/></option>', "", 1),
+    ],
+)
+def test_an_equality_that_is_not_active_closes_no_loop(tmp_path, head, attribute, count):
+    path = tmp_path / "closed.xml"
+    text = CLOSED.replace('<joint name="gear" joint1="j"/>', "").replace("<mujoco>", f"<mujoco>{head}")
+    path.write_text(text.replace('name="loop"', f'name="loop" {attribute}'))
+    scenario, document = load_model_file(path)
+    assert len(document.get("closes", [])) == count
+    assert f"{2 - count} × equality" in scenario.purpose
+
+
 def test_sixty_bodies_are_a_mechanism(tmp_path):
     long = tmp_path / "long.urdf"
     long.write_text(random_urdf(np.random.default_rng(3), 60))
