@@ -8,6 +8,7 @@ from copy import deepcopy
 from dataclasses import dataclass, replace
 from os.path import isfile
 from pathlib import Path
+from tempfile import mkdtemp
 from typing import Literal
 from urllib.parse import unquote
 
@@ -108,7 +109,7 @@ class PreparedFile:
         return sorted(self.lines.get(line, ()), key=lambda element: element.tag not in tags)
 
     def write_rewritings(self, folder: Path) -> dict[str, ModelFile]:
-        """Write equivalent rewritings of an MJCF file.
+        """Write equivalent rewritings of an MJCF file, in a folder of their own below a given one.
 
         Returns:
             Files for importers, by what was done to them.
@@ -117,8 +118,9 @@ class PreparedFile:
         tree = deepcopy(self.tree)
         mjcf.make_paths_absolute(tree, Path(self.shown).parent.resolve())
         found = {}
-        for name, rewritten in rewritings(tree).items():
-            path = folder / f"{len(list(folder.iterdir()))}.xml"
+        own_folder = Path(mkdtemp(dir=folder))  # a copy of the user's file may have any name in the other
+        for count, (name, rewritten) in enumerate(rewritings(tree).items()):
+            path = own_folder / f"{count}.xml"
             with naming_file(path):
                 path.write_text(write_xml(rewritten), encoding="utf-8")
             found[name] = replace(self.file, path=str(path))

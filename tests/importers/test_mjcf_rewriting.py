@@ -1,5 +1,7 @@
 """Equivalent rewritings of an MJCF file: MuJoCo compiles each to the same model; defects are reported."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -138,3 +140,15 @@ def test_files_with_what_is_not_covered_have_no_rewriting(tmp_path):
     path = tmp_path / "robot.xml"
     path.write_text(text)
     assert rewritings(prepare_file(str(path), tmp_path).tree) == {}
+
+
+@pytest.mark.parametrize("name", ["0.xml", "1.xml", "6.xml", "rewritings"])
+def test_rewritings_are_written_beside_a_copy_of_any_name(tmp_path, name):
+    path, scratch = tmp_path / name, tmp_path / "scratch"
+    path.write_text(ROBOT.replace('<freejoint name="free"/>', "<freejoint/>"))
+    scratch.mkdir()
+    prepared = prepare_file(str(path), scratch)
+    copied = Path(prepared.file.path).read_text()
+    written = [file.path for file in prepared.write_rewritings(scratch).values()]
+    assert len({prepared.file.path, *written}) == 1 + len(NAMES)
+    assert Path(prepared.file.path).read_text() == copied
