@@ -3,7 +3,8 @@
 Every decimal is rounded to double once.  With the joint's origin (xyz, rpy) the frame of the child link is
 T = Trans(xyz) Rz(yaw) Ry(pitch) Rx(roll) J(x), and the joint moves about or along its axis in that frame
 (http://wiki.ros.org/urdf/XML).  A continuous joint is a hinge; a planar one two slides perpendicular to its
-axis and a hinge about it; a floating one a free joint below the root, else three slides and a ball.
+axis and a hinge about it; a floating one a free joint below the root and links fixed to it, else three slides
+and a ball.
 """
 
 from __future__ import annotations
@@ -85,6 +86,7 @@ class _UrdfReader:
         self.ambiguous: list[Feature] = []
         self.links = self.named("link")
         self.joints = self.named("joint")
+        self.fixed_to_root: set[str] = set()  # links that no joint of the file moves, with the root itself
 
     def named(self, tag: str) -> dict[str, Element]:
         """Index the robot's children of a tag by name."""
@@ -110,6 +112,8 @@ class _UrdfReader:
         stack: list[tuple[str, int, _Joint | None]] = [(top, -1, None)] if top else []
         while stack:
             name, parent, joint = stack.pop()
+            if joint is None or (joint.kind == "fixed" and joint.parent in self.fixed_to_root):
+                self.fixed_to_root.add(name)
             bodies.append(self.body(name, parent, joint, base))
             stack.extend((j.child, len(bodies) - 1, j) for j in reversed(below.get(name, [])))
         if self.problems:
@@ -216,7 +220,7 @@ class _UrdfReader:
                 joints = (_joint(f"{name}/free", "free", np.zeros(3), link.source),)
         else:
             position, attitude = self.pose(joint.element)
-            joints = self.elementary(joint, parent)
+            joints = self.elementary(joint)
             origin = joint.element.find("origin")
             fields = dict.fromkeys(("position", "attitude"), (origin or joint.element).source)
         mass, center, inertia = self.inertial(link, fields)
@@ -257,7 +261,7 @@ class _UrdfReader:
         elif high > (low + middle) * (1 + _TRIANGLE_ROUNDING):
             self.ambiguous.append(Feature("inertia that violates A + B ≥ C", name, element.source))
 
-    def elementary(self, joint: _Joint, parent: int) -> tuple[ElementaryJoint, ...]:
+    def elementary(self, joint: _Joint) -> tuple[ElementaryJoint, ...]:
         """Translate a joint to elementary ones."""
         element, kind = joint.element, joint.kind
         name, source = element.attributes["name"], element.source
@@ -276,10 +280,11 @@ class _UrdfReader:
             },
         }
         if kind == "floating":
-            if parent == 0:
+            if joint.parent in self.fixed_to_root:
                 return (_joint(name, "free", np.zeros(3), source, **passive),)
             slides = [
-                _joint(f"{name}/{c}", "slide", e, source) for c, e in zip("xyz", np.eye(3), strict=True)
+                _joint(f"{name}/{c}", "slide", e, source, **passive)
+                for c, e in zip("xyz", np.eye(3), strict=True)
             ]
             return (*slides, _joint(f"{name}/rotation", "ball", np.zeros(3), source, **passive))
         axis = self.axis(element)

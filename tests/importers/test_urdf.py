@@ -20,16 +20,16 @@ def prepared(tmp_path, text, base="auto"):
     return prepared_file(tmp_path, text, base=base)[1]
 
 
-def ratios(found, importer):
+def ratios(found, importer, at=None):
     """Error over tolerance by quantity, in the order of the file's joints."""
     model = found.neutral_model(None)
     reading = read_model_file(importer, found.file).model
     order = joint_permutation(model, reading)
     assert order is not None, [(j.name, j.kind) for j in reading.joints]
-    answers = evaluate_model_file(importer, found.file, model_states(reading, 3, 1))
+    answers = evaluate_model_file(importer, found.file, model_states(reading, 3, 1, at))
     if importer == "pinocchio":
         model = without_passive_forces(model)
-    truths = certify_states(model, model_states(model, 3, 1))
+    truths = certify_states(model, model_states(model, 3, 1, at))
     return {n: m.ratio for n, m in mismatches(model, truths, [permuted(a, order) for a in answers]).items()}
 
 
@@ -52,12 +52,26 @@ def test_a_floating_joint_of_the_root_is_a_free_joint(tmp_path, importer):
     assert max(found.values()) <= 1, found
 
 
+@pytest.mark.parametrize("importer", ["mujoco", "pinocchio"])
+@pytest.mark.parametrize("at", [None, {}])
+def test_a_floating_joint_of_a_link_that_is_fixed_to_the_root_is_a_free_joint(tmp_path, importer, at):
+    text = random_urdf(np.random.default_rng(0), 3, ("revolute",))
+    assert '<parent link="base"/><child link="link2"/>' in text
+    assert '<parent link="link2"/><child link="link3"/>' in text
+    for k, kind in ((2, "fixed"), (3, "floating")):
+        text = text.replace(f'name="joint{k}" type="revolute"', f'name="joint{k}" type="{kind}"')
+    model = prepared(tmp_path, text).urdf_model
+    assert [(joint.kind, joint.damping) for joint in model.joints] == [("hinge", 0.635), ("free", 0.585)]
+    found = ratios(prepared(tmp_path, text), importer, at)
+    assert max(found.values()) <= 1, found
+
+
 def test_planar_and_inner_floating_joints_are_elementary_ones(tmp_path):
     robots = (random_urdf(np.random.default_rng(seed), 3, ("revolute",)) for seed in range(50))
     inner = '<parent link="link1"/><child link="link2"/>'
     text = next(robot for robot in robots if inner in robot)
     first, second, third = (f'name="joint{k}" type="revolute"' for k in (1, 2, 3))
-    text = text.replace(second, second.replace("revolute", "floating"))
+    text = text.replace(f"{second}>", f'{second.replace("revolute", "floating")}><dynamics damping="0.5"/>')
     text = text.replace(third, third.replace("revolute", "planar"))
     model = prepared(tmp_path, text).urdf_model
     assert first in text
@@ -67,6 +81,8 @@ def test_planar_and_inner_floating_joints_are_elementary_ones(tmp_path):
     )
     planar = next(b for b in model.bodies if len(b.joints) == 3)
     x, y, angle = (joint.axis for joint in planar.joints)
+    floating = next(b for b in model.bodies if len(b.joints) == 4)
+    assert [joint.damping for joint in floating.joints] == [0.5] * 4
     np.testing.assert_allclose(np.cross(x, y), angle, atol=1e-15)
 
 
