@@ -4,12 +4,14 @@ Every decimal is rounded to double once.  With the joint's origin (xyz, rpy) the
 T = Trans(xyz) Rz(yaw) Ry(pitch) Rx(roll) J(x), and the joint moves about or along its axis in that frame
 (http://wiki.ros.org/urdf/XML).  A continuous joint is a hinge; a planar one two slides perpendicular to its
 axis and a hinge about it; a floating one a free joint below the root and links fixed to it, else three slides
-and a ball.
+and a ball.  From version 1.1 an origin may have a quaternion quat_xyzw in place of rpy
+(https://github.com/ros/urdfdom).
 """
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -17,7 +19,6 @@ from typing import Any
 import numpy as np
 
 from plumbline.importers.neutral_model import (
-    MAX_MAGNITUDE,
     ElementaryJoint,
     Feature,
     JointKind,
@@ -46,6 +47,8 @@ _READ = {  # what is read of each element: its attributes, and the first of each
     "axis": ({"xyz"}, set[str]()),
     "dynamics": ({"damping", "friction"}, set[str]()),
 }
+_QUATERNION = "quat_xyzw"
+_VERSION = re.compile(r"(\d{1,9})\.(\d{1,9})", re.ASCII)
 _GEOMETRY = {"visual", "collision"}
 _TRIANGLE_ROUNDING = 1e-9  # relative; published inertias are rounded to a few decimals
 
@@ -86,6 +89,8 @@ class _UrdfReader:
         self.ambiguous: list[Feature] = []
         self.links = self.named("link")
         self.joints = self.named("joint")
+        version = _VERSION.fullmatch(root.attributes.get("version", ""))
+        self.has_quaternions = version is not None and (int(version[1]), int(version[2])) >= (1, 1)
         self.fixed_to_root: set[str] = set()  # links that no joint of the file moves, with the root itself
 
     def named(self, tag: str) -> dict[str, Element]:
@@ -181,17 +186,11 @@ class _UrdfReader:
             return ""
         return name
 
-    def numbers(
-        self,
-        element: Element | None,
-        attribute: str,
-        default: tuple[float, ...],
-        largest: float = MAX_MAGNITUDE,
-    ) -> list[float]:
+    def numbers(self, element: Element | None, attribute: str, default: tuple[float, ...]) -> list[float]:
         """Read an attribute's numbers; the default where the attribute or its element is missing."""
         if element is None or attribute not in element.attributes:
             return list(default)
-        return parse_numbers(element, attribute, len(default), self.problems, largest)
+        return parse_numbers(element, attribute, len(default), self.problems)
 
     def required(self, element: Element | None, owner: Element, tag: str, attribute: str) -> float:
         """Read one number that must be there."""
@@ -205,9 +204,12 @@ class _UrdfReader:
         """Read an <origin>: position and unit quaternion."""
         origin = owner.find("origin")
         zeros = (0.0, 0.0, 0.0)
-        return np.array(self.numbers(origin, "xyz", zeros)), quaternion_from_rpy(
-            self.numbers(origin, "rpy", zeros)
-        )
+        position, rpy = (self.numbers(origin, name, zeros) for name in ("xyz", "rpy"))
+        if not self.has_quaternions or origin is None or _QUATERNION not in origin.attributes:
+            return np.array(position), quaternion_from_rpy(rpy)
+        if "rpy" in origin.attributes:
+            self.problems.append(origin.problem("stands beside rpy", _QUATERNION, "one of the two"))
+        return np.array(position), np.roll(self.unit(origin, _QUATERNION, 4, "a turn"), 1)
 
     def body(self, name: str, parent: int, joint: _Joint | None, base: str) -> NeutralBody:
         """Read a link and the joint that holds it."""
@@ -301,11 +303,17 @@ class _UrdfReader:
     def axis(self, joint: Element) -> Array:
         """Read a joint's axis as a unit vector; (1, 0, 0) where the file has none."""
         element = joint.find("axis")
-        values = np.array(self.numbers(element, "xyz", (1.0, 0.0, 0.0), math.inf))
+        if element is not None and "xyz" in element.attributes:
+            return self.unit(element, "xyz", 3, "a direction")
+        return np.array([1.0, 0.0, 0.0])
+
+    def unit(self, element: Element, attribute: str, count: int, valid: str) -> Array:
+        """Read the numbers of an attribute and normalise them."""
+        values = np.array(parse_numbers(element, attribute, count, self.problems, math.inf))
         largest = float(np.max(np.abs(values)))
         if largest == 0:
-            if not self.problems or self.problems[-1].line != (element or joint).source.line:
-                self.problems.append((element or joint).problem("is zero", "xyz", "a direction"))
+            if not self.problems or self.problems[-1].line != element.source.line:
+                self.problems.append(element.problem("is zero", attribute, valid))
             return values
         values = values / largest  # so that its square neither overflows nor vanishes
         unit: Array = values / math.sqrt(float(values @ values))
@@ -328,6 +336,8 @@ class _UrdfReader:
     def note_unread(self, element: Element, owner: str) -> None:
         """List attributes and elements of a link or joint that are not read, misspelt ones too."""
         attributes, parts = _READ[element.tag]
+        if element.tag == "origin" and self.has_quaternions:
+            attributes = attributes | {_QUATERNION}
         for name in sorted(element.attributes.keys() - attributes):
             what = f"attribute {shorten(name)} of <{element.tag}>"
             self.features.append(Feature(what, owner, element.source))

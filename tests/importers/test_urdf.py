@@ -86,6 +86,30 @@ def test_planar_and_inner_floating_joints_are_elementary_ones(tmp_path):
     np.testing.assert_allclose(np.cross(x, y), angle, atol=1e-15)
 
 
+QUATERNION = """<robot name="r" version="1.1"><link name="a"/><link name="b"><inertial>
+<origin xyz="0.1 0.02 0.3" quat_xyzw="0.1 -0.2 0.3 0.9"/><mass value="2"/>
+<inertia ixx="1" ixy="0.1" ixz="0" iyy="1.2" iyz="0" izz="1.3"/></inertial></link>
+<joint name="j" type="continuous"><origin xyz="0 1 0" quat_xyzw="2e30 0 0 2e30"/>
+<parent link="a"/><child link="b"/><axis xyz="0 1 0"/></joint></robot>
+"""
+
+
+def test_origins_have_quaternions_from_version_1_1(tmp_path):
+    found = prepared(tmp_path, QUATERNION)
+    np.testing.assert_allclose(found.urdf_model.bodies[1].attitude, np.sqrt([0.5, 0.5, 0, 0]), rtol=1e-15)
+    assert found.urdf_model.not_compared == ()
+    text = QUATERNION.replace("2e30", "2")  # urdfdom squares the numbers
+    assert max(ratios(prepared(tmp_path, text), "pinocchio").values()) <= 1
+
+
+@pytest.mark.parametrize("version", ["1.0", "1", "1.1.1", None])
+def test_quaternions_of_other_versions_are_not_read_and_listed(tmp_path, version):
+    new = "" if version is None else f'version="{version}"'
+    model = prepared(tmp_path, QUATERNION.replace('version="1.1"', new)).urdf_model
+    assert {f.what for f in model.not_compared} == {"attribute quat_xyzw of <origin>"}
+    np.testing.assert_array_equal(model.bodies[1].attitude, [1, 0, 0, 0])
+
+
 def test_decimals_are_rounded_once_and_axes_normalised(tmp_path):
     text = random_urdf(np.random.default_rng(5), 1, ("revolute",))
     start = text.index("<axis")
