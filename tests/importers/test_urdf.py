@@ -43,6 +43,19 @@ def test_importers_that_read_a_file_alike_agree_with_the_own_reader(tmp_path, im
     assert max(found.values()) <= 1, found
 
 
+EXTENSION = """<mujoco><option gravity="0 0 -1"><flag damper="disable" spring="disable"/></option>
+<compiler balanceinertia="true" boundmass="5" boundinertia="7" settotalmass="9" fusestatic="false"/></mujoco>
+"""
+
+
+@pytest.mark.parametrize("base", ["fixed", "free"])
+def test_mujocos_extension_of_a_urdf_is_listed_and_does_not_hold(tmp_path, base):
+    text = random_urdf(np.random.default_rng(3), 3, ("revolute", "fixed"))
+    found = prepared(tmp_path, text.replace("<link", f"{EXTENSION}<link", 1), base)
+    assert ("mujoco", 2) in {(f.what, f.source.line) for f in found.urdf_model.not_compared}
+    assert max(ratios(found, "mujoco").values()) <= 1
+
+
 @pytest.mark.parametrize("importer", ["mujoco", "pinocchio"])
 def test_a_floating_joint_of_the_root_is_a_free_joint(tmp_path, importer):
     text = random_urdf(np.random.default_rng(3), 3, ("revolute",)).replace("revolute", "floating", 1)
