@@ -284,21 +284,30 @@ class _UrdfReader:
         if kind == "floating":
             if joint.parent in self.fixed_to_root:
                 return (_joint(name, "free", np.zeros(3), source, **passive),)
+            *names, rotation = self.names_of_parts(name, ("x", "y", "z", "rotation"))
             slides = [
-                _joint(f"{name}/{c}", "slide", e, source, **passive)
-                for c, e in zip("xyz", np.eye(3), strict=True)
+                _joint(own, "slide", e, source, **passive) for own, e in zip(names, np.eye(3), strict=True)
             ]
-            return (*slides, _joint(f"{name}/rotation", "ball", np.zeros(3), source, **passive))
+            return (*slides, _joint(rotation, "ball", np.zeros(3), source, **passive))
         axis = self.axis(element)
         if kind == "planar":
             first, second = _perpendicular_axes(axis)
             self.ambiguous.append(Feature("planar joint: directions of its two slides", name, source))
+            x, y, angle = self.names_of_parts(name, ("x", "y", "angle"))
             return (
-                _joint(f"{name}/x", "slide", first, source, **passive),
-                _joint(f"{name}/y", "slide", second, source, **passive),
-                _joint(f"{name}/angle", "hinge", axis, source, **passive),
+                _joint(x, "slide", first, source, **passive),
+                _joint(y, "slide", second, source, **passive),
+                _joint(angle, "hinge", axis, source, **passive),
             )
         return (_joint(name, "slide" if kind == "prismatic" else "hinge", axis, source, **passive),)
+
+    def names_of_parts(self, joint: str, parts: Sequence[str]) -> list[str]:
+        """Make up names of a joint's parts that no joint of the file has."""
+        stem, count = joint, 1
+        while (count > 1 and stem in self.joints) or any(f"{stem}/{p}" in self.joints for p in parts):
+            count += 1
+            stem = f"{joint}.{count}"
+        return [f"{stem}/{part}" for part in parts]
 
     def axis(self, joint: Element) -> Array:
         """Read a joint's axis as a unit vector; (1, 0, 0) where the file has none."""

@@ -11,6 +11,7 @@ from plumbline.model_files.model_comparison import (
     mismatches,
     model_states,
     permuted,
+    with_names_of,
 )
 from tests.helpers.importer_columns import prepared_file
 from tests.helpers.random_robots import random_urdf
@@ -121,6 +122,29 @@ def test_quaternions_of_other_versions_are_not_read_and_listed(tmp_path, version
     model = prepared(tmp_path, QUATERNION.replace('version="1.1"', new)).urdf_model
     assert {f.what for f in model.not_compared} == {"attribute quat_xyzw of <origin>"}
     np.testing.assert_array_equal(model.bodies[1].attitude, [1, 0, 0, 0])
+
+
+def test_made_up_names_of_parts_are_no_names_of_the_file(tmp_path):
+    text = random_urdf(np.random.default_rng(3), 5, ("revolute",))
+    for k, (name, kind) in enumerate(
+        [
+            ("p", "planar"),
+            ("p/x", "prismatic"),
+            ("f", "floating"),
+            ("f/rotation", "planar"),
+            ("p.2", "planar"),
+        ],
+        start=1,
+    ):
+        text = text.replace(f'name="joint{k}" type="revolute"', f'name="{name}" type="{kind}"')
+    found = prepared(tmp_path, text.replace("floating", "planar"))
+    model, reading = found.urdf_model, read_model_file("mujoco", found.file).model
+    names = [joint.name for joint in model.joints]
+    assert {"p.3/x", "p.3/angle", "p/x", "f/x", "f/rotation/x", "p.2/y"} <= set(names)
+    assert len(set(names)) == len(names) == 13
+    assert joint_permutation(model, with_names_of(model, reading)) == list(range(13))
+    names = [joint.name for joint in prepared(tmp_path, text).urdf_model.joints]
+    assert "f.2/rotation" in names and len(set(names)) == len(names)
 
 
 def test_decimals_are_rounded_once_and_axes_normalised(tmp_path):
