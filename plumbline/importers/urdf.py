@@ -151,7 +151,8 @@ class _UrdfReader:
             holder[joint.child] = joint
             below.setdefault(joint.parent, []).append(joint)
         tops = [name for name in self.links if name not in holder]
-        if len(tops) > 1:
+        is_any_left_out = len(holder) < len(self.root.find_all("joint"))  # with a mistake, which is listed
+        if len(tops) > 1 and not is_any_left_out:
             listed = ", ".join(f"{name!r} ({self.links[name].source})" for name in tops[:5])
             message = f"has {len(tops)} links that are no joint's child: {listed}"
             self.problems.append(self.root.problem(message, valid="one root link"))
@@ -312,9 +313,12 @@ class _UrdfReader:
     def axis(self, joint: Element) -> Array:
         """Read a joint's axis as a unit vector; (1, 0, 0) where the file has none."""
         element = joint.find("axis")
-        if element is not None and "xyz" in element.attributes:
-            return self.unit(element, "xyz", 3, "a direction")
-        return np.array([1.0, 0.0, 0.0])
+        if element is None:
+            return np.array([1.0, 0.0, 0.0])
+        if "xyz" not in element.attributes:
+            self.problems.append(element.problem("has no xyz", valid="a direction, or no <axis>"))
+            return np.zeros(3)
+        return self.unit(element, "xyz", 3, "a direction")
 
     def unit(self, element: Element, attribute: str, count: int, valid: str) -> Array:
         """Read the numbers of an attribute and normalise them."""

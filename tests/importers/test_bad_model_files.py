@@ -79,6 +79,21 @@ def test_every_mistake_of_a_file_is_listed(tmp_path):
     assert len(refusal(prepare_file, str(path), tmp_path).problems) == 4
 
 
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ('<parent link="a"/>', '<parent link="c"/>'),
+        ('joint name="j"', "joint"),
+        ("</robot>", '<link name="c"/>' + JOINT.replace('link="b"', 'link="c"') + "</robot>"),
+    ],
+)
+def test_links_of_a_joint_with_a_mistake_are_no_roots(tmp_path, old, new):
+    path = tmp_path / "robot.urdf"
+    path.write_text(robot(old, new))
+    problems = refusal(prepare_file, str(path), tmp_path).problems
+    assert problems and not any("no joint's child" in problem.message for problem in problems)
+
+
 def test_a_header_with_a_wrong_version_and_another_encoding_is_read(tmp_path):
     path = tmp_path / "robot.urdf"
     path.write_bytes(
