@@ -112,6 +112,10 @@ class _UrdfReader:
         if not self.links and not self.problems:
             self.problems.append(self.root.problem("has no <link>"))
         below, top = self.tree()
+        if top == "world" and base == "free":
+            message = "is the root link: importers take it for the world itself, which is fixed"
+            hint = "leave --base free out, or rename the link"
+            self.problems.append(self.links[top].problem(message, "name", hint=hint))
         self.note_features()
         bodies: list[NeutralBody] = []
         stack: list[tuple[str, int, _Joint | None]] = [(top, -1, None)] if top else []

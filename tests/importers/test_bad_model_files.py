@@ -94,6 +94,14 @@ def test_links_of_a_joint_with_a_mistake_are_no_roots(tmp_path, old, new):
     assert problems and not any("no joint's child" in problem.message for problem in problems)
 
 
+def test_a_free_root_is_not_the_world(tmp_path):
+    path = tmp_path / "robot.urdf"
+    path.write_text(robot().replace('"a"', '"world"'))
+    assert prepare_file(str(path), tmp_path, base="fixed").urdf_model.bodies[0].name == "world"
+    message = "robot.urdf:1:8: <link name='world'> name: is the root link: importers take it for the world"
+    assert message in str(refusal(prepare_file, str(path), tmp_path, None, "free"))
+
+
 def test_a_header_with_a_wrong_version_and_another_encoding_is_read(tmp_path):
     path = tmp_path / "robot.urdf"
     path.write_bytes(
