@@ -12,13 +12,15 @@ body, are merged into that body.
         refuses plants with constraints (mimic joints among them)
     f = damping of the joints, AddInDamping, and what force elements besides gravity add to inverse dynamics
 
-A URDF's root link is free in Drake; with a fixed base it is welded to the world.  Its actuators have no rotor
-here: transmissions are not compared.
+A URDF's root link is free in Drake; with a fixed base it is welded to the world.  So are the children of
+floating joints, for which Drake adds no joint; they stay free.  Its actuators have no rotor here:
+transmissions are not compared.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -38,6 +40,7 @@ from adapters.importer_common import (
 )
 from plumbline.importers.importer import ModelFile
 from plumbline.importers.neutral_model import ElementaryJoint, ModelQuantities, NeutralBody
+from plumbline.importers.xml_tree import read_xml
 from plumbline.model.datatypes import Array
 from plumbline.model.kinematics import rotation_matrix
 
@@ -180,9 +183,11 @@ class DrakeImporter(LoadingImporter):
         plant = MultibodyPlant(0.0)
         Parser(plant).AddModels(file.path)
         if file.format == "urdf" and file.base == "fixed":
-            children = {plant.get_joint(j).child_body().index() for j in plant.GetJointIndices()}
+            joints = read_xml(Path(file.path), file.path).find_all("joint")
+            children = {child.attributes.get("link") for j in joints for child in j.find_all("child")}
             for index in range(1, plant.num_bodies()):
-                if BodyIndex(index) not in children:
-                    plant.WeldFrames(plant.world_frame(), plant.get_body(BodyIndex(index)).body_frame())
+                body = plant.get_body(BodyIndex(index))
+                if body.name() not in children:
+                    plant.WeldFrames(plant.world_frame(), body.body_frame())
         plant.Finalize()
         return plant

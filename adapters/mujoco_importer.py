@@ -11,7 +11,8 @@ What is not compared is switched off after compiling: actuators with their armat
 tendons and flexes, terms of joint springs and dampers that are not linear, buoyancy and drag of a fluid,
 gravity compensation.  Contacts, limits, equalities and friction loss do not enter these
 quantities.  A URDF's root link is fused with the world, MuJoCo's default; with a free base links are not
-fused and the root link gets a free joint.
+fused and the root link gets a free joint.  Of
+MuJoCo's extension <mujoco> in a URDF only the places of files hold: the other importers do not read it.
 """
 
 from __future__ import annotations
@@ -48,6 +49,11 @@ NOT_COMPARED = (  # arrays of a compiled model whose features are not compared
     "dof_dampingpoly", "jnt_stiffnesspoly", "jnt_springyield", "body_gravcomp",
     "flex_stiffness", "flex_bending", "flex_damping", "flex_edgestiffness", "flex_edgedamping",
 )  # fmt: skip
+URDF_GRAVITY = (0.0, 0.0, -9.81)  # m/s²
+URDF_COMPILER = {  # MuJoCo's defaults, which a URDF's extension <mujoco> can change
+    "balanceinertia": False, "boundinertia": 0.0, "boundmass": 0.0, "inertiafromgeom": 2,
+    "inertiagrouprange": (0, 5), "settotalmass": -1.0, "alignfree": False,
+}  # fmt: skip
 
 
 class _Layout(Layout):
@@ -118,15 +124,21 @@ def _print(text: str) -> None:
 
 
 def _compiled(file: ModelFile) -> Any:
-    if file.format == "mjcf" or file.base == "fixed":
+    if file.format == "mjcf":
         return mujoco.MjModel.from_xml_path(file.path)
-    spec = mujoco.MjSpec.from_file(file.path)
-    compiler_of(spec).fusestatic = False
+    spec = mujoco.MjSpec()
+    spec = spec.from_file(file.path) or spec  # 3.2.0 returns nothing
+    compiler = compiler_of(spec)
+    set_attributes(compiler, **{name: x for name, x in URDF_COMPILER.items() if hasattr(compiler, name)})
+    compiler.fusestatic = file.base == "fixed"
     root = spec.worldbody.first_body()
-    if root is not None:
+    if file.base == "free" and root is not None:
         name = free_joint_name(root.name, file)
         set_attributes(root.add_joint(), type=mujoco.mjtJoint.mjJNT_FREE, name=name)
-    return spec.compile()
+    model = spec.compile()
+    model.opt.gravity[:] = URDF_GRAVITY
+    model.opt.disableflags = 0
+    return model
 
 
 def _switch_off(m: Any) -> None:

@@ -3,12 +3,15 @@
 Every decimal is rounded to double once.  With the joint's origin (xyz, rpy) the frame of the child link is
 T = Trans(xyz) Rz(yaw) Ry(pitch) Rx(roll) J(x), and the joint moves about or along its axis in that frame
 (http://wiki.ros.org/urdf/XML).  A continuous joint is a hinge; a planar one two slides perpendicular to its
-axis and a hinge about it; a floating one a free joint below the root, else three slides and a ball.
+axis and a hinge about it; a floating one a free joint below the root and links fixed to it, else three slides
+and a ball.  From version 1.1 an origin may have a quaternion quat_xyzw in place of rpy
+(https://github.com/ros/urdfdom).
 """
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -16,7 +19,6 @@ from typing import Any
 import numpy as np
 
 from plumbline.importers.neutral_model import (
-    MAX_MAGNITUDE,
     ElementaryJoint,
     Feature,
     JointKind,
@@ -45,6 +47,8 @@ _READ = {  # what is read of each element: its attributes, and the first of each
     "axis": ({"xyz"}, set[str]()),
     "dynamics": ({"damping", "friction"}, set[str]()),
 }
+_QUATERNION = "quat_xyzw"
+_VERSION = re.compile(r"(\d{1,9})\.(\d{1,9})", re.ASCII)
 _GEOMETRY = {"visual", "collision"}
 _TRIANGLE_ROUNDING = 1e-9  # relative; published inertias are rounded to a few decimals
 
@@ -85,6 +89,9 @@ class _UrdfReader:
         self.ambiguous: list[Feature] = []
         self.links = self.named("link")
         self.joints = self.named("joint")
+        version = _VERSION.fullmatch(root.attributes.get("version", ""))
+        self.has_quaternions = version is not None and (int(version[1]), int(version[2])) >= (1, 1)
+        self.fixed_to_root: set[str] = set()  # links that no joint of the file moves, with the root itself
 
     def named(self, tag: str) -> dict[str, Element]:
         """Index the robot's children of a tag by name."""
@@ -105,11 +112,17 @@ class _UrdfReader:
         if not self.links and not self.problems:
             self.problems.append(self.root.problem("has no <link>"))
         below, top = self.tree()
+        if top == "world" and base == "free":
+            message = "is the root link: importers take it for the world itself, which is fixed"
+            hint = "leave --base free out, or rename the link"
+            self.problems.append(self.links[top].problem(message, "name", hint=hint))
         self.note_features()
         bodies: list[NeutralBody] = []
         stack: list[tuple[str, int, _Joint | None]] = [(top, -1, None)] if top else []
         while stack:
             name, parent, joint = stack.pop()
+            if joint is None or (joint.kind == "fixed" and joint.parent in self.fixed_to_root):
+                self.fixed_to_root.add(name)
             bodies.append(self.body(name, parent, joint, base))
             stack.extend((j.child, len(bodies) - 1, j) for j in reversed(below.get(name, [])))
         if self.problems:
@@ -142,7 +155,8 @@ class _UrdfReader:
             holder[joint.child] = joint
             below.setdefault(joint.parent, []).append(joint)
         tops = [name for name in self.links if name not in holder]
-        if len(tops) > 1:
+        is_any_left_out = len(holder) < len(self.root.find_all("joint"))  # with a mistake, which is listed
+        if len(tops) > 1 and not is_any_left_out:
             listed = ", ".join(f"{name!r} ({self.links[name].source})" for name in tops[:5])
             message = f"has {len(tops)} links that are no joint's child: {listed}"
             self.problems.append(self.root.problem(message, valid="one root link"))
@@ -177,17 +191,11 @@ class _UrdfReader:
             return ""
         return name
 
-    def numbers(
-        self,
-        element: Element | None,
-        attribute: str,
-        default: tuple[float, ...],
-        largest: float = MAX_MAGNITUDE,
-    ) -> list[float]:
+    def numbers(self, element: Element | None, attribute: str, default: tuple[float, ...]) -> list[float]:
         """Read an attribute's numbers; the default where the attribute or its element is missing."""
         if element is None or attribute not in element.attributes:
             return list(default)
-        return parse_numbers(element, attribute, len(default), self.problems, largest)
+        return parse_numbers(element, attribute, len(default), self.problems)
 
     def required(self, element: Element | None, owner: Element, tag: str, attribute: str) -> float:
         """Read one number that must be there."""
@@ -201,9 +209,12 @@ class _UrdfReader:
         """Read an <origin>: position and unit quaternion."""
         origin = owner.find("origin")
         zeros = (0.0, 0.0, 0.0)
-        return np.array(self.numbers(origin, "xyz", zeros)), quaternion_from_rpy(
-            self.numbers(origin, "rpy", zeros)
-        )
+        position, rpy = (self.numbers(origin, name, zeros) for name in ("xyz", "rpy"))
+        if not self.has_quaternions or origin is None or _QUATERNION not in origin.attributes:
+            return np.array(position), quaternion_from_rpy(rpy)
+        if "rpy" in origin.attributes:
+            self.problems.append(origin.problem("stands beside rpy", _QUATERNION, "one of the two"))
+        return np.array(position), np.roll(self.unit(origin, _QUATERNION, 4, "a turn"), 1)
 
     def body(self, name: str, parent: int, joint: _Joint | None, base: str) -> NeutralBody:
         """Read a link and the joint that holds it."""
@@ -216,7 +227,7 @@ class _UrdfReader:
                 joints = (_joint(f"{name}/free", "free", np.zeros(3), link.source),)
         else:
             position, attitude = self.pose(joint.element)
-            joints = self.elementary(joint, parent)
+            joints = self.elementary(joint)
             origin = joint.element.find("origin")
             fields = dict.fromkeys(("position", "attitude"), (origin or joint.element).source)
         mass, center, inertia = self.inertial(link, fields)
@@ -257,7 +268,7 @@ class _UrdfReader:
         elif high > (low + middle) * (1 + _TRIANGLE_ROUNDING):
             self.ambiguous.append(Feature("inertia that violates A + B ≥ C", name, element.source))
 
-    def elementary(self, joint: _Joint, parent: int) -> tuple[ElementaryJoint, ...]:
+    def elementary(self, joint: _Joint) -> tuple[ElementaryJoint, ...]:
         """Translate a joint to elementary ones."""
         element, kind = joint.element, joint.kind
         name, source = element.attributes["name"], element.source
@@ -276,31 +287,50 @@ class _UrdfReader:
             },
         }
         if kind == "floating":
-            if parent == 0:
+            if joint.parent in self.fixed_to_root:
                 return (_joint(name, "free", np.zeros(3), source, **passive),)
+            *names, rotation = self.names_of_parts(name, ("x", "y", "z", "rotation"))
             slides = [
-                _joint(f"{name}/{c}", "slide", e, source) for c, e in zip("xyz", np.eye(3), strict=True)
+                _joint(own, "slide", e, source, **passive) for own, e in zip(names, np.eye(3), strict=True)
             ]
-            return (*slides, _joint(f"{name}/rotation", "ball", np.zeros(3), source, **passive))
+            return (*slides, _joint(rotation, "ball", np.zeros(3), source, **passive))
         axis = self.axis(element)
         if kind == "planar":
             first, second = _perpendicular_axes(axis)
             self.ambiguous.append(Feature("planar joint: directions of its two slides", name, source))
+            x, y, angle = self.names_of_parts(name, ("x", "y", "angle"))
             return (
-                _joint(f"{name}/x", "slide", first, source, **passive),
-                _joint(f"{name}/y", "slide", second, source, **passive),
-                _joint(f"{name}/angle", "hinge", axis, source, **passive),
+                _joint(x, "slide", first, source, **passive),
+                _joint(y, "slide", second, source, **passive),
+                _joint(angle, "hinge", axis, source, **passive),
             )
         return (_joint(name, "slide" if kind == "prismatic" else "hinge", axis, source, **passive),)
+
+    def names_of_parts(self, joint: str, parts: Sequence[str]) -> list[str]:
+        """Make up names of a joint's parts that no joint of the file has."""
+        stem, count = joint, 1
+        while (count > 1 and stem in self.joints) or any(f"{stem}/{p}" in self.joints for p in parts):
+            count += 1
+            stem = f"{joint}.{count}"
+        return [f"{stem}/{part}" for part in parts]
 
     def axis(self, joint: Element) -> Array:
         """Read a joint's axis as a unit vector; (1, 0, 0) where the file has none."""
         element = joint.find("axis")
-        values = np.array(self.numbers(element, "xyz", (1.0, 0.0, 0.0), math.inf))
+        if element is None:
+            return np.array([1.0, 0.0, 0.0])
+        if "xyz" not in element.attributes:
+            self.problems.append(element.problem("has no xyz", valid="a direction, or no <axis>"))
+            return np.zeros(3)
+        return self.unit(element, "xyz", 3, "a direction")
+
+    def unit(self, element: Element, attribute: str, count: int, valid: str) -> Array:
+        """Read the numbers of an attribute and normalise them."""
+        values = np.array(parse_numbers(element, attribute, count, self.problems, math.inf))
         largest = float(np.max(np.abs(values)))
         if largest == 0:
-            if not self.problems or self.problems[-1].line != (element or joint).source.line:
-                self.problems.append((element or joint).problem("is zero", "xyz", "a direction"))
+            if not self.problems or self.problems[-1].line != element.source.line:
+                self.problems.append(element.problem("is zero", attribute, valid))
             return values
         values = values / largest  # so that its square neither overflows nor vanishes
         unit: Array = values / math.sqrt(float(values @ values))
@@ -323,6 +353,8 @@ class _UrdfReader:
     def note_unread(self, element: Element, owner: str) -> None:
         """List attributes and elements of a link or joint that are not read, misspelt ones too."""
         attributes, parts = _READ[element.tag]
+        if element.tag == "origin" and self.has_quaternions:
+            attributes = attributes | {_QUATERNION}
         for name in sorted(element.attributes.keys() - attributes):
             what = f"attribute {shorten(name)} of <{element.tag}>"
             self.features.append(Feature(what, owner, element.source))

@@ -11,6 +11,7 @@ import numpy as np
 
 from plumbline.importers.neutral_model import CanonicalState, ModelQuantities, NeutralModel
 from plumbline.model.datatypes import Array
+from plumbline.model.kinematics import quaternion_product, rotation_matrix
 from plumbline.model_files.certified_model import FORCES, CertifiedModelQuantities, certify_model
 
 TINY = float(np.finfo(float).tiny)  # replaces a tolerance of zero, so that an error of zero has the ratio 0
@@ -71,13 +72,20 @@ def _joint_values(name: str, kind: str, count: int, seed: int) -> tuple[Array, A
 
 def _given_state(model: NeutralModel, at: Mapping[str, float]) -> CanonicalState:
     parts: list[Array] = []
+    places: list[tuple[Array, Array]] = []  # of the bodies in the world, at the joints' reference
     for body in model.bodies:
+        position, attitude = body.position, body.attitude
+        if body.parent >= 0:
+            above, turn_above = places[body.parent]
+            position = above + rotation_matrix(turn_above) @ position
+            attitude = quaternion_product(turn_above, attitude)
+        places.append((position, attitude))
         for joint in body.joints:
             turn = np.array([1.0, 0.0, 0.0, 0.0])
             parts.append(
                 {
                     "ball": turn,
-                    "free": np.concatenate([body.position, body.attitude]),
+                    "free": np.concatenate([position, attitude]),
                 }.get(joint.kind, np.array([at.get(joint.name, joint.reference)]))
             )
     return CanonicalState(np.concatenate([*parts, np.zeros(0)]), np.zeros(model.velocity_count))

@@ -8,6 +8,7 @@ from copy import deepcopy
 from dataclasses import dataclass, replace
 from os.path import isfile
 from pathlib import Path
+from tempfile import mkdtemp
 from typing import Literal
 from urllib.parse import unquote
 
@@ -109,7 +110,7 @@ class PreparedFile:
         return sorted(self.lines.get(line, ()), key=lambda element: element.tag not in tags)
 
     def write_rewritings(self, folder: Path) -> dict[str, ModelFile]:
-        """Write equivalent rewritings of an MJCF file.
+        """Write equivalent rewritings of an MJCF file, in a folder of their own below a given one.
 
         Returns:
             Files for importers, by what was done to them.
@@ -118,8 +119,9 @@ class PreparedFile:
         tree = deepcopy(self.tree)
         mjcf.make_paths_absolute(tree, Path(self.shown).parent.resolve())
         found = {}
-        for name, rewritten in rewritings(tree).items():
-            path = folder / f"{len(list(folder.iterdir()))}.xml"
+        own_folder = Path(mkdtemp(dir=folder))  # a copy of the user's file may have any name in the other
+        for count, (name, rewritten) in enumerate(rewritings(tree).items()):
+            path = own_folder / f"{count}.xml"
             with naming_file(path):
                 path.write_text(write_xml(rewritten), encoding="utf-8")
             found[name] = replace(self.file, path=str(path))
@@ -165,7 +167,7 @@ def prepare_file(
             link.children = [c for c in link.children if c.tag not in ("visual", "collision")]
     model = read_urdf(tree, chosen) if kind == "urdf" else None
     leave_out = "the mass of a body without <inertial> is made of it" if strip else STRIP_HINT
-    _check_references(tree, kind, path.parent, folder, f"{leave_out}; --root names another folder")
+    _check_references(tree, kind, path, folder, f"{leave_out}; --root names another folder")
     opened, lines = path.resolve(), dict[int, list[Element]]()
     if is_copied:
         if kind == "mjcf":
@@ -208,9 +210,27 @@ def _format_of(tree: Element, shown: str) -> Format:
     raise ModelFileError([tree.source.problem(message, "<robot> (URDF) or <mujoco> (MJCF)", hint)])
 
 
-def _check_references(tree: Element, kind: Format, folder: Path, root: Path, hint: str) -> None:
-    """Refuse files that are missing, outside the root, or on the network."""
-    problems = []
+def _check_references(tree: Element, kind: Format, file: Path, root: Path, hint: str) -> None:
+    """Refuse files that are missing, outside the root, or on the network, those of models of assets too."""
+    checked, pending = {file.resolve()}, [(tree, kind, file)]
+    while pending:
+        tree, kind, file = pending.pop()
+        for element, inside in _check_files(tree, kind, file.parent, root, hint):
+            if element.tag != "model" or inside in checked:
+                continue
+            checked.add(inside)
+            shown = str(Path(tree.source.file).parent / element.attributes["file"])
+            model = read_xml(inside, shown)
+            if (kind_of_model := _format_of(model, shown)) == "mjcf":
+                mjcf.expand_includes(model, inside, root, shown)
+            pending.append((model, kind_of_model, inside))
+
+
+def _check_files(
+    tree: Element, kind: Format, folder: Path, root: Path, hint: str
+) -> list[tuple[Element, Path]]:
+    """Refuse files that one file names; return those that are there, with the elements that name them."""
+    problems, good = [], []
     if kind == "mjcf":
         found = list(mjcf.asset_files(tree, folder))
     else:
@@ -235,13 +255,16 @@ def _check_references(tree: Element, kind: Format, folder: Path, root: Path, hin
         else:
             candidates = [path]
         inside = [target for c in candidates if (target := mjcf.resolve_inside(c, root)) is not None]
+        there = [target for target in inside if isfile(target)]
+        good += [(element, target) for target in there[:1]]
         if not inside:
             problems.append(element.problem(f"{shorten(repr(name))} is outside {root}", attribute, hint=hint))
-        elif not any(isfile(target) for target in inside):
+        elif not there:
             message = f"there is no file {shorten(repr(name))} in {root}"
             problems.append(element.problem(message, attribute, hint=hint))
     if problems:
         raise ModelFileError(problems)
+    return good
 
 
 def _package_paths(rest: str, root: Path) -> list[Path]:

@@ -152,6 +152,17 @@ def check_agreement(pool, importer, name, base):
                 np.testing.assert_allclose(answer, value, atol=tolerance, err_msg=quantity)
 
 
+@pytest.mark.parametrize("parent", ["base", "bob"])
+def test_drake_leaves_the_child_of_a_floating_joint_free_with_a_fixed_base(pool, tmp_path, parent):
+    path, more = tmp_path / "floating.urdf", '<link name="ball"/><joint name="f" type="floating">'
+    more += f'<parent link="{parent}"/><child link="ball"/></joint></robot>'
+    text = (FOLDER / "pendulum.urdf").read_text(encoding="utf-8")
+    path.write_text(text.replace("</robot>", more), encoding="utf-8")
+    reading = call(pool, "drake", read_model_file, ModelFile(str(path), "urdf", root=str(tmp_path)))
+    kinds = {body.name: [joint.kind for joint in body.joints] for body in reading.model.bodies}
+    assert kinds == {"base": [], "bob": ["hinge"], "ball": ["free"]}
+
+
 @pytest.mark.parametrize("importer", IMPORTERS)
 @pytest.mark.parametrize("text", ["", "<robot", "\0\1\2"])
 def test_a_bad_file_is_refused_in_the_importers_words(pool, tmp_path, importer, text):

@@ -198,6 +198,8 @@ def test_one_state_can_be_given(tmp_path):
     (file,) = json.loads(result.stdout)["files"]
     assert file["degrees_of_freedom"] == 7
     assert {row["verdict"] for row in file["rows"]} <= {"agrees", "information"}
+    (energy,) = (row for row in file["rows"] if row["quantity"] == "potential_energy")
+    assert energy["verdict"] == "information" and "differences between states" in energy["reason"]
 
 
 def test_a_scenario_file_is_sent_to_run(tmp_path):

@@ -38,10 +38,68 @@ def test_a_bad_file_gets_a_clear_error_with_its_line(tmp_path, name):
     assert all(f"{path}:1:1:" not in problem.message for problem in error.problems), error
 
 
+MAIN = """<mujoco><asset><model name="c" file="parts/child.xml"/></asset><worldbody><body name="b">
+<joint name="j"/><geom size=".1"/><attach model="c" body="k" prefix="p_"/></body></worldbody></mujoco>"""
+CHILD = '<mujoco>{}<worldbody><body name="k"><joint/><geom size=".1"/></body></worldbody></mujoco>'
+OUTSIDE = {  # what the model of an asset reads, and words of the problem
+    "include": [
+        '\n<include file="../../outside.xml"/>',
+        "child.xml:2:1: <include> file: '../../outside.xml' is",
+    ],
+    "mesh": [
+        '<asset><mesh file="../../outside.stl"/></asset>',
+        "child.xml:1:16: <mesh> file: '../../outside.stl'",
+    ],
+    "model": [
+        '<asset><model file="../../outside.xml"/></asset>',
+        "child.xml:1:16: <model> file: '../../outside.xml'",
+    ],
+    "its own": ['<asset><model file="child.xml"/><mesh file="no.stl"/></asset>', "there is no file 'no.stl'"],
+}
+
+
+@pytest.mark.parametrize("name", OUTSIDE)
+def test_models_of_assets_read_no_file_outside_of_the_root(tmp_path, name):
+    more, message = OUTSIDE[name]
+    path, scratch = tmp_path / "robot" / "main.xml", tmp_path / "scratch"
+    for folder in (scratch, path.parent / "parts"):
+        folder.mkdir(parents=True)
+    path.write_text(MAIN)
+    (path.parent / "parts" / "child.xml").write_text(CHILD.format(more))
+    (tmp_path / "outside.xml").write_text(CHILD.format(""))
+    (tmp_path / "outside.stl").write_text("solid\nendsolid\n")
+    assert message in str(refusal(prepare_file, str(path), scratch))
+    (path.parent / "parts" / "child.xml").write_text(CHILD.format('<asset><model file="child.xml"/></asset>'))
+    assert prepare_file(str(path), scratch).file.path == str(path)
+
+
 def test_every_mistake_of_a_file_is_listed(tmp_path):
     path = tmp_path / "robot.urdf"
     path.write_text(f"<robot>{LINKS}{JOINT}</robot>".replace('value="1"', 'value="-1"').replace("ixx", "IXX"))
     assert len(refusal(prepare_file, str(path), tmp_path).problems) == 4
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ('<parent link="a"/>', '<parent link="c"/>'),
+        ('joint name="j"', "joint"),
+        ("</robot>", '<link name="c"/>' + JOINT.replace('link="b"', 'link="c"') + "</robot>"),
+    ],
+)
+def test_links_of_a_joint_with_a_mistake_are_no_roots(tmp_path, old, new):
+    path = tmp_path / "robot.urdf"
+    path.write_text(robot(old, new))
+    problems = refusal(prepare_file, str(path), tmp_path).problems
+    assert problems and not any("no joint's child" in problem.message for problem in problems)
+
+
+def test_a_free_root_is_not_the_world(tmp_path):
+    path = tmp_path / "robot.urdf"
+    path.write_text(robot().replace('"a"', '"world"'))
+    assert prepare_file(str(path), tmp_path, base="fixed").urdf_model.bodies[0].name == "world"
+    message = "robot.urdf:1:8: <link name='world'> name: is the root link: importers take it for the world"
+    assert message in str(refusal(prepare_file, str(path), tmp_path, None, "free"))
 
 
 def test_a_header_with_a_wrong_version_and_another_encoding_is_read(tmp_path):

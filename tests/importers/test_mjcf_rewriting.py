@@ -1,5 +1,7 @@
 """Equivalent rewritings of an MJCF file: MuJoCo compiles each to the same model; defects are reported."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -219,3 +221,15 @@ def test_inertias_that_a_body_frame_is_aligned_with_are_not_written_otherwise(tm
     )
     written, row = judged(tmp_path, text)
     assert row.verdict == "agrees" and inertias & written.keys() == {"geoms replaced by their inertials"}
+
+
+@pytest.mark.parametrize("name", ["0.xml", "1.xml", "6.xml", "rewritings"])
+def test_rewritings_are_written_beside_a_copy_of_any_name(tmp_path, name):
+    path, scratch = tmp_path / name, tmp_path / "scratch"
+    path.write_text(ROBOT.replace('<freejoint name="free"/>', "<freejoint/>"))
+    scratch.mkdir()
+    prepared = prepare_file(str(path), scratch)
+    copied = Path(prepared.file.path).read_text()
+    written = [file.path for file in prepared.write_rewritings(scratch).values()]
+    assert len({prepared.file.path, *written}) == 1 + len(NAMES)
+    assert Path(prepared.file.path).read_text() == copied
