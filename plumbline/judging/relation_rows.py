@@ -54,7 +54,7 @@ def _relation_row(context: RowContext, result: RelationResult) -> Row:
         verdict, quantity = Verdict.DISAGREES, result.quantity.replace("_", " ")
         reason = f"the {quantity} of {context.title} at {where} differs by {result.ratio:.3g} times {limit}"
     return context.make_row(
-        "relations", integrator, name, verdict, f"{name}: {reason}",
+        "relations", integrator, name, verdict, f"{name}: {reason}{result.remark}",
         value=result.ratio, tolerance=1.0, derivation=derivation, extra=extra,
     )  # fmt: skip
 
@@ -69,7 +69,7 @@ def _repeatability_row(context: RowContext, result: RelationResult, extra: dict[
         reason = f"{result.quantity}, differs by {result.ratio:.2g} of its size from the first answer"
     else:
         verdict, reason = Verdict.AGREES, f"{asked} gave the same bits each time"
-    reason = f"{REPEATABILITY} of {context.title}: {reason}"
+    reason = f"{REPEATABILITY} of {context.title}: {reason}{result.remark}"
     return context.make_row(
         "relations", result.integrator, REPEATABILITY, verdict, reason, value=result.ratio, tolerance=0.0,
         derivation="equal questions give equal bits: alone, in one call, in reverse order, after another one",

@@ -10,6 +10,7 @@ perturbations of the motion grow.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -96,16 +97,15 @@ def with_shorter_steps(
 ) -> Iterator[RelationResult]:
     """Check short runs of every integrator; where an implicit one fails, with the next step."""
     for integrator in (one for one in engine.integrators if one.has_motions):
-        results: list[RelationResult] = []
+        results, remark = list[RelationResult](), ""
         for step in steps:
-            results = [*check(integrator, step)]
-            if integrator.kind == "tolerance" or not any(_has_failed(result) for result in results):
+            results = [replace(result, remark=remark) for result in check(integrator, step)]
+            no_answers = [one.no_answer for one in results if one.no_answer]
+            failures = [one.message for one in no_answers if not one.is_refusal]
+            if integrator.kind == "tolerance" or not failures:
                 break
+            remark = remark or f"; with steps of {step:.4g} s {failures[0]}"
         yield from results
-
-
-def _has_failed(result: RelationResult) -> bool:
-    return result.no_answer is not None and not result.no_answer.is_refusal
 
 
 def check_integrator_relations(

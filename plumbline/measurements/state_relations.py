@@ -370,7 +370,7 @@ def check_state_relation(
 
     """
     worst, count, unexplained = (0.0, "", 0), 0, 0.0
-    refused: Unsupported | None = None
+    refused = list[Unsupported]()
     others = [relation.transform(model, state) for state in states]
     try:
         answered = _evaluate_together(evaluate_other, others)
@@ -380,11 +380,8 @@ def check_state_relation(
         return RelationResult(relation.name, None, no_answer=NoAnswer.by(error))
     for index, (state, other) in enumerate(zip(states, answered, strict=True)):
         here = answers[index]
-        if isinstance(here, Unsupported):
-            refused = here
-            continue
-        if isinstance(other, Unsupported):
-            refused = other
+        if isinstance(here, Unsupported) or isinstance(other, Unsupported):
+            refused += [one for one in (here, other) if isinstance(one, Unsupported)][:1]
             continue
         count += 1
         mine, theirs = quantity_values(here), relation.transform_back(other)
@@ -400,10 +397,10 @@ def check_state_relation(
             worst = max(worst, (_largest_ratio(difference, allowed), q, index))
             unexplained = max(unexplained, _largest_ratio(difference - missing.get(q, 0.0), allowed))
     if not count:
-        assert refused is not None
-        return RelationResult(relation.name, None, no_answer=NoAnswer.by(refused))
+        return RelationResult(relation.name, None, no_answer=NoAnswer.by(refused[-1]))
     left = unexplained if relation.missing_term else None
-    return RelationResult(relation.name, *worst, count, unexplained=left)
+    remark = f"; refused at {len(refused)} of {len(states)} states: {refused[0]}" if refused else ""
+    return RelationResult(relation.name, *worst, count, unexplained=left, remark=remark)
 
 
 def _largest_ratio(difference: Array, allowed: Array) -> float:

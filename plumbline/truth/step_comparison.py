@@ -907,14 +907,6 @@ class RunSteps(StepsFromSamples):
         found["run_samples"] = self._samples()
         return found
 
-    def resolves_rest(self, count: int) -> bool:
-        """Find out whether the declared formula itself resolves so many steps more, from the last sample."""
-        start = self.charts.divided(*(x[-1:] for x in self.own))
-        with np.errstate(all="ignore"):
-            passed = steps_in_charts(self.charts, *start, [self.h], count)
-            rates = np.array([np.linalg.norm(np.asarray(links.omega, float), axis=-1) for links in passed])
-            return bool(np.max(rates) * self.h <= MAX_TURN)
-
     def _left_out_steps(self) -> NDArray[np.str_]:
         """Find the steps (steps,) for which no bound is given, and why; whether they agree plays no part.
 
@@ -1027,6 +1019,30 @@ class RunSteps(StepsFromSamples):
             for name, x in off.items()
         ]
         return np.array(padded)
+
+
+def resolves_steps(
+    method: JointSpaceMethod, model: Model, state: State, h: float, count: int, run: StepRun | None,
+    angle_axes: Array | None,
+) -> bool:  # fmt: skip
+    """Find out whether the declared formula itself resolves a motion with this step.
+
+    Args:
+        state: that a run starts from; ``angle_axes``: its coordinates, as of `StepRun`.
+        h: step [s].
+        count: of steps, from the start.
+        run: the first of them, with coordinates; the others start from its end.
+
+    """
+    charts, done = StepCharts(model, method, [state], [angle_axes]), 0
+    start = charts.start()
+    if run is not None and run.trajectory.coordinates is not None and run.trajectory.velocities is not None:
+        done = len(run.trajectory.t) - 1
+        start = charts.divided(run.trajectory.coordinates[-1:], run.trajectory.velocities[-1:])
+    with np.errstate(all="ignore"):
+        passed = steps_in_charts(charts, *start, [h], count - done)
+        rates = np.array([np.linalg.norm(np.asarray(links.omega, float), axis=-1) for links in passed])
+        return bool(np.max(rates) * h <= MAX_TURN)
 
 
 def sample_deviations(

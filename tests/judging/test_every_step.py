@@ -151,6 +151,30 @@ def test_a_run_that_stops_where_the_method_goes_on_has_failed(monkeypatch):
     assert row.verdict == Verdict.FAILED and row.reason.endswith(": it stops")
 
 
+@pytest.mark.parametrize(("engine", "name"), [("mujoco", "Euler"), ("exudyn", "generalized-alpha")])
+def test_smaller_steps_do_not_replace_a_run_that_failed_where_the_method_goes_on(engine, name, monkeypatch):
+    """Newton's iteration may diverge at larger steps, as every row then says; explicit methods may not."""
+    (model, states), adapter = subject("tumbling-ball"), load_adapter(engine)
+    own, steps = type(adapter).step, []
+
+    def fails(self, model, state, integrator, step, count):
+        steps.append(step)
+        if step == steps[0]:
+            raise EngineFailure("it stops")
+        return own(self, model, state, integrator, step, count)
+
+    monkeypatch.setattr(type(adapter), "step", fails)
+    rows = {name: row for name, row in rows_of(adapter, name, model, states).items() if "run" in name}
+    if engine == "mujoco":
+        assert rows["run"].verdict == Verdict.FAILED
+        assert rows["run"].reason.endswith(f"in a run of {steps[0]:g} s per step: it stops")
+    else:
+        assert rows.keys() == {"run_quadrature", "run_equations", "run_samples"}
+        for row in rows.values():
+            assert row.verdict == Verdict.AGREES
+            assert row.reason.endswith(f"; in a run of {steps[0]:.4g} s per step it stops")
+
+
 @pytest.mark.parametrize("engine", ["mujoco", "pinocchio", "exudyn-tree"])
 def test_every_step_of_free_bodies_far_away_agrees(engine):
     """They fly past 100 times their size: nothing but a place is rounded more coarsely there."""
