@@ -1,6 +1,7 @@
 """The arithmetic behind the relations: what is compared, over what, and what the rows say."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from plumbline.measurements.run_relations import (
     relative_differences,
     run_tolerance,
     state_at_sample,
+    with_shorter_steps,
     worst_difference_result,
 )
 from plumbline.measurements.state_relations import (
@@ -92,6 +94,8 @@ def test_equal_answers_and_refused_ones():
     some = self_relation_result((0, "acceleration", 5.0), (1, "acceleration", 3.0), refuse=(0,))
     assert (some.state_count, some.worst_state) == (2, 1) and some.no_answer is None
     assert some.ratio == pytest.approx(3, rel=1e-3)  # rounded as above
+    (row,) = judge_relations(WHO, [some]).rows
+    assert row.reason.endswith("; refused at 1 of 3 states: not state 0")
     mine = self_relation_result((2, "acceleration", 5.0), (1, "acceleration", 3.0), refuse_here=(2,))
     assert (mine.state_count, mine.worst_state, mine.no_answer) == (2, 1, None)
     none = self_relation_result(refuse=(0, 1, 2))
@@ -115,6 +119,19 @@ def test_an_option_by_which_the_engine_fails_is_a_failure_of_its_own_row():
     (row,) = judge_relations(WHO, [found]).rows
     assert row.verdict == "failed" and "no such option" in row.reason
     assert row.extra["place"].startswith("AttributeError in ") and row.extra["place"].endswith(" > failing")
+
+
+def test_a_run_that_failed_with_a_larger_step_is_named():
+    engine = SimpleNamespace(integrators=[METHOD])
+
+    def check(integrator, step):
+        failure = NoAnswer(f"it stopped at {step:g}", is_refusal=False) if step > 0.1 else None
+        ratio = None if failure else 0.5
+        yield RelationResult("by it", ratio, no_answer=failure, integrator=integrator.name, steps=8)
+
+    rows = judge_relations(WHO, [*with_shorter_steps(engine, [0.4, 0.2, 0.1], check)]).rows
+    assert [row.verdict for row in rows] == ["agrees"]
+    assert rows[0].reason.endswith("over 8 steps; with steps of 0.4 s it stopped at 0.4")
 
 
 def test_runs_are_measured_by_length_turn_and_speed():
