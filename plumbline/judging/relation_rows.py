@@ -47,7 +47,9 @@ def _relation_row(context: RowContext, result: RelationResult) -> Row:
         limit, over = "the sum of both rounding bounds", f"{result.state_count} states"
         where = f"state {result.worst_state}"
         derivation = "worst difference over the sum of the state-level rounding bounds of both sides"
-    if result.ratio <= 1:
+    if result.ratio <= 1 and result.undecided:
+        verdict, reason = Verdict.UNRESOLVED, f"inconclusive: {result.undecided}"
+    elif result.ratio <= 1:
         verdict = Verdict.AGREES
         reason = f"both results of {context.title} agree within {result.ratio:.2g} of {limit}, over {over}"
     else:

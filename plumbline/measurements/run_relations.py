@@ -36,6 +36,7 @@ from plumbline.truth.rounding_bound import remembered_rounding_bound
 
 REVERSED_IN_TIME = "reversed in time"
 STEP_DIVISORS = 1, 4, 16  # of the step, tried one after the other where an implicit integrator fails
+MAX_TOLERANCE = 1e-4  # of a run's scales; a larger one could hide a mistake
 RUN_STEPS = 16  # of a run, one way
 STEPS_PER_RADIAN = 32  # at the fastest rate, so that implicit steps can be solved
 
@@ -306,7 +307,13 @@ def worst_difference_result(
 
     """
     quantity = max(differences, key=lambda q: differences[q])
+    undecided = ""
+    if limit > MAX_TOLERANCE:
+        undecided = (
+            f"runs may differ by {limit:.2g} of their scales, by rounding and by the tolerance of the steps, "
+            f"too much to detect an error (limit {MAX_TOLERANCE:g})"
+        )
     return RelationResult(
-        name, differences[quantity] / limit, quantity, 0, 1, integrator=integrator.name, steps=steps,
-        resolution=resolution, end_time=end,
+        name, differences[quantity] / limit, quantity, 0, 1, undecided=undecided,
+        integrator=integrator.name, steps=steps, resolution=resolution, end_time=end,
     )  # fmt: skip

@@ -1106,7 +1106,8 @@ def _compared_parts(
             first[index] = first_coordinate_acceleration(model, states[index]), allowed
         true, allowed = first[index]
         error = np.asarray(np.max(np.abs(true - engine_coordinates(run)[2][0]), axis=-1), float)
-        yield "step_first_acceleration", place, error, allowed, np.zeros(model.n)
+        size = np.full(model.n, float(np.max(np.abs(true))))
+        yield "step_first_acceleration", place, error, allowed, size
 
 
 def constrained_deviations(

@@ -271,6 +271,17 @@ def test_rows_count_the_runs_that_were_compared_and_name_refusals():
     assert not any(f" {all_runs} of {all_runs} runs" in row.reason for row in rows)
 
 
+def test_a_loose_bound_of_first_accelerations_proves_nothing():
+    (model, states), adapter = subject("rod"), load_adapter("exudyn")
+    integrator, own = adapter.integrator("trapezoidal"), step_comparison.first_acceleration_bound
+    for factor, verdict in ((1, Verdict.AGREES), (1e4, Verdict.UNRESOLVED)):
+        wider = partial(lambda factor, *given: factor * own(*given), factor)
+        with patch.object(step_comparison, "first_acceleration_bound", wider):
+            rows = judged(adapter, integrator, model, states)
+        (row,) = (row for row in rows if row.quantity == "step_first_acceleration")
+        assert row.verdict == verdict, row
+
+
 @pytest.mark.parametrize("draw", [(601, 0), (601, 141), (802, 82)])
 def test_first_accelerations_are_wrong_by_what_finite_differences_leave(draw):
     """The error grows with the conditioning: 1.1e-5 of the largest in random-601-141, 1e-7 in most chains.
