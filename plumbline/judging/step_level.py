@@ -301,8 +301,8 @@ def _run_row(
                 "what rounding explains in the mean"
             )
     elif np.mean(sharp) < 0.5:
-        # Single steps are larger, and decide; of long trees, which have none, a refinement study does, as this
-        # row does not count in `compares_every_step`.
+        # Single steps are larger, and decide.  Of long trees, which have none, a refinement study does: such
+        # a row does not count in `compares_every_step`.
         verdict = Verdict.INFORMATION
         reason = (
             f"not compared: at {np.mean(~sharp):.0%} of the steps there is no bound, or it is above "
