@@ -94,6 +94,7 @@ class StepEvaluation:
     attempts: list[StepAttempt]
     cpu_time: float  # CPU s
     run: StepAttempt | None = None  # many steps from the first state
+    larger: tuple[StepAttempt, ...] = ()  # of larger steps, which failed, so that ``run`` was made
 
     @property
     def runs(self) -> list[tuple[int, float, StepRun]]:

@@ -101,6 +101,15 @@ class RefinementAnalysis:
         return {"alias_of": alias, "cpu_time": sum(run.cpu_time for run in self.runs)}
 
     @property
+    def failures(self) -> str:
+        """Words on the runs that failed, of which the limit makes nothing; empty where all went through."""
+        failed = [(run.resolution, run.failure.message) for run in self.runs if run.failure]
+        if not failed:
+            return ""
+        at, message = failed[-1]
+        return f"; {len(failed)} of {len(self.runs)} runs failed, the finest of these at {at:g}: {message}"
+
+    @property
     def rounding_description(self) -> str:
         """The formula of `rounding`, for derivations."""
         if not self.finest.solver_rtol:

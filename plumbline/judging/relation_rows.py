@@ -47,14 +47,16 @@ def _relation_row(context: RowContext, result: RelationResult) -> Row:
         limit, over = "the sum of both rounding bounds", f"{result.state_count} states"
         where = f"state {result.worst_state}"
         derivation = "worst difference over the sum of the state-level rounding bounds of both sides"
-    if result.ratio <= 1:
+    if result.ratio <= 1 and result.undecided:
+        verdict, reason = Verdict.UNRESOLVED, f"inconclusive: {result.undecided}"
+    elif result.ratio <= 1:
         verdict = Verdict.AGREES
         reason = f"both results of {context.title} agree within {result.ratio:.2g} of {limit}, over {over}"
     else:
         verdict, quantity = Verdict.DISAGREES, result.quantity.replace("_", " ")
         reason = f"the {quantity} of {context.title} at {where} differs by {result.ratio:.3g} times {limit}"
     return context.make_row(
-        "relations", integrator, name, verdict, f"{name}: {reason}",
+        "relations", integrator, name, verdict, f"{name}: {reason}{result.remark}",
         value=result.ratio, tolerance=1.0, derivation=derivation, extra=extra,
     )  # fmt: skip
 
@@ -69,7 +71,7 @@ def _repeatability_row(context: RowContext, result: RelationResult, extra: dict[
         reason = f"{result.quantity}, differs by {result.ratio:.2g} of its size from the first answer"
     else:
         verdict, reason = Verdict.AGREES, f"{asked} gave the same bits each time"
-    reason = f"{REPEATABILITY} of {context.title}: {reason}"
+    reason = f"{REPEATABILITY} of {context.title}: {reason}{result.remark}"
     return context.make_row(
         "relations", result.integrator, REPEATABILITY, verdict, reason, value=result.ratio, tolerance=0.0,
         derivation="equal questions give equal bits: alone, in one call, in reverse order, after another one",

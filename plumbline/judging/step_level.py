@@ -11,13 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from plumbline.engines.engine_calls import StepEvaluation
+from plumbline.engines.engine_calls import StepAttempt, StepEvaluation
 from plumbline.engines.no_answer import NoAnswer
 from plumbline.judging.rows import JudgingResult, Row, RowContext, Verdict, with_unit
 from plumbline.measurements.single_steps import run_counts
-from plumbline.model.datatypes import EngineFailure, Integrator, Model, State, StepRun
+from plumbline.model.datatypes import Array, EngineFailure, Integrator, Model, State, StepRun
 from plumbline.model.loops import keeps_dependent_rows
 from plumbline.model.step_methods import ConstrainedMethod, JointSpaceMethod
+from plumbline.truth.ground_truth import DETECTABLE_PARAMETER_ERROR
 from plumbline.truth.step_comparison import (
     CONSTRAINED_QUANTITIES,
     RUN_QUANTITIES,
@@ -29,6 +30,7 @@ from plumbline.truth.step_comparison import (
     constrained_deviations,
     constrained_samples,
     joined,
+    resolves_steps,
     step_counts,
 )
 from plumbline.truth.step_formulas import HAS_EXTENDED_PRECISION
@@ -49,6 +51,8 @@ DECIDED, UNDECIDED = (
     {Verdict.UNRESOLVED, Verdict.FAILED, Verdict.HARNESS_FAILED},
 )
 MAX_STEP_BOUND = 1e-6  # of the accelerations' effect; a looser bound could hide a mistake
+# of the largest first acceleration, which an engine finds by finite differences
+MAX_LOOSENESS = {"step_first_acceleration": DETECTABLE_PARAMETER_ERROR}
 
 
 def judge_steps(
@@ -126,12 +130,15 @@ def _single_step_rows(
             if attempt.failure and steps.is_stable(i):
                 return none(attempt.failure)
         found, table = steps.compare([run for *_, run in runs]), STEP_QUANTITIES
+        compared = [attempt for i, attempt in enumerate(attempts) if steps.is_stable(i)]
     else:
         assert isinstance(method, ConstrainedMethod)
-        found, table = compare_parts(method, model, states, runs), CONSTRAINED_QUANTITIES
+        found, table, compared = compare_parts(method, model, states, runs), CONSTRAINED_QUANTITIES, attempts
     alias = None if model.has_drag else integrator.alias_of  # with drag the two methods differ
-    complete = sum(not (attempt.refusal or attempt.failure) for attempt in answer.attempts)
-    note = f"{complete} runs of {max(step_counts(method))} steps"
+    complete = sum(not (attempt.refusal or attempt.failure) for attempt in compared)
+    note = f"{complete} of {len(answer.attempts)} runs of {max(step_counts(method))} steps"
+    if refusals := [attempt.refusal.message for attempt in answer.attempts if attempt.refusal]:
+        note += f"; the engine refused {len(refusals)} of them: {refusals[0]}"
     return [
         _row(context, integrator, quantity, table[quantity], comparisons, note, alias, answer.cpu_time)
         for quantity, comparisons in found.items()
@@ -147,7 +154,8 @@ def _row(
     row, body = at = np.unravel_index(np.argmax(ratios), ratios.shape)
     worst = found.places[int(row)]
     place = f"body {body + 1}, {worst}"
-    ratio, is_sharp = ratios[at], looseness <= MAX_STEP_BOUND
+    most = MAX_LOOSENESS.get(quantity, MAX_STEP_BOUND)
+    ratio, is_sharp = ratios[at], looseness <= most
     name, unit = about[0].replace("_", " "), about[1]
     if ratio > 1:
         verdict = Verdict.DISAGREES
@@ -159,7 +167,7 @@ def _row(
         verdict = Verdict.UNRESOLVED
         reason = (
             f"inconclusive: at {np.mean(~is_sharp):.0%} of the comparisons the rounding bound is above "
-            f"{MAX_STEP_BOUND:g} of the accelerations' effect, too loose to detect an error"
+            f"{most:g} of the accelerations' effect, too loose to detect an error"
         )
     else:
         verdict = Verdict.AGREES
@@ -212,14 +220,30 @@ def _run_rows(
             steps = RunSteps(method, model, state, h, run)
         except EngineFailure as error:
             return one(Verdict.FAILED, str(error))
-        if failed and steps.resolves_rest(max(run_counts(model.n)) + 1 - len(run.trajectory.t)):
-            return failed
+        for tried in (*answer.larger, attempt):
+            if tried.failure and _should_go_on(method, model, state, tried, run.angle_axes):
+                return none(tried.failure, f"in a run of {tried.step:g} s per step: ")
         found = steps.compare()
     alias = None if model.has_drag else integrator.alias_of
+    remark = "".join(f"; in a run of {one.step:.4g} s per step {one.failure.message}"
+                     for one in answer.larger if one.failure)  # fmt: skip
+    if attempt.failure:
+        remark += f"; after these {attempt.failure.message}"
+    if remark and isinstance(method, JointSpaceMethod):
+        remark += ": with this step the method itself does not resolve the rest"
     return [
-        _run_row(context, integrator, quantity, deviations, h, run, alias, answer.cpu_time, attempt.failure)
+        _run_row(context, integrator, quantity, deviations, h, run, alias, answer.cpu_time, remark)
         for quantity, deviations in found.items()
     ]
+
+
+def _should_go_on(
+    method: JointSpaceMethod, model: Model, state: State, attempt: StepAttempt, angle_axes: Array | None
+) -> bool:
+    """Whether the method itself resolves the steps of a run in which the engine has failed."""
+    done = 0 if attempt.run is None else len(attempt.run.trajectory.t) - 1
+    count = next(count for count in run_counts(model.n) if count > done)  # the least that failed
+    return resolves_steps(method, model, state, attempt.step, count, attempt.run, angle_axes)
 
 
 def _left_out_words(found: StepDeviations, unit: str) -> tuple[str, int]:
@@ -241,12 +265,12 @@ def _left_out_words(found: StepDeviations, unit: str) -> tuple[str, int]:
 
 def _run_row(
     context: RowContext, integrator: Integrator, quantity: str, found: StepDeviations, h: float,
-    run: StepRun, alias: str | None, cpu_time: float, failure: NoAnswer | None,
+    run: StepRun, alias: str | None, cpu_time: float, remark: str,
 ) -> Row:  # fmt: skip
     """The row of one quantity at every step: the worst step decides, the first wrong one is named.
 
     Args:
-        failure: of the engine after the last step, where the method itself does not resolve the motion.
+        remark: on failures of the engine.
 
     """
     (name, unit), ratios = RUN_QUANTITIES[quantity], found.ratios
@@ -277,7 +301,9 @@ def _run_row(
                 "what rounding explains in the mean"
             )
     elif np.mean(sharp) < 0.5:
-        verdict = Verdict.INFORMATION  # single steps are larger, and decide
+        # Single steps are larger, and decide.  Of long trees, which have none, a refinement study does: such
+        # a row does not count in `compares_every_step`.
+        verdict = Verdict.INFORMATION
         reason = (
             f"not compared: at {np.mean(~sharp):.0%} of the steps there is no bound, or it is above "
             f"{MAX_STEP_BOUND:g} of the accelerations' effect, too loose to detect an error"
@@ -291,10 +317,7 @@ def _run_row(
         words, off = _left_out_words(found, unit)
         extra |= {"left_out_steps": number, "left_out_wrong_steps": off}
         reason += words
-    if failure:
-        reason += (
-            f"; after these {failure.message}: with this step the method itself does not resolve the rest"
-        )
+    reason += remark
     return context.make_row(
         "step", integrator.name, quantity, verdict, reason, unit,
         value=found.errors[at], tolerance=found.bounds[at], ratio=ratio,

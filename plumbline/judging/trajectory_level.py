@@ -156,7 +156,7 @@ def _order_row(study: RefinementAnalysis) -> Row:
         study.integrator.name,
         "order",
         verdict,
-        reason,
+        reason + study.failures,
         value=error,
         tolerance=ORDER_MARGIN,
         order=order.value,
@@ -215,10 +215,10 @@ def _rows_against_truth(study: RefinementAnalysis, name: str) -> list[Row]:
         resolution = "step"
         how = (
             f"{limit.eliminated_powers} powers of h from {study.integrator.error_exponents} eliminated "
-            f"over {len(samples)} steps"
+            f"over {len(samples)} steps{study.failures}"
         )
     else:
-        resolution, how = "tolerance", f"tightest of {len(samples)} tolerances"
+        resolution, how = "tolerance", f"tightest of {len(samples)} tolerances{study.failures}"
     common = {
         "compared_until": end,
         "uncertainty": limit_uncertainty[at] + truth_uncertainty[at],

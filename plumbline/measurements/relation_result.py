@@ -25,6 +25,8 @@ class RelationResult:
     worst_state: int = 0  # index of its state
     state_count: int = 0  # number of states that were compared
     no_answer: NoAnswer | None = None  # where the engine refused or failed
+    undecided: str = ""  # why no difference within the tolerance shows that the relation holds
+    remark: str = ""  # on what the engine refused or failed besides
     note: str = ""  # why it was not asked, or how two answers to one question differ but in numbers
     integrator: str = "-"  # of a relation of runs
     steps: int = 0  # of a run, there and back

@@ -10,6 +10,7 @@ perturbations of the motion grow.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -35,6 +36,7 @@ from plumbline.truth.rounding_bound import remembered_rounding_bound
 
 REVERSED_IN_TIME = "reversed in time"
 STEP_DIVISORS = 1, 4, 16  # of the step, tried one after the other where an implicit integrator fails
+MAX_TOLERANCE = 1e-4  # of a run's scales; a larger one could hide a mistake
 RUN_STEPS = 16  # of a run, one way
 STEPS_PER_RADIAN = 32  # at the fastest rate, so that implicit steps can be solved
 
@@ -96,16 +98,15 @@ def with_shorter_steps(
 ) -> Iterator[RelationResult]:
     """Check short runs of every integrator; where an implicit one fails, with the next step."""
     for integrator in (one for one in engine.integrators if one.has_motions):
-        results: list[RelationResult] = []
+        results, remark = list[RelationResult](), ""
         for step in steps:
-            results = [*check(integrator, step)]
-            if integrator.kind == "tolerance" or not any(_has_failed(result) for result in results):
+            results = [replace(result, remark=remark) for result in check(integrator, step)]
+            no_answers = [one.no_answer for one in results if one.no_answer]
+            failures = [one.message for one in no_answers if not one.is_refusal]
+            if integrator.kind == "tolerance" or not failures:
                 break
+            remark = remark or f"; with steps of {step:.4g} s {failures[0]}"
         yield from results
-
-
-def _has_failed(result: RelationResult) -> bool:
-    return result.no_answer is not None and not result.no_answer.is_refusal
 
 
 def check_integrator_relations(
@@ -306,7 +307,13 @@ def worst_difference_result(
 
     """
     quantity = max(differences, key=lambda q: differences[q])
+    undecided = ""
+    if limit > MAX_TOLERANCE:
+        undecided = (
+            f"runs may differ by {limit:.2g} of their scales, by rounding and by the tolerance of the steps, "
+            f"too much to detect an error (limit {MAX_TOLERANCE:g})"
+        )
     return RelationResult(
-        name, differences[quantity] / limit, quantity, 0, 1, integrator=integrator.name, steps=steps,
-        resolution=resolution, end_time=end,
+        name, differences[quantity] / limit, quantity, 0, 1, undecided=undecided,
+        integrator=integrator.name, steps=steps, resolution=resolution, end_time=end,
     )  # fmt: skip

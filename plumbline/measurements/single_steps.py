@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 
-from plumbline.engines.engine_calls import StepEvaluation, run_steps
+from plumbline.engines.engine_calls import StepAttempt, StepEvaluation, run_steps
 from plumbline.model.datatypes import ZERO_INERTIA, Integrator, Model, State
 from plumbline.model.loops import STABILISATION
 from plumbline.model.step_methods import ConstrainedMethod
@@ -47,14 +48,18 @@ def run_step_study(
         counts = step_counts(integrator.method)
         return run_steps(engine, integrator.name, model, states[:count], sizes[:count], counts)
     h, counts = RUN_STEP_SHARE * sizes[0][0], run_counts(model.n)
-    run = run_steps(engine, integrator.name, model, states[:1], [[h]], counts)
-    for finer in RUN_REFINEMENTS:  # a motion may become faster than it is at the start
-        if run.attempts[0].failure:
-            run = run_steps(engine, integrator.name, model, states[:1], [[h / finer]], counts)
-    if model.n > MAX_STEP_BODIES and not model.has_loops:
-        return StepEvaluation([], run.cpu_time, run.attempts[0])
-    single = run_steps(engine, integrator.name, model, states, sizes, step_counts(integrator.method))
-    return StepEvaluation(single.attempts, single.cpu_time + run.cpu_time, run.attempts[0])
+    tried = list[StepAttempt]()
+    cpu_time = 0.0
+    for finer in (1, *RUN_REFINEMENTS):  # a motion may become faster than it is at the start
+        run = run_steps(engine, integrator.name, model, states[:1], [[h / finer]], counts)
+        tried += run.attempts
+        cpu_time += run.cpu_time
+        if not tried[-1].failure:
+            break
+    single = StepEvaluation([], 0.0)
+    if model.n <= MAX_STEP_BODIES or model.has_loops:
+        single = run_steps(engine, integrator.name, model, states, sizes, step_counts(integrator.method))
+    return replace(single, cpu_time=single.cpu_time + cpu_time, run=tried[-1], larger=tuple(tried[:-1]))
 
 
 def run_counts(bodies: int) -> tuple[int, ...]:

@@ -20,6 +20,7 @@ terms.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -50,13 +51,21 @@ from plumbline.model.redescription import (
     state_of_balls,
 )
 from plumbline.model.welding import split_bodies
-from plumbline.truth.rounding_bound import RoundingBound, rounding_bounds, state_rounding_bound
+from plumbline.truth.rounding_bound import (
+    MAX_RELATIVE_BOUND,
+    RoundingBound,
+    rounding_bounds,
+    state_rounding_bound,
+)
 
 WELDED_HALVES = "two welded halves"
 ROOT_MOVED, JOINTS_AS_RODS = "root moved", "joints as rods"
 INERTIA_AS_ROTORS, SPRINGS_AS_LOADS = "inertia as rotors", "springs as loads"
 REDESCRIPTIONS = (ROOT_MOVED, JOINTS_AS_RODS, INERTIA_AS_ROTORS, SPRINGS_AS_LOADS)
 MAX_STATES, LONG_CHAIN_BODIES = 4, 12  # states per relation; half of them for chains of more bodies
+# What an engine may add to rounding by the uncertainty of its limit: as much again, or what hides no mistake.
+LIMIT_SHARE = 2.0
+MAX_LOOSENESS = 1e-3  # of both together, over the quantity's scale; bounds of light bodies may be near it
 Q = np.array([1.0, 2.0, 3.0, 4.0]) / np.sqrt(30.0)  # unit quaternion that rotates no axis into an axis
 QUANTITIES = (
     "acceleration", "angular_acceleration", "joint_reaction", "joint_moment", "kinetic_energy",
@@ -370,7 +379,7 @@ def check_state_relation(
 
     """
     worst, count, unexplained = (0.0, "", 0), 0, 0.0
-    refused: Unsupported | None = None
+    refused, loose = list[Unsupported](), Counter[str]()
     others = [relation.transform(model, state) for state in states]
     try:
         answered = _evaluate_together(evaluate_other, others)
@@ -380,11 +389,8 @@ def check_state_relation(
         return RelationResult(relation.name, None, no_answer=NoAnswer.by(error))
     for index, (state, other) in enumerate(zip(states, answered, strict=True)):
         here = answers[index]
-        if isinstance(here, Unsupported):
-            refused = here
-            continue
-        if isinstance(other, Unsupported):
-            refused = other
+        if isinstance(here, Unsupported) or isinstance(other, Unsupported):
+            refused += [one for one in (here, other) if isinstance(one, Unsupported)][:1]
             continue
         count += 1
         mine, theirs = quantity_values(here), relation.transform_back(other)
@@ -394,16 +400,27 @@ def check_state_relation(
             if relation.has_own_terms:  # its bodies may have another order
                 theirs_allowed = np.max(theirs_allowed)
             both = np.asarray(bounds[index].tolerance(q)) + theirs_allowed
+            scale = np.asarray(bounds[index].scale[q])
+            most = np.maximum(LIMIT_SHARE * both, MAX_RELATIVE_BOUND * scale)
+            most = np.minimum(most, np.where(scale > 0, MAX_LOOSENESS * scale, np.inf))
             both = both + sum((answer.limit_error or {}).get(q, 0.0) for answer in (here, other))
+            loose[q] += bool(np.any(both > most))
             allowed = np.maximum(both, np.finfo(float).tiny)
             difference = theirs[q] - mine[q]
             worst = max(worst, (_largest_ratio(difference, allowed), q, index))
             unexplained = max(unexplained, _largest_ratio(difference - missing.get(q, 0.0), allowed))
     if not count:
-        assert refused is not None
-        return RelationResult(relation.name, None, no_answer=NoAnswer.by(refused))
+        return RelationResult(relation.name, None, no_answer=NoAnswer.by(refused[-1]))
     left = unexplained if relation.missing_term else None
-    return RelationResult(relation.name, *worst, count, unexplained=left)
+    q, often = max(loose.items(), key=lambda one: one[1], default=("", 0))
+    undecided = ""
+    if 2 * often > count:
+        undecided = (
+            f"at {often} of {count} states the {q.replace('_', ' ')} may differ by too much to detect an "
+            "error, by rounding or by the uncertainty of the engine's limit"
+        )
+    remark = f"; refused at {len(refused)} of {len(states)} states: {refused[0]}" if refused else ""
+    return RelationResult(relation.name, *worst, count, unexplained=left, undecided=undecided, remark=remark)
 
 
 def _largest_ratio(difference: Array, allowed: Array) -> float:

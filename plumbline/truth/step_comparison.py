@@ -75,6 +75,7 @@ DISTURBANCE = 1e-9  # of rates, to measure the growth of perturbations
 ANGLE_ROUNDINGS = 4
 MAX_STRETCH = 2e-15  # of a joint's quaternions
 MIN_MIDDLE_COSINE = 0.1  # of the second of two or three angles: at 0 two of their axes are one
+STRAY = 1e-3  # from the declared end of a step, over the sizes there: such an end tells nothing of the step
 MAX_DISTANCE = 10.0  # of bodies from where their mechanism hangs, or from its free body, over its size
 MAX_COSINE_CHANGE = 1 / 2  # of that cosine in a step, over itself
 MAX_TURN = 1.0  # rad, step × fastest rate: beyond it explicit methods become unstable, and bounds do not hold
@@ -334,7 +335,8 @@ def acceleration_bounds(method: JointSpaceMethod, model: Model, states: State) -
     bounds = bounds_at(model, states, method=method)
     if model.has_loops:
         return bounds
-    added = _formula_errors(model, states)
+    scale = np.stack([bounds.scale[name] for name in ("acceleration", "angular_acceleration")], axis=1)
+    added = _formula_errors(model, states, scale)
     return replace(
         bounds,
         acceleration=bounds.acceleration + added[:, 0],
@@ -547,11 +549,19 @@ def _rod_spins(model: Model, charts: StepCharts, v: Array, states: State) -> Arr
     return np.abs(found)
 
 
-def _formula_errors(model: Model, states: State) -> Array:
+def _rates(model: Model, charts: StepCharts, v: Array, states: State) -> Array:
+    """(S, N) rates [rad/s] of bodies, of their rods, and of these about themselves, as `_rod_spins`."""
+    norm = np.linalg.norm
+    rates = norm(states.omega, axis=-1), norm(states.udot, axis=-1), _rod_spins(model, charts, v, states)
+    return np.asarray(np.max(rates, axis=0))
+
+
+def _formula_errors(model: Model, states: State, scale: Array) -> Array:
     """(S, 2, N) errors of r̈ and ω̇′ by the formula itself, in extended precision.
 
     Its recursion loses digits where light bodies carry heavy ones, as in doubles, where the same loss shows
-    and is larger by the ratio of the two precisions.  Of the samples of a run, the largest loss counts.
+    and is larger by the ratio of the two precisions.  Of the samples of a run, the largest loss counts, in
+    itself or over ``scale`` (S, 2, N), whichever is less: one wild sample tells little of the others.
     """
     count = len(states.p)
     some = _every_few(count)
@@ -563,8 +573,12 @@ def _formula_errors(model: Model, states: State) -> Array:
         found.append(np.stack([stacked(x, (len(some),)) for x in each], axis=1))
     size = np.linalg.norm(np.asarray(found[0] - found[1], float), axis=-1)
     share = float(np.finfo(LongDouble).eps / np.finfo(float).eps)
-    lost = LOST_DIGITS * share * size
-    return lost if len(some) == count else np.tile(np.max(lost, axis=0), (count, 1, 1))
+    lost = np.asarray(LOST_DIGITS * share * size)
+    if len(some) == count:
+        return lost
+    scale = np.maximum(scale, TINY)
+    share_of_scale = np.fmax.reduce(lost / scale[some])
+    return np.asarray(np.fmin(np.fmax.reduce(lost), share_of_scale * scale), float)
 
 
 def _every_few(count: int) -> NDArray[np.intp]:
@@ -687,22 +701,41 @@ class StepsFromSamples:
         self.bounds = acceleration_bounds(method, model, self.states)
         self.middle_cosine = charts.middle_cosine(q)
         sizes = _sizes(self.states, vars(self.bounds)) | charts.coordinate_sizes(coordinates)
-        sizes["rate"] = np.maximum(sizes["rate"], _rod_spins(model, charts, v, self.states))
+        sizes["rate"] = _rates(model, charts, v, self.states)
         # Angles whose axes meet at the cosine c have rates of W/c and accelerations of (α + W²/c²)/c; their
         # torques, too, are converted by a matrix of norm 1/c.
         converted = 1 / np.maximum(self.middle_cosine, TINY)[:, None]
         self.fastest = np.max(sizes["rate"], axis=-1)  # (S,) rad/s, W of all bodies
         of_samples = _sample_bound(method, model, sizes)
+        self.declared_ends, self.end_cosine = self.after.rounded(), charts.middle_cosine(ends)
+        self.strays = self._find_strays(count)
+        # (count,) samples besides the starts that bounds look at; where an end strays, none but the start,
+        # as the size of the mistake would widen its own bound
+        self.ends = np.where(self.strays, np.arange(count), np.arange(len(v))[-count:])
         self.uncertainty = uncertainty or dict.fromkeys(STEP_QUANTITIES, np.zeros((count, 1)))
         self.of_samples = {name: x * converted for name, x in of_samples.items()}
-        between = {name: np.maximum(x[:count], x[-count:]) for name, x in sizes.items()}
-        of_torques = np.maximum(converted[:count], converted[-count:]) ** 4
-        passed = self.states[:count], self.states[-count:]
+        between = {name: np.maximum(x[:count], x[self.ends]) for name, x in sizes.items()}
+        of_torques = np.maximum(converted[:count], converted[self.ends]) ** 4
+        passed = self.states[:count], self.states[self.ends]
         self.lost = _lost_in_closed_forms(method, model, passed, between["speed"], h)
         of_step = step_bound(method, model, between, h, 1, self.lost)
         self.of_step = {name: x * of_torques + self.uncertainty[name] for name, x in of_step.items()}
         self.is_of_one_pose = method.formula == "semi-implicit Euler" and method.implicit_forces != "all"
         self.of_totals = self._total_bounds(count, between)
+
+    def _find_strays(self, count: int) -> NDArray[np.bool_]:
+        """Find the steps (count,) whose samples at the end are nowhere near the declared end."""
+        there, apart = self.declared_ends, _norms(_differences(self.here[-count:], self.after))
+        reach = float(np.sum(stretched_length(self.model)))
+        rate = np.max(_rates(self.model, self.charts, self.declared, there), axis=-1)
+        sizes = {
+            "step_position": np.max(np.linalg.norm(there.r, axis=-1), axis=-1) + reach,
+            "step_attitude": np.ones(count),
+            "step_velocity": np.max(np.linalg.norm(there.v, axis=-1), axis=-1) + rate * reach,
+            "step_rate": rate,
+        }
+        near = [np.max(x, axis=-1) <= STRAY * np.maximum(sizes[name], TINY) for name, x in apart.items()]
+        return np.asarray(~np.all(near, axis=0))
 
     def _total_bounds(self, count: int, between: dict[str, Array]) -> dict[str, Array]:
         """Bound the errors (count,) of energy [J] and angular momentum about the origin [kg m²/s].
@@ -715,7 +748,7 @@ class StepsFromSamples:
         """
 
         def of_both_ends(x: Any) -> Array:
-            return np.asarray(np.maximum(x[:count], x[-count:]))
+            return np.asarray(np.maximum(x[:count], x[self.ends]))
 
         bounds, model, reach = self.bounds, self.model, np.linalg.norm(self.states.r, axis=-1)
         share = ACCELERATION_FACTOR * self.h / np.maximum(self.middle_cosine, TINY) ** 4
@@ -853,7 +886,7 @@ class RunSteps(StepsFromSamples):
         """
         found, bounds = dict[str, StepDeviations](), self.bounds
         scale = {name: np.asarray(bounds.scale[name]) for name in ACCELERATIONS[:2]}
-        of_ends = [{name: x[some] for name, x in scale.items()} for some in (slice(-1), slice(1, None))]
+        of_ends = [{name: x[some] for name, x in scale.items()} for some in (slice(-1), self.ends)]
         effects = _effects(of_ends, self.h)
         off = _differences(_reported(self.motion, slice(1, None)), self.after)
         for quantity, error in _norms(off).items():
@@ -866,21 +899,13 @@ class RunSteps(StepsFromSamples):
             found[f"run_{name}"] = StepDeviations(
                 error[:, None],
                 self.of_totals[name][:, None],
-                scale_of[1:, None] / (EPS * SUM_ROUNDING_FACTOR),
+                scale_of[self.ends, None] / (EPS * SUM_ROUNDING_FACTOR),
             )
         left_out = self._left_out_steps()
         found = {name: replace(x, left_out=left_out) for name, x in found.items()}
         found["run_mean"] = self._mean(off, found)
         found["run_samples"] = self._samples()
         return found
-
-    def resolves_rest(self, count: int) -> bool:
-        """Find out whether the declared formula itself resolves so many steps more, from the last sample."""
-        start = self.charts.divided(*(x[-1:] for x in self.own))
-        with np.errstate(all="ignore"):
-            passed = steps_in_charts(self.charts, *start, [self.h], count)
-            rates = np.array([np.linalg.norm(np.asarray(links.omega, float), axis=-1) for links in passed])
-            return bool(np.max(rates) * self.h <= MAX_TURN)
 
     def _left_out_steps(self) -> NDArray[np.str_]:
         """Find the steps (steps,) for which no bound is given, and why; whether they agree plays no part.
@@ -889,27 +914,37 @@ class RunSteps(StepsFromSamples):
         mechanism's size, or angles are near the pose in which two of their axes are one: at a cosine below
         `MIN_MIDDLE_COSINE`, or that a step changes by `MAX_COSINE_CHANGE` of itself.  A free body may be
         anywhere, and others count from it; but for loops, whose gaps are rounded as places are.
+        Where a step starts and where the declared one ends count; where the engine's own ends does not.
         The fastest rate is estimated at every `SAMPLE_STRIDE`-th sample and counts up to the next ones.
         """
-        some = _every_few(len(self.velocities))
+        model, h, starts, some = self.model, self.h, self.states[:-1], _every_few(len(self.velocities))
         with np.errstate(all="ignore"):
-            rates = fastest_rates(self.model, [self.states[n] for n in some])
+            rates = _spread(fastest_rates(model, [self.states[n] for n in some]), some)[1:]
+            if at := np.flatnonzero(self.strays).tolist():  # samples beyond them are of another motion
+                own = [one[n] for one in (starts, self.declared_ends) for n in at]
+                rates[at] = np.max(np.reshape(fastest_rates(model, own), (2, -1)), axis=0)
         # implicit steps divide by 1 − step × rate, and the rates may change between these samples
         most = MAX_TURN / 2 if self.method.implicit_forces == "all" else MAX_TURN
-        fast = _spread(rates, some)[1:] * self.h > most
-        fast |= np.maximum(self.fastest[:-1], self.fastest[1:]) * self.h > most
-        size = np.sum(stretched_length(self.model)) + np.max(np.linalg.norm(self.model.point, axis=2))
-        first = np.argmax(_paths(self.model), axis=1)  # of the bodies between each and the world
-        free = self.model.free[first] & (not self.model.has_loops)
-        apart = self.states.r - np.where(free[:, None], self.states.r[:, first], 0.0)
-        far = np.max(np.linalg.norm(apart, axis=-1), axis=-1) > MAX_DISTANCE * size
-        cosine = self.middle_cosine
-        change = self.h * self.fastest / np.maximum(cosine, TINY)
-        singular = (cosine < 1) & ((cosine < MIN_MIDDLE_COSINE) | (change > MAX_COSINE_CHANGE * cosine))
+        size = np.sum(stretched_length(model)) + np.max(np.linalg.norm(model.point, axis=2))
+        first = np.argmax(_paths(model), axis=1)  # of the bodies between each and the world
+        free = model.free[first] & (not model.has_loops)
+        fast = ~(rates * h <= most)
+        far, singular = np.zeros((2, len(rates)), bool)
+        end_rates = np.max(_rates(model, self.charts, self.declared, self.declared_ends), axis=-1)
+        for states, fastest, cosine in (
+            (starts, self.fastest[:-1], self.middle_cosine[:-1]),
+            (self.declared_ends, end_rates, self.end_cosine),
+        ):
+            fast |= ~(fastest * h <= most)
+            apart = states.r - np.where(free[:, None], states.r[:, first], 0.0)
+            far |= ~(np.max(np.linalg.norm(apart, axis=-1), axis=-1) <= MAX_DISTANCE * size)
+            change = h * fastest / np.maximum(cosine, TINY)
+            is_clear = (cosine >= MIN_MIDDLE_COSINE) & (change <= MAX_COSINE_CHANGE * cosine)
+            singular |= (cosine < 1) & ~is_clear
         reasons = (
             (fast, f"step × fastest rate is above {most:g}"),
-            (far[:-1] | far[1:], f"a body is beyond {MAX_DISTANCE:g} sizes of the mechanism"),
-            (singular[:-1] | singular[1:], "an angle is too near its singular pose"),
+            (far, f"a body is beyond {MAX_DISTANCE:g} sizes of the mechanism"),
+            (singular, "an angle is too near its singular pose"),
         )
         return np.select([where for where, _ in reasons], [why for _, why in reasons], "")
 
@@ -986,6 +1021,30 @@ class RunSteps(StepsFromSamples):
         return np.array(padded)
 
 
+def resolves_steps(
+    method: JointSpaceMethod, model: Model, state: State, h: float, count: int, run: StepRun | None,
+    angle_axes: Array | None,
+) -> bool:  # fmt: skip
+    """Find out whether the declared formula itself resolves a motion with this step.
+
+    Args:
+        state: that a run starts from; ``angle_axes``: its coordinates, as of `StepRun`.
+        h: step [s].
+        count: of steps, from the start.
+        run: the first of them, with coordinates; the others start from its end.
+
+    """
+    charts, done = StepCharts(model, method, [state], [angle_axes]), 0
+    start = charts.start()
+    if run is not None and run.trajectory.coordinates is not None and run.trajectory.velocities is not None:
+        done = len(run.trajectory.t) - 1
+        start = charts.divided(run.trajectory.coordinates[-1:], run.trajectory.velocities[-1:])
+    with np.errstate(all="ignore"):
+        passed = steps_in_charts(charts, *start, [h], count - done)
+        rates = np.array([np.linalg.norm(np.asarray(links.omega, float), axis=-1) for links in passed])
+        return bool(np.max(rates) * h <= MAX_TURN)
+
+
 def sample_deviations(
     motion: Trajectory, state: State, h: float, of_start: dict[str, Array], mapped: Sequence[Array] = ()
 ) -> StepDeviations:
@@ -1047,7 +1106,8 @@ def _compared_parts(
             first[index] = first_coordinate_acceleration(model, states[index]), allowed
         true, allowed = first[index]
         error = np.asarray(np.max(np.abs(true - engine_coordinates(run)[2][0]), axis=-1), float)
-        yield "step_first_acceleration", place, error, allowed, np.zeros(model.n)
+        size = np.full(model.n, float(np.max(np.abs(true))))
+        yield "step_first_acceleration", place, error, allowed, size
 
 
 def constrained_deviations(

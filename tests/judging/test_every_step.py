@@ -14,13 +14,15 @@ from plumbline.engines.registry import load_adapter
 from plumbline.judging.rows import RowContext, Verdict
 from plumbline.judging.step_level import judge_steps
 from plumbline.measurements.single_steps import run_counts, run_step_study
-from plumbline.model.datatypes import EngineFailure
+from plumbline.model.datatypes import EngineFailure, State
 from plumbline.model.kinematics import (
     angular_velocity,
+    complete_state,
     joint_vectors,
     normalised,
     rotate_vectors,
     rotation_matrix,
+    with_joint_coordinates,
 )
 from plumbline.scenario.generator import random_mechanism, random_scenario
 from plumbline.studies.random_steps import mechanism_of
@@ -147,6 +149,30 @@ def test_a_run_that_stops_where_the_method_goes_on_has_failed(monkeypatch):
     monkeypatch.setattr(type(adapter), "step", stops)
     row = rows_of(adapter, "RK4", model, states)["run"]
     assert row.verdict == Verdict.FAILED and row.reason.endswith(": it stops")
+
+
+@pytest.mark.parametrize(("engine", "name"), [("mujoco", "Euler"), ("exudyn", "generalized-alpha")])
+def test_smaller_steps_do_not_replace_a_run_that_failed_where_the_method_goes_on(engine, name, monkeypatch):
+    """Newton's iteration may diverge at larger steps, as every row then says; explicit methods may not."""
+    (model, states), adapter = subject("tumbling-ball"), load_adapter(engine)
+    own, steps = type(adapter).step, []
+
+    def fails(self, model, state, integrator, step, count):
+        steps.append(step)
+        if step == steps[0]:
+            raise EngineFailure("it stops")
+        return own(self, model, state, integrator, step, count)
+
+    monkeypatch.setattr(type(adapter), "step", fails)
+    rows = {name: row for name, row in rows_of(adapter, name, model, states).items() if "run" in name}
+    if engine == "mujoco":
+        assert rows["run"].verdict == Verdict.FAILED
+        assert rows["run"].reason.endswith(f"in a run of {steps[0]:g} s per step: it stops")
+    else:
+        assert rows.keys() == {"run_quadrature", "run_equations", "run_samples"}
+        for row in rows.values():
+            assert row.verdict == Verdict.AGREES
+            assert row.reason.endswith(f"; in a run of {steps[0]:.4g} s per step it stops")
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "pinocchio", "exudyn-tree"])
@@ -277,6 +303,43 @@ def test_steps_without_a_bound_are_counted_and_those_that_differ_are_named():
     assert row.verdict == Verdict.INFORMATION
     assert (row.extra["left_out_steps"], row.extra["left_out_wrong_steps"]) == (steps, steps - 499)
     assert f"of which {steps - 499} differ by more than one would allow" in row.reason
+
+
+def with_a_wrong_sample(right, at, wrong):
+    """The steps of an engine that is elsewhere after so many, and from there on where it should be."""
+
+    def step(self, model, state, times, integrator, h):
+        run = right(self, model, state, times, integrator, h)
+        if len(times) <= at:
+            return run
+        motion = run.trajectory
+        omega = angular_velocity(motion.p[at], motion.pdot[at])
+        own = with_joint_coordinates(model, State(motion.p[at], omega, r=motion.r[at], v=motion.v[at]))
+        there = right(self, model, complete_state(model, wrong(own)), times[:2], integrator, h).trajectory
+        changed = {name: x.copy() for name, x in vars(motion).items() if np.ndim(x) and name != "t"}
+        for name, x in changed.items():
+            x[at] = getattr(there, name)[0]
+        return replace(run, trajectory=replace(motion, **changed))
+
+    return step
+
+
+@pytest.mark.parametrize("at", [151, 160, 400])
+@pytest.mark.parametrize(("field", "joint", "change"), [("x", 0, 1e3), ("xdot", 1, 1e4), ("xdot", 1, 1e30)])
+def test_how_wrong_a_step_is_does_not_decide_whether_it_is_judged(at, field, joint, change):
+    """It ends where bodies are far away or fast, from where no step has a bound; bounds grow with rates."""
+    (model, states), adapter = subject("cart-pole"), load_adapter("pinocchio")
+
+    def wrong(state):
+        moved = getattr(state, field).copy()
+        moved[joint, 0] += change
+        return replace(state, **{field: moved})
+
+    with patch.object(type(adapter), "_step", with_a_wrong_sample(type(adapter)._step, at, wrong)):
+        rows = rows_of_runs(adapter, "rkmk4", model, states)
+    of = {"x": {"run_position"}, "xdot": {"run_velocity", "run_rate", "run_energy"}}[field]
+    assert of <= disagreeing(rows), rows
+    assert all(rows[name].extra["first_step"] == at for name in of)
 
 
 def test_an_adapter_without_coordinates_says_so():

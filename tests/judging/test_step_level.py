@@ -16,7 +16,7 @@ from plumbline.execution.plan import Plan, TaskKind, task_keys
 from plumbline.judging.rows import RowContext, Verdict
 from plumbline.judging.step_level import judge_steps
 from plumbline.measurements.single_steps import STEP_STATES, run_step_study, step_sizes
-from plumbline.model.datatypes import BALL, FREE, KINDS, ROD, SPRING_FIELDS
+from plumbline.model.datatypes import BALL, FREE, KINDS, ROD, SPRING_FIELDS, Unsupported
 from plumbline.model.kinematics import complete_state, quaternion_exponential, quaternion_product
 from plumbline.model.loops import STABILISATION
 from plumbline.model.random_mechanisms import random_loop_mechanism
@@ -249,6 +249,37 @@ def test_an_engine_that_refuses_or_fails_has_one_row():
     failed = StepEvaluation([StepAttempt(0, 0.01, failure=NoAnswer("it crashed", False, place="in f"))], 0.1)
     (row,) = rows_of(integrator, model, states, failed)
     assert (row.verdict, row.reason, row.extra["place"]) == (Verdict.FAILED, "it crashed", "in f")
+
+
+def test_rows_count_the_runs_that_were_compared_and_name_refusals():
+    (model, states), adapter = subject("balls"), load_adapter("pinocchio")
+    integrator, right = adapter.integrator("rkmk4"), type(adapter).step
+
+    def refusing(self, model, state, integrator, step, count):
+        if state is states[1] and count > 1:
+            raise Unsupported("no more steps")
+        return right(self, model, state, integrator, step, count)
+
+    all_runs = 2 * len(states)
+    with patch.object(type(adapter), "step", refusing):
+        rows = judged(adapter, integrator, model, states)
+    said = f"in {all_runs - 2} of {all_runs} runs of 10 steps; the engine refused 2 of them: no more steps"
+    assert len(rows) == 4 and all(row.reason.endswith(said) for row in rows)
+    with patch.object(step_comparison, "MAX_GROWTH", 1 + 1e-9):
+        rows = judged(adapter, integrator, model, states)
+    assert all(row.reason.endswith(f" of {all_runs} runs of 10 steps") for row in rows)
+    assert not any(f" {all_runs} of {all_runs} runs" in row.reason for row in rows)
+
+
+def test_a_loose_bound_of_first_accelerations_proves_nothing():
+    (model, states), adapter = subject("rod"), load_adapter("exudyn")
+    integrator, own = adapter.integrator("trapezoidal"), step_comparison.first_acceleration_bound
+    for factor, verdict in ((1, Verdict.AGREES), (1e4, Verdict.UNRESOLVED)):
+        wider = partial(lambda factor, *given: factor * own(*given), factor)
+        with patch.object(step_comparison, "first_acceleration_bound", wider):
+            rows = judged(adapter, integrator, model, states)
+        (row,) = (row for row in rows if row.quantity == "step_first_acceleration")
+        assert row.verdict == verdict, row
 
 
 @pytest.mark.parametrize("draw", [(601, 0), (601, 141), (802, 82)])

@@ -102,6 +102,19 @@ def analysis(study=None, method=METHOD, model=MODEL, **changes):
     )
 
 
+@pytest.mark.parametrize("kind", ["step", "tolerance"])
+def test_coarse_runs_that_failed_are_named(kind):
+    study = refinement_study([1e-13] * len(STEPS) if kind == "tolerance" else None)
+    lost = [
+        replace(run, trajectory=None, failure=NoAnswer("it broke", is_refusal=False))
+        for run in study.runs[:2]
+    ]
+    found = judged_rows(RefinementStudy([*lost, *study.runs[2:]]), replace(METHOD, kind=kind))
+    said = f"; 2 of {len(STEPS)} runs failed, the finest of these at {STEPS[1]:g}: it broke"
+    assert said in found["position_limit"].derivation and found["position_limit"].verdict == "agrees"
+    assert kind == "tolerance" or found["order"].reason.endswith(said)
+
+
 def test_a_sound_study_agrees_in_everything_and_states_what_it_measured():
     found = judged_rows()
     assert list(found) == [

@@ -1,6 +1,7 @@
 """The arithmetic behind the relations: what is compared, over what, and what the rows say."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from plumbline.measurements.run_relations import (
     relative_differences,
     run_tolerance,
     state_at_sample,
+    with_shorter_steps,
     worst_difference_result,
 )
 from plumbline.measurements.state_relations import (
@@ -92,6 +94,8 @@ def test_equal_answers_and_refused_ones():
     some = self_relation_result((0, "acceleration", 5.0), (1, "acceleration", 3.0), refuse=(0,))
     assert (some.state_count, some.worst_state) == (2, 1) and some.no_answer is None
     assert some.ratio == pytest.approx(3, rel=1e-3)  # rounded as above
+    (row,) = judge_relations(WHO, [some]).rows
+    assert row.reason.endswith("; refused at 1 of 3 states: not state 0")
     mine = self_relation_result((2, "acceleration", 5.0), (1, "acceleration", 3.0), refuse_here=(2,))
     assert (mine.state_count, mine.worst_state, mine.no_answer) == (2, 1, None)
     none = self_relation_result(refuse=(0, 1, 2))
@@ -115,6 +119,47 @@ def test_an_option_by_which_the_engine_fails_is_a_failure_of_its_own_row():
     (row,) = judge_relations(WHO, [found]).rows
     assert row.verdict == "failed" and "no such option" in row.reason
     assert row.extra["place"].startswith("AttributeError in ") and row.extra["place"].endswith(" > failing")
+
+
+@pytest.mark.parametrize(("uncertain", "verdict"), [(0, "agrees"), (1, "agrees"), (2, "unresolved")])
+def test_agreement_within_an_uncertainty_of_the_engines_own_is_undecided(uncertain, verdict):
+    """It may be as large as rounding at every state, and larger at less than half of them."""
+    answers = load_adapter("reference").evaluate(MODEL, STATES)
+    bounds = [state_rounding_bound(MODEL, state) for state in STATES]
+    reported = []
+    for k, (answer, bound) in enumerate(zip(answers, bounds, strict=True)):
+        wrong = k < uncertain
+        limit_error = {"acceleration": 1e3 if wrong else float(np.min(bound.acceleration))}
+        acceleration = answer.acceleration * (1.3 if wrong else 1.0)
+        reported.append(replace(answer, acceleration=acceleration, limit_error=limit_error))
+    relation = Relation("by it", unchanged, quantity_values)
+    found = check_state_relation(relation, answers, lambda *_: reported, MODEL, STATES, bounds, bounds)
+    (row,) = judge_relations(WHO, [found]).rows
+    assert row.verdict == verdict and found.ratio < 1
+    assert uncertain < 2 or "at 2 of 3 states the acceleration may differ by too much" in row.reason
+    off = replace(found, ratio=1.5)
+    assert judge_relations(WHO, [off]).rows[0].verdict == "disagrees"
+
+
+@pytest.mark.parametrize(("rtol", "verdict"), [(1e-9, "agrees"), (1e-3, "unresolved")])
+def test_agreement_of_runs_within_a_large_tolerance_of_the_step_is_undecided(rtol, verdict):
+    loose = replace(METHOD, solver_rtol=rtol)
+    limit = run_tolerance(loose, MODEL, STATES[0], end=0.1, steps=16, growth=1.0)
+    found = worst_difference_result("reversed in time", loose, {"position": limit / 2}, limit, 16, 0.01, 0.1)
+    assert judge_relations(WHO, [found]).rows[0].verdict == verdict
+
+
+def test_a_run_that_failed_with_a_larger_step_is_named():
+    engine = SimpleNamespace(integrators=[METHOD])
+
+    def check(integrator, step):
+        failure = NoAnswer(f"it stopped at {step:g}", is_refusal=False) if step > 0.1 else None
+        ratio = None if failure else 0.5
+        yield RelationResult("by it", ratio, no_answer=failure, integrator=integrator.name, steps=8)
+
+    rows = judge_relations(WHO, [*with_shorter_steps(engine, [0.4, 0.2, 0.1], check)]).rows
+    assert [row.verdict for row in rows] == ["agrees"]
+    assert rows[0].reason.endswith("over 8 steps; with steps of 0.4 s it stopped at 0.4")
 
 
 def test_runs_are_measured_by_length_turn_and_speed():
@@ -147,9 +192,9 @@ def test_runs_are_measured_by_length_turn_and_speed():
         },
         rel=1e-9,  # distances of 1e-3 and more between numbers of size 1 … 50
     )
-    found = worst_difference_result(
-        "reversed in time", METHOD, {"position": 1.0, "velocity": 3.0, "attitude": 2.0}, 0.5, 64, 0.25, 8.0
-    )
+    unit = 2.0**-20
+    differences = {"position": unit, "velocity": 3 * unit, "attitude": 2 * unit}
+    found = worst_difference_result("reversed in time", METHOD, differences, unit / 2, 64, 0.25, 8.0)
     assert found == RelationResult(
         "reversed in time",
         6.0,
