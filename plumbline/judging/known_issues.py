@@ -133,13 +133,20 @@ class KnownIssue:
         return f"{MECHANISMS[self.mechanism]}. {self.reason}" if self.mechanism else self.reason
 
     def has_cause(self, row: Row) -> bool:
-        """Return whether the diagnosis of a row's cell names what is recorded."""
+        """Return whether the diagnosis of a row's cell names what is recorded of it, and nothing else."""
         if row.level not in DIAGNOSED_LEVELS or not (self.cause or self.needs is not None):
             return True
+        about = [cause for cause in row.causes if row.quantity in (cause["quantities"] or (row.quantity,))]
+        if any(
+            map(_is_close, about)
+        ):  # too small a difference for a cause of its own follows from the others
+            about = [cause for cause in row.causes if not _is_close(cause)]
+        return bool(about) and all(map(self._records, about))
+
+    def _records(self, cause: Mapping[str, Any]) -> bool:
         return any(
             all(wanted in (one[name], one["general"]) for name, wanted in self.cause.items())
             and self.needs in (None, tuple(one["needs"]))
-            for cause in row.causes
             for one in (cause, *cause["equal"])
         )
 
@@ -239,6 +246,10 @@ class KnownIssue:
                 f"differ by {shown:.2g} times their tolerance"
             )
         return ""
+
+
+def _is_close(cause: Mapping[str, Any]) -> bool:
+    return (cause["kind"], cause["change"]) == ("unexplained", "close")
 
 
 def _scatter_of(row: Row) -> float | None:

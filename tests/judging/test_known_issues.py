@@ -441,6 +441,28 @@ def test_an_entry_is_matched_by_cause_size_and_version_in_any_scenario(tmp_path,
     assert (judged.known_issue == "a") is is_known, judged.reason
 
 
+NEW_CAUSE = asdict(Cause("number", "gravity", "z", amount=(-9.80999,), nominal=(-9.81,)))
+CLOSE = asdict(Cause("unexplained", "acceleration", change="close", quantities=("acceleration",)))
+
+
+@pytest.mark.parametrize(
+    ("others", "quantities", "is_known"),
+    [
+        ([NEW_CAUSE], (), False),
+        ([NEW_CAUSE | {"quantities": ("acceleration",)}], ("joint_reaction",), False),
+        ([NEW_CAUSE | {"quantities": ("joint_reaction",)}], ("acceleration",), True),
+        ([], ("joint_reaction",), False),
+        ([CLOSE], ("joint_reaction",), True),
+        ([CLOSE, NEW_CAUSE], ("joint_reaction",), False),
+    ],
+)
+def test_every_cause_of_a_row_must_be_recorded(tmp_path, others, quantities, is_known):
+    changes = {"scenario": "*", "verdict": "disagrees", "cause": CAUSE, "max_ratio": 30}
+    found = replace(with_cause(), causes=(with_cause(quantities=quantities).causes[0], *others))
+    judged = judged_by([found], loaded(tmp_path, changes)).rows[0]
+    assert (judged.known_issue == "a") is is_known, judged.reason
+
+
 def test_an_entry_of_what_no_cause_explains_is_matched_by_needs(tmp_path):
     changes = {"scenario": "*", "verdict": "disagrees", "max_ratio": 30, "needs": ["motion"]}
     entries = loaded(tmp_path, changes)
