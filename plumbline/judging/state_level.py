@@ -113,7 +113,8 @@ def judge_variants(context: RowContext, truth: StateTruth, evaluation: Evaluatio
             others = " and by ".join(by for by in ratios if by != names)
             reason = f"by {names}: {row.reason}" + (f"; by {others} too" if others else "")
             extra = row.extra | {"calls": float(len(judged))}
-            extra |= {WRONG_CALL: most_wrong_call(ratios)} if ratios else {}
+            if ratios:
+                extra |= {WRONG_CALL: most_wrong_call(ratios), FAILED_CALLS: "\n".join(sorted(ratios))}
             name = f"{quantity}_by_{kind}"
             rows.append(replace(row, level="surface", quantity=name, reason=reason, extra=extra))
         if missing:  # refusals are shown too: what was not compared is no agreement

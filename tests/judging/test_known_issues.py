@@ -521,6 +521,19 @@ def test_an_entry_covers_no_other_call_that_fails(tmp_path, calls, is_known):
     assert is_known or "does not record that" in found.reason
 
 
+@pytest.mark.parametrize(("joint", "is_known"), [("RevoluteUnaligned", True), ("Spherical", False)])
+def test_spellings_without_rotors_excuse_no_other_spelling(joint, is_known):
+    entries = known_issues.KnownIssues(known_issues.project_known_issues(), has_extra_refinements=False)
+    context = RowContext("furuta-motor", "joint", "pinocchio", "Pinocchio", "4.1.0")
+    extra = {FAILED_CALLS: f"JointModel{joint}, JointData{joint}"}
+    row = context.make_row(
+        "surface", "-", "kinetic_energy_by_spelling", "disagrees", "why", value=9e13, tolerance=1.0,
+        extra=extra,
+    )  # fmt: skip
+    (found,) = entries.mark_known([row], 2, joints=("hinge", "hinge"))
+    assert (found.known_issue is not None) is is_known, found.reason
+
+
 def test_each_row_of_an_entry_must_occur(tmp_path):
     rows = [{"level": "state", "max_ratio": 30}, {"level": "relations", "max_ratio": 30}]
     changes = {"scenario": "*", "verdict": "disagrees", "mechanism": "rounding", "rows": rows}

@@ -297,6 +297,7 @@ def test_calls_are_what_findings_are_about_whatever_quantities_they_get_wrong(tr
              for one in right]  # fmt: skip
     variants = {"option": {("a",): right, ("b", "c"): wrong}}
     rows = rows_of_variants(truth, variants)
+    assert {row.extra["failed_calls"] for row in rows if row.verdict == Verdict.DISAGREES} == {"b, c"}
     masses = dict.fromkeys((("e",), ("d",)), 2 * truth.surface["total_mass"].value)
     rows += judge_surface(WHO, truth, Evaluation([], surface={"total_mass": masses}))
     found = find_findings(rows, {"s": model.n})
