@@ -31,7 +31,7 @@ from plumbline.model.datatypes import Array
 from plumbline.model.grouping import grouped
 from plumbline.model.loops import MIN_SINGULAR_VALUE
 from plumbline.truth.ground_truth import StateTruth
-from plumbline.truth.rounding_bound import MAX_RELATIVE_BOUND, TINY
+from plumbline.truth.rounding_bound import MAX_RELATIVE_BOUND, TINY, bound_over_scale
 
 STATE_UNITS = {
     "acceleration": "m/s²",
@@ -132,17 +132,19 @@ def _judge_quantity(
     """The row of one quantity, per state the worst body, and the deviations.
 
     A disagreement in any state decides. A state does not count as compared where the bound of its worst body
-    is too loose to detect an error, or any bound is not a number; of fewer than half of the states no
-    agreement follows. The reason counts the bodies with a loose bound in any case.
+    is too loose to detect an error, or that of another one unless its error is as small as a sharp bound, or
+    any bound is not a number; of fewer than half of the states no agreement follows. The reason counts the
+    bodies with a loose bound in any case.
     """
     deviation, unit = _deviation(quantity, truth, evaluation), STATE_UNITS[quantity]
-    worst, looseness = _worst_error_per_state(quantity, truth, deviation)
+    worst, looseness, is_small = _worst_error_per_state(quantity, truth, deviation)
     error, bound, scale = worst["error"], worst["bound"], worst["scale"]
     known, has_scale = np.isfinite(bound), scale > 0
     ratios = np.where(known, error / np.maximum(bound, TINY), 0.0)
     at, ratio, count = np.argmax(ratios), np.max(ratios), len(ratios)
     own = looseness[worst["state"], worst["body"]]
-    sharp = (own <= MAX_RELATIVE_BOUND) & np.all(np.isfinite(looseness), axis=1)
+    is_decided = (looseness <= MAX_RELATIVE_BOUND) | (np.isfinite(looseness) & is_small)
+    sharp = (own <= MAX_RELATIVE_BOUND) & np.all(is_decided, axis=1)
     compared, loosest = np.sum(sharp), np.max(looseness)
     loose_count = np.sum(looseness > MAX_RELATIVE_BOUND)
     state, body = worst["state"][at], worst["body"][at] + 1
@@ -225,10 +227,13 @@ def _deviation(quantity: str, truth: StateTruth, evaluation: Evaluation) -> Devi
     return Deviation(vectors, np.broadcast_to(bound, vectors.shape[:2]) if has_entries else bound)
 
 
-def _worst_error_per_state(quantity: str, truth: StateTruth, deviation: Deviation) -> tuple[Columns, Array]:
+def _worst_error_per_state(
+    quantity: str, truth: StateTruth, deviation: Deviation
+) -> tuple[Columns, Array, Array]:
     """Per state (S,): error, bound and scale of the body with the largest ratio of error and bound.
 
-    Besides them the ratio of bound and scale (S, N) of every body; inf where a bound is not a number.
+    Besides them of every body (S, N) the ratio of bound and scale, inf where a bound is not a number, and
+    whether the error is within the loosest sharp bound.
     """
     error, bound = np.linalg.norm(deviation.vectors, axis=-1), deviation.tolerance
     if quantity == "mass_matrix":
@@ -238,7 +243,6 @@ def _worst_error_per_state(quantity: str, truth: StateTruth, deviation: Deviatio
     ratio = np.where(known, error / np.maximum(bound, TINY), -1.0)  # without a bound nothing is compared
     state, body = np.arange(len(error)), np.argmax(ratio, axis=1)
     at = state, body
-    relative = np.where(scale > 0, bound / np.where(scale > 0, scale, 1.0), np.where(bound > 0, np.inf, 0.0))
-    looseness = np.where(known, relative, np.inf)
+    is_small: Array = error <= MAX_RELATIVE_BOUND * scale
     worst = {"state": state, "body": body, "error": error[at], "bound": bound[at], "scale": scale[at]}
-    return worst, looseness
+    return worst, bound_over_scale(bound, scale), is_small

@@ -68,6 +68,16 @@ def test_each_state_counts_only_with_its_own_bound(loose, verdict, body, by):
         assert row.reason.startswith("acceleration within 0.5 of the rounding bound at 2 states; ")
 
 
+@pytest.mark.parametrize(("by", "verdict"), [(0.3, "unresolved"), (1e-6, "agrees")])
+def test_a_wrong_body_with_a_loose_bound_is_not_behind_one_with_a_sharp_bound(by, verdict):
+    """Off by a share of its bound, which is 1e-4 of its scale, while the other is nearer to its own."""
+    bounds = loosened(0, 1, 2, body=1, by=1e9)
+    off = [(state, body, share) for state in range(3) for body, share in ((0, 0.5), (1, by))]
+    row = judge_shifted_answers(*off, bounds=bounds).rows[0]
+    assert row.verdict == verdict, row.reason
+    assert row.extra["body"] == 1
+
+
 @pytest.mark.parametrize("by", [1e6, np.nan])
 def test_a_disagreement_in_any_state_decides_whatever_the_other_bounds_are(by):
     bounds = loosened(0, 1, 2, body=1, by=by)

@@ -22,8 +22,8 @@ from plumbline.judging.surface_rows import judge_surface
 from plumbline.model.kinematics import complete_state, quaternion_product, rotation_matrix
 from plumbline.model.sampling import random_states
 from plumbline.studies.exercised_names import exercised_names
-from plumbline.truth.ground_truth import state_truth
-from plumbline.truth.surface_truth import SURFACE_QUANTITIES
+from plumbline.truth.ground_truth import StateTruth, state_truth
+from plumbline.truth.surface_truth import SURFACE_QUANTITIES, SurfaceTruth
 from tests.helpers.catalogue import catalogue_scenario, states_of
 from tests.helpers.random_chains import tree_from_seed
 
@@ -272,6 +272,35 @@ def test_a_loose_bound_is_no_agreement(tree):
     mass = truth.surface["total_mass"]
     loose = replace(truth, surface={"total_mass": replace(mass, tolerance=mass.scale)})
     assert verdicts(loose, {"total_mass": {("f",): mass.value}}) == {"total_mass": Verdict.UNRESOLVED}
+
+
+def row_of_two_bodies(value, tolerance, scale):
+    """The row of a call that returns (8, 2, 3) velocities, of which all are 0."""
+    true = SurfaceTruth(np.zeros((8, 2, 3)), np.full((8, 2), tolerance), np.full((8, 2), scale))
+    truth = StateTruth([], [], [], "none", surface={"frame_velocity": true})
+    answers = {("f",): np.full((8, 2, 1), value)[..., [0, 0, 0]] / np.sqrt(3), ("g",): true.value}
+    (row,) = judge_surface(WHO, truth, Evaluation([], surface={"frame_velocity": answers}))
+    return row
+
+
+@pytest.mark.parametrize(
+    ("value", "tolerance", "scale", "verdict"),
+    [
+        ([[0], [0]], [1e-12, 1e-12], [1.0, 1.0], Verdict.AGREES),
+        ([[0], [5]], [1e-12, np.nan], [1.0, 1.0], Verdict.UNRESOLVED),
+        ([[0], [5]], [1e-12, np.nan], [1.0, 0.0], Verdict.UNRESOLVED),
+        ([[5], [0]], [1e-12, np.nan], [1.0, 1.0], Verdict.DISAGREES),
+        ([[5], [5]], [1e3, 1e3], [0.0, 0.0], Verdict.UNRESOLVED),
+        ([[0], [0]], [0.0, 0.0], [0.0, 0.0], Verdict.AGREES),
+        ([[0], [1e-6]], [1e-12, 1e-5], [1e4, 1e-5], Verdict.UNRESOLVED),
+        ([[0], [1e-14]], [1e-12, 1e-5], [1e4, 1e-5], Verdict.AGREES),
+        ([[0], [1e-14]], [1e-12, 1e-12], [1.0, 0.0], Verdict.AGREES),
+    ],
+)
+def test_no_body_agrees_without_a_sharp_tolerance_of_its_own(value, tolerance, scale, verdict):
+    row = row_of_two_bodies(value, tolerance, scale)
+    assert row.verdict == verdict, row.reason
+    assert row.ratio >= 0 and "nan" not in row.reason
 
 
 def test_a_wrong_call_is_named(tree):
