@@ -42,7 +42,7 @@ from plumbline.diagnosis.cause import CauseKind
 from plumbline.engines.declared_names import declared_integrators, declared_texts
 from plumbline.engines.registry import ENGINES, IMPORTERS, USER_ENGINES
 from plumbline.importers.neutral_model import MODEL_UNITS
-from plumbline.judging.rows import CHECKED, FAILED_CALLS, Level, Row, Verdict
+from plumbline.judging.rows import CHECKED, FAILED_CALLS, OWN_UNCERTAINTY, Level, Row, Verdict
 from plumbline.judging.state_level import SINGULAR_POSE, STATE_UNITS, VARIANT_QUANTITIES
 from plumbline.measurements.relation_result import OTHER_FORMULATIONS, REPEATABILITY, UNEXPLAINED
 from plumbline.measurements.run_relations import REVERSED_IN_TIME
@@ -219,6 +219,8 @@ class KnownIssue:
         """
         if not self.has_cause(row):
             return f"the entry {self.name} records another cause"
+        if self.engine == "*" and OWN_UNCERTAINTY in row.extra:
+            return f"the entry {self.name} records no uncertainty that an engine states itself"
         failed = str(row.extra.get(FAILED_CALLS, "")).split("\n") if self.failed_calls else []
         for call in failed:
             if not any(fnmatchcase(call, pattern) for pattern in self.failed_calls):

@@ -16,6 +16,7 @@ from plumbline.engines.variants import VariantKind
 from plumbline.judging.identity import state_fingerprints
 from plumbline.judging.rows import (
     FAILED_CALLS,
+    OWN_UNCERTAINTY,
     WRONG_CALL,
     Columns,
     Deviation,
@@ -168,6 +169,11 @@ def _judge_quantity(
         reason += f"; {loose}" if loose_count else ""
     else:
         verdict, reason = Verdict.UNRESOLVED, f"inconclusive: {loose}"
+    extra: dict[str, float] = {"limit_error": float(limit_error)} if limit_error else {}
+    if extra and verdict == Verdict.UNRESOLVED:
+        exact = [replace(answer, limit_error=None) for answer in evaluation.quantities]
+        other, *_ = _judge_quantity(context, quantity, truth, replace(evaluation, quantities=exact))
+        extra |= {} if other.verdict == Verdict.UNRESOLVED else {OWN_UNCERTAINTY: 1.0}
     row = context.make_row(
         "state",
         "-",
@@ -190,7 +196,7 @@ def _judge_quantity(
             "state": state,
             "body": body,
         }
-        | ({"limit_error": limit_error} if limit_error else {}),
+        | extra,
     )
     return row, worst, deviation
 
