@@ -24,6 +24,7 @@ from plumbline.judging.rows import (
     Row,
     RowContext,
     Verdict,
+    cell_rank,
     most_wrong_call,
     with_unit,
 )
@@ -105,10 +106,15 @@ def judge_variants(context: RowContext, truth: StateTruth, evaluation: Evaluatio
             true = replace(truth, quantities=truth.quantities[first], bounds=truth.bounds[first])
             other = replace(evaluation, quantities=answer)
             for quantity in STATE_UNITS:
-                if all(getattr(one, quantity) is not None for one in (answer[0], true.quantities[0])):
+                if getattr(true.quantities[0], quantity) is None:
+                    continue
+                if all(getattr(one, quantity) is not None for one in answer):
                     found.append((_judge_quantity(context, quantity, true, other)[0], names))
+                elif any(getattr(one, quantity) is not None for one in evaluation.quantities):
+                    lacks = f"it returns no {quantity.replace('_', ' ')}"
+                    missing.append((NoAnswer(lacks, is_refusal=True), names))
         for quantity, judged in grouped(found, lambda one: one[0].quantity).items():
-            judged.sort(key=lambda one: (one[0].verdict == Verdict.DISAGREES, one[0].ratio or 0.0))
+            judged.sort(key=lambda one: cell_rank(one[0].verdict, None, one[0].ratio))
             row, names = judged[-1]
             ratios = {by: one.ratio or 0.0 for one, by in judged if one.verdict == Verdict.DISAGREES}
             others = " and by ".join(by for by in ratios if by != names)
@@ -119,10 +125,12 @@ def judge_variants(context: RowContext, truth: StateTruth, evaluation: Evaluatio
             name = f"{quantity}_by_{kind}"
             rows.append(replace(row, level="surface", quantity=name, reason=reason, extra=extra))
         if missing:  # refusals are shown too: what was not compared is no agreement
-            failed = sorted(names for answer, names in missing if not answer.is_refusal)
-            verdict = Verdict.FAILED if failed else Verdict.INFORMATION
+            failed = [names for answer, names in missing if not answer.is_refusal]
+            refused = [names for answer, names in missing if not (answer.gap or answer.missing)]
+            verdict = Verdict.FAILED if failed else Verdict.UNSUPPORTED if refused else Verdict.INFORMATION
             reason = "; ".join(f"by {names}: {answer.message}" for answer, names in missing)
-            extra = {WRONG_CALL: failed[0], FAILED_CALLS: "\n".join(failed)} if failed else {}
+            calls = sorted({*(failed or refused)})
+            extra = {WRONG_CALL: calls[0], FAILED_CALLS: "\n".join(calls)} if calls else {}
             rows.append(context.make_row("surface", "-", f"all_by_{kind}", verdict, reason, extra=extra))
     return rows
 

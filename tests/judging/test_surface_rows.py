@@ -244,7 +244,7 @@ def test_a_variant_that_fails_or_is_wrong_is_named(tree):
     assert set(bad) == {"all_by_option", "acceleration_by_option", "all_by_spelling"} and len(rows) > 3
     failed, refused = bad["all_by_option"], bad["all_by_spelling"]
     assert (failed.verdict, failed.reason) == (Verdict.FAILED, "by d: it crashed")
-    assert (refused.verdict, refused.reason) == (Verdict.INFORMATION, "by e: not so")
+    assert (refused.verdict, refused.reason) == (Verdict.UNSUPPORTED, "by e: not so")
     reason = bad["acceleration_by_option"].reason
     assert reason.startswith("by b, c: the acceleration of The engine is off by") and "too" not in reason
 
@@ -351,6 +351,23 @@ def test_names_that_a_version_lacks_are_listed_and_the_rest_is_compared(tree, mo
         "this version of Pinocchio has no JointModelSphericalZYX"
     )
     assert {row.quantity for row in rows} > {"inverse_dynamics", "momentum", "frame_axes"}
+
+
+def test_a_variant_that_is_undecided_or_refuses_or_lacks_a_quantity_is_not_behind_others(tree):
+    _, _, truth = tree
+    right = truth.quantities[:2]
+    unsure = [replace(one, acceleration=2 * one.acceleration, limit_error={"acceleration": 1e9})
+              for one in right]  # fmt: skip
+    less = [right[0], replace(right[1], joint_reaction=None)]
+    variants = {"option": {("a",): right, ("b",): unsure, ("c", "d"): less, ("e",): NoAnswer("why", True)}}
+    rows = judge_variants(WHO, truth, Evaluation(list(truth.quantities), variants=variants))
+    found = {row.quantity: row for row in rows}
+    assert found["acceleration_by_option"].verdict == Verdict.UNRESOLVED
+    assert found["acceleration_by_option"].reason.startswith("by b: inconclusive: ")
+    assert found["joint_reaction_by_option"].verdict == Verdict.AGREES
+    missing = found["all_by_option"]
+    assert missing.verdict == Verdict.UNSUPPORTED and missing.extra["failed_calls"] == "c, d\ne"
+    assert missing.reason == "by c, d: it returns no joint reaction; by e: why"
 
 
 def test_a_name_that_this_project_lacks_is_a_failure(tree, monkeypatch):
