@@ -246,6 +246,8 @@ class Adapter(ABC):
         """
         with self._checked_call(model):
             answers = self._surface(model, states)
+        if len(answers) not in (0, len(states)):
+            raise EngineFailure(f"{self.name}._surface answered {len(answers)} of {len(states)} states")
         for answer in answers:
             for quantity, by_call in answer.items():
                 for call, value in by_call.items():

@@ -41,8 +41,11 @@ def judge_surface(context: RowContext, truth: StateTruth, evaluation: Evaluation
     rows = [
         _row(context, name, truth.surface[name], evaluation)
         for name in SURFACE_QUANTITIES
-        if name in truth.surface and name in evaluation.surface
+        if name in truth.surface and evaluation.surface.get(name)
     ]
+    if unknown := sorted({*evaluation.surface} - {*SURFACE_QUANTITIES, FAILED_PARTS, MISSING_NAMES}):
+        reason = f"the surface of {context.title} has unknown quantities: {', '.join(unknown)}"
+        rows.append(context.make_row("surface", "-", "all", Verdict.FAILED, reason))
     if parts := sorted(evaluation.surface.get(FAILED_PARTS, ())):
         reason, place = ("; ".join(some) for some in zip(*parts, strict=True))
         rows.append(context.make_row("surface", "-", "all", Verdict.FAILED, reason, place=place))

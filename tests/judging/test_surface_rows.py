@@ -19,6 +19,7 @@ from plumbline.judging.findings import find_findings
 from plumbline.judging.rows import RowContext, Verdict, most_wrong_call
 from plumbline.judging.state_level import judge_variants
 from plumbline.judging.surface_rows import judge_surface
+from plumbline.model.datatypes import Unsupported
 from plumbline.model.kinematics import complete_state, quaternion_product, rotation_matrix
 from plumbline.model.sampling import random_states
 from plumbline.studies.exercised_names import exercised_names
@@ -267,6 +268,57 @@ def test_an_answer_of_another_shape_disagrees_and_a_failure_is_a_row(tree):
     assert (row.verdict, row.quantity, row.reason) == (Verdict.FAILED, "all", "it crashed")
 
 
+def surface_rows_of_pinocchio(tree, monkeypatch, change):
+    """Rows where what the adapter returns at each state is changed."""
+    model, states, truth = tree
+
+    class Changed(type(load_adapter("pinocchio"))):
+        def _surface(self, model, states):
+            return change(super()._surface(model, states))
+
+    monkeypatch.setattr("plumbline.engines.engine_calls.load_adapter", lambda _: Changed())
+    return judge_surface(WHO, truth, evaluate_states("pinocchio", model, states, ["surface"]))
+
+
+def refused(_):
+    raise Unsupported("it has not converged")
+
+
+def without_first_velocity(answers):
+    del answers[0]["frame_velocity"]
+    return answers
+
+
+@pytest.mark.parametrize(
+    ("change", "verdict", "reason"),
+    [
+        (refused, Verdict.UNSUPPORTED, "it has not converged"),
+        (without_first_velocity, Verdict.FAILED, "is missing at state 0, but not at state 1"),
+        (lambda answers: answers[:1], Verdict.FAILED, "pinocchio._surface answered 1 of 3 states"),
+        (lambda answers: [one | {"frame_velocitty": {("f",): np.ones((1, 3))}} for one in answers],
+         Verdict.FAILED, "the surface of The engine has unknown quantities: frame_velocitty"),
+    ],
+)  # fmt: skip
+def test_nothing_that_an_engine_does_not_answer_as_asked_is_left_out(
+    tree, monkeypatch, change, verdict, reason
+):
+    rows = surface_rows_of_pinocchio(tree, monkeypatch, change)
+    (told,) = (row for row in rows if row.quantity == "all")
+    assert told.verdict == verdict and reason in told.reason
+
+
+def test_calls_are_compared_up_to_the_first_state_at_which_a_part_failed():
+    velocities = {"frame_velocity": {("f",): np.ones((1, 3))}}
+    failed = {FAILED_PARTS: {("f", ""): np.ones((1, 1))}}
+    found = stack_answers([velocities, velocities, failed, velocities])
+    assert len(found["frame_velocity"][("f",)]) == 2 and list(found[FAILED_PARTS]) == [("f", "")]
+    assert stack_answers([failed, velocities])["frame_velocity"] == {}
+
+
+def test_states_count_that_are_answered():
+    assert row_of_two_bodies([[0], [0]], [1e-12] * 2, [1.0] * 2, answered=3).extra["states"] == 3
+
+
 def test_a_loose_bound_is_no_agreement(tree):
     _, _, truth = tree
     mass = truth.surface["total_mass"]
@@ -274,12 +326,13 @@ def test_a_loose_bound_is_no_agreement(tree):
     assert verdicts(loose, {"total_mass": {("f",): mass.value}}) == {"total_mass": Verdict.UNRESOLVED}
 
 
-def row_of_two_bodies(value, tolerance, scale):
-    """The row of a call that returns (8, 2, 3) velocities, of which all are 0."""
+def row_of_two_bodies(value, tolerance, scale, answered=8):
+    """The row of two calls that return (8, 2, 3) velocities at the first states, of which all are 0."""
     true = SurfaceTruth(np.zeros((8, 2, 3)), np.full((8, 2), tolerance), np.full((8, 2), scale))
     truth = StateTruth([], [], [], "none", surface={"frame_velocity": true})
     answers = {("f",): np.full((8, 2, 1), value)[..., [0, 0, 0]] / np.sqrt(3), ("g",): true.value}
-    (row,) = judge_surface(WHO, truth, Evaluation([], surface={"frame_velocity": answers}))
+    first = {call: values[:answered] for call, values in answers.items()}
+    (row,) = judge_surface(WHO, truth, Evaluation([], surface={"frame_velocity": first}))
     return row
 
 
