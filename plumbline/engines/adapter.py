@@ -246,6 +246,8 @@ class Adapter(ABC):
         """
         with self._checked_call(model):
             answers = self._surface(model, states)
+        if len(answers) not in (0, len(states)):
+            raise EngineFailure(f"{self.name}._surface answered {len(answers)} of {len(states)} states")
         for answer in answers:
             for quantity, by_call in answer.items():
                 for call, value in by_call.items():
@@ -338,6 +340,12 @@ class Adapter(ABC):
             what = "joints with rotors, springs, dampers and efforts"
             raise Unsupported(f"the adapter of {self.title} covers no {what}", "elements")
 
+    def _gaps_of_calls(self, model: Model, moves: bool) -> dict[str, bool]:
+        """Whether the mechanism has each declared gap for which a call may be refused: no quantity is one."""
+        declared = {*self.unsupported, *self.gaps}
+        found = {gap: is_met(model) for gap, is_met in MODEL_GAPS.items() if gap in declared}
+        return found | ({"integrators": True} if moves and "integrators" in declared else {})
+
     @contextmanager
     def _checked_call(self, model: Model, *states: State, moves: bool = False) -> Iterator[None]:
         """Check what the engine is to receive, and hold the adapter's own refusals to what it declares.
@@ -349,11 +357,13 @@ class Adapter(ABC):
         try:
             yield
         except Unsupported as refusal:
-            if refusal.gap not in {*self.unsupported, *self.gaps}:
+            gaps = self._gaps_of_calls(model, moves)
+            if refusal.gap not in gaps:
                 raise Unsupported(str(refusal)) from None
-            if refusal.gap in MODEL_GAPS and not MODEL_GAPS[refusal.gap](model):
+            if not gaps[refusal.gap]:
                 raise EngineFailure(
-                    f"{self.name} refuses a mechanism for its {refusal.gap}, and it has none: {refusal}"
+                    f"{self.name} refuses a mechanism for its {refusal.gap}, and it has none that the gap is "
+                    f"about: {refusal}"
                 ) from None
             raise
         except (AttributeError, ModuleNotFoundError) as error:

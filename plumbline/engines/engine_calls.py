@@ -25,6 +25,7 @@ from plumbline.engines.variants import VariantKind
 from plumbline.model.datatypes import (
     Array,
     Call,
+    EngineFailure,
     Float,
     Integrator,
     Model,
@@ -172,10 +173,10 @@ def evaluate_states(
         stacked = attempt(lambda: stack_answers(adapter.surface(model, states[:SURFACE_STATES])))
         if not isinstance(stacked, NoAnswer):
             surface = stacked
-        elif not stacked.is_refusal:
-            failure = stacked
-        elif stacked.missing:  # else the adapter offers nothing of the mechanism
+        elif stacked.missing:
             surface = {MISSING_NAMES: {(stacked.missing,): np.zeros((1, 1, 1))}}
+        else:
+            failure = stacked
     if found and "variants" in besides:
         variants = evaluate_variants(adapter, model, states[:SURFACE_STATES])
     return Evaluation(found, time.process_time() - begin, None, declared, surface, failure, variants)
@@ -201,20 +202,29 @@ def evaluate_variants(adapter: Adapter, model: Model, states: Sequence[State]) -
 
 
 def stack_answers(answers: Sequence[SurfaceAnswer]) -> dict[str, dict[Call, Array]]:
-    """Put the answers at all states into one array per call.
+    """Put the answers at all states into one array per call, up to the first state at which a part failed.
 
     Args:
         answers: of the surface, one per state; later states may lack calls of the first.
 
+    Raises:
+        EngineFailure: a call is missing at a state where no part failed, and not at a later one.
+
     """
-    failed = {words: np.zeros((1, 1, 1)) for one in answers for words in one.get(FAILED_PARTS, {})}
-    return ({FAILED_PARTS: failed} if failed else {}) | {
-        quantity: {
-            call: np.array([one[quantity][call] for one in answers if call in one.get(quantity, {})])
-            for call in calls
-        }
-        for quantity, calls in (answers[0] if answers else {}).items()
-        if quantity != FAILED_PARTS
+    found = dict[str, dict[Call, list[Array]]]()
+    for place, one in enumerate(answers):
+        for quantity, by_call in one.items():
+            for call, value in by_call.items():
+                stacked = found.setdefault(quantity, {}).setdefault(call, [])
+                without = answers[len(stacked) : place]
+                if not without or quantity in (FAILED_PARTS, MISSING_NAMES):
+                    stacked.append(value)
+                elif not any(FAILED_PARTS in other for other in without):
+                    at = f"{len(stacked)}, but not at state {place}"
+                    raise EngineFailure(f"the {quantity} by {', '.join(call)} is missing at state {at}")
+    return {
+        quantity: {call: np.array(values) for call, values in calls.items() if values}
+        for quantity, calls in found.items()
     }
 
 

@@ -210,6 +210,8 @@ class ServedEngine(Adapter):
         }
         lifted = arrays.pop("joint_acceleration")
         if lifted is not None:
+            if twice := given & {"acceleration", "angular_acceleration"}:
+                raise EngineFailure(f"{label} returns the {min(twice)} besides the joint_acceleration")
             moved = lift_acceleration(
                 model, state, lifted, self.hello.ball_rates, f"{label}: joint_acceleration"
             )
@@ -230,6 +232,10 @@ class ServedEngine(Adapter):
                 f"{label}: r, p and omega have the shapes {r.shape}, {p.shape}, {omega.shape}"
             )
         return Trajectory(t, r, p, v, quaternion_rate(p, omega), run.steps)
+
+    def _gaps_of_calls(self, model: Model, moves: bool) -> dict[str, bool]:
+        lacks_joints = not {*model.kind} <= {*self.hello.joints}
+        return super()._gaps_of_calls(model, moves) | {"joints": lacks_joints}
 
     def _ask(self, model: Model, question: Message) -> Message:
         """Ask about a mechanism, which the program gets first where it has another."""

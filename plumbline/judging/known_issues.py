@@ -42,7 +42,7 @@ from plumbline.diagnosis.cause import CauseKind
 from plumbline.engines.declared_names import declared_integrators, declared_texts
 from plumbline.engines.registry import ENGINES, IMPORTERS, USER_ENGINES
 from plumbline.importers.neutral_model import MODEL_UNITS
-from plumbline.judging.rows import CHECKED, FAILED_CALLS, Level, Row, Verdict
+from plumbline.judging.rows import CHECKED, FAILED_CALLS, OWN_UNCERTAINTY, Level, Row, Verdict
 from plumbline.judging.state_level import SINGULAR_POSE, STATE_UNITS, VARIANT_QUANTITIES
 from plumbline.measurements.relation_result import OTHER_FORMULATIONS, REPEATABILITY, UNEXPLAINED
 from plumbline.measurements.run_relations import REVERSED_IN_TIME
@@ -133,13 +133,20 @@ class KnownIssue:
         return f"{MECHANISMS[self.mechanism]}. {self.reason}" if self.mechanism else self.reason
 
     def has_cause(self, row: Row) -> bool:
-        """Return whether the diagnosis of a row's cell names what is recorded."""
+        """Return whether the diagnosis of a row's cell names what is recorded of it, and nothing else."""
         if row.level not in DIAGNOSED_LEVELS or not (self.cause or self.needs is not None):
             return True
+        about = [cause for cause in row.causes if row.quantity in (cause["quantities"] or (row.quantity,))]
+        if any(
+            map(_is_close, about)
+        ):  # too small a difference for a cause of its own follows from the others
+            about = [cause for cause in row.causes if not _is_close(cause)]
+        return bool(about) and all(map(self._records, about))
+
+    def _records(self, cause: Mapping[str, Any]) -> bool:
         return any(
             all(wanted in (one[name], one["general"]) for name, wanted in self.cause.items())
             and self.needs in (None, tuple(one["needs"]))
-            for cause in row.causes
             for one in (cause, *cause["equal"])
         )
 
@@ -212,6 +219,8 @@ class KnownIssue:
         """
         if not self.has_cause(row):
             return f"the entry {self.name} records another cause"
+        if self.engine == "*" and OWN_UNCERTAINTY in row.extra:
+            return f"the entry {self.name} records no uncertainty that an engine states itself"
         failed = str(row.extra.get(FAILED_CALLS, "")).split("\n") if self.failed_calls else []
         for call in failed:
             if not any(fnmatchcase(call, pattern) for pattern in self.failed_calls):
@@ -239,6 +248,10 @@ class KnownIssue:
                 f"differ by {shown:.2g} times their tolerance"
             )
         return ""
+
+
+def _is_close(cause: Mapping[str, Any]) -> bool:
+    return (cause["kind"], cause["change"]) == ("unexplained", "close")
 
 
 def _scatter_of(row: Row) -> float | None:

@@ -99,6 +99,7 @@ VERDICT_STYLES = {
 SAME_SIZE = 0.1  # of the worst call's error: within a decade
 WRONG_CALL = "wrong_call"  # in ``extra`` of a row: of the engine's calls, that of `most_wrong_call`
 FAILED_CALLS = "failed_calls"  # the same: all that failed or are off, one per line
+OWN_UNCERTAINTY = "own_uncertainty"  # the same, of one that is unresolved by what the engine states itself
 PLACE = "place"  # the same, of one that failed or was refused: class and place of what was raised
 CHECKED = "checked"  # the same: what was checked of it where its diagnosis is a record's; may be empty
 RUN_FAMILY = "run"  # of a row that is about the whole run, in place of a scenario's family

@@ -16,6 +16,7 @@ from plumbline.engines.variants import VariantKind
 from plumbline.judging.identity import state_fingerprints
 from plumbline.judging.rows import (
     FAILED_CALLS,
+    OWN_UNCERTAINTY,
     WRONG_CALL,
     Columns,
     Deviation,
@@ -23,6 +24,7 @@ from plumbline.judging.rows import (
     Row,
     RowContext,
     Verdict,
+    cell_rank,
     most_wrong_call,
     with_unit,
 )
@@ -31,7 +33,7 @@ from plumbline.model.datatypes import Array
 from plumbline.model.grouping import grouped
 from plumbline.model.loops import MIN_SINGULAR_VALUE
 from plumbline.truth.ground_truth import StateTruth
-from plumbline.truth.rounding_bound import MAX_RELATIVE_BOUND, TINY
+from plumbline.truth.rounding_bound import MAX_RELATIVE_BOUND, TINY, bound_over_scale
 
 STATE_UNITS = {
     "acceleration": "m/s²",
@@ -104,23 +106,31 @@ def judge_variants(context: RowContext, truth: StateTruth, evaluation: Evaluatio
             true = replace(truth, quantities=truth.quantities[first], bounds=truth.bounds[first])
             other = replace(evaluation, quantities=answer)
             for quantity in STATE_UNITS:
-                if all(getattr(one, quantity) is not None for one in (answer[0], true.quantities[0])):
+                if getattr(true.quantities[0], quantity) is None:
+                    continue
+                if all(getattr(one, quantity) is not None for one in answer):
                     found.append((_judge_quantity(context, quantity, true, other)[0], names))
+                elif any(getattr(one, quantity) is not None for one in evaluation.quantities):
+                    lacks = f"it returns no {quantity.replace('_', ' ')}"
+                    missing.append((NoAnswer(lacks, is_refusal=True), names))
         for quantity, judged in grouped(found, lambda one: one[0].quantity).items():
-            judged.sort(key=lambda one: (one[0].verdict == Verdict.DISAGREES, one[0].ratio or 0.0))
+            judged.sort(key=lambda one: cell_rank(one[0].verdict, None, one[0].ratio))
             row, names = judged[-1]
             ratios = {by: one.ratio or 0.0 for one, by in judged if one.verdict == Verdict.DISAGREES}
             others = " and by ".join(by for by in ratios if by != names)
             reason = f"by {names}: {row.reason}" + (f"; by {others} too" if others else "")
             extra = row.extra | {"calls": float(len(judged))}
-            extra |= {WRONG_CALL: most_wrong_call(ratios)} if ratios else {}
+            if ratios:
+                extra |= {WRONG_CALL: most_wrong_call(ratios), FAILED_CALLS: "\n".join(sorted(ratios))}
             name = f"{quantity}_by_{kind}"
             rows.append(replace(row, level="surface", quantity=name, reason=reason, extra=extra))
         if missing:  # refusals are shown too: what was not compared is no agreement
-            failed = sorted(names for answer, names in missing if not answer.is_refusal)
-            verdict = Verdict.FAILED if failed else Verdict.INFORMATION
+            failed = [names for answer, names in missing if not answer.is_refusal]
+            refused = [names for answer, names in missing if not (answer.gap or answer.missing)]
+            verdict = Verdict.FAILED if failed else Verdict.UNSUPPORTED if refused else Verdict.INFORMATION
             reason = "; ".join(f"by {names}: {answer.message}" for answer, names in missing)
-            extra = {WRONG_CALL: failed[0], FAILED_CALLS: "\n".join(failed)} if failed else {}
+            calls = sorted({*(failed or refused)})
+            extra = {WRONG_CALL: calls[0], FAILED_CALLS: "\n".join(calls)} if calls else {}
             rows.append(context.make_row("surface", "-", f"all_by_{kind}", verdict, reason, extra=extra))
     return rows
 
@@ -131,17 +141,19 @@ def _judge_quantity(
     """The row of one quantity, per state the worst body, and the deviations.
 
     A disagreement in any state decides. A state does not count as compared where the bound of its worst body
-    is too loose to detect an error, or any bound is not a number; of fewer than half of the states no
-    agreement follows. The reason counts the bodies with a loose bound in any case.
+    is too loose to detect an error, or that of another one unless its error is as small as a sharp bound, or
+    any bound is not a number; of fewer than half of the states no agreement follows. The reason counts the
+    bodies with a loose bound in any case.
     """
     deviation, unit = _deviation(quantity, truth, evaluation), STATE_UNITS[quantity]
-    worst, looseness = _worst_error_per_state(quantity, truth, deviation)
+    worst, looseness, is_small = _worst_error_per_state(quantity, truth, deviation)
     error, bound, scale = worst["error"], worst["bound"], worst["scale"]
     known, has_scale = np.isfinite(bound), scale > 0
     ratios = np.where(known, error / np.maximum(bound, TINY), 0.0)
     at, ratio, count = np.argmax(ratios), np.max(ratios), len(ratios)
     own = looseness[worst["state"], worst["body"]]
-    sharp = (own <= MAX_RELATIVE_BOUND) & np.all(np.isfinite(looseness), axis=1)
+    is_decided = (looseness <= MAX_RELATIVE_BOUND) | (np.isfinite(looseness) & is_small)
+    sharp = (own <= MAX_RELATIVE_BOUND) & np.all(is_decided, axis=1)
     compared, loosest = np.sum(sharp), np.max(looseness)
     loose_count = np.sum(looseness > MAX_RELATIVE_BOUND)
     state, body = worst["state"][at], worst["body"][at] + 1
@@ -165,6 +177,11 @@ def _judge_quantity(
         reason += f"; {loose}" if loose_count else ""
     else:
         verdict, reason = Verdict.UNRESOLVED, f"inconclusive: {loose}"
+    extra: dict[str, float] = {"limit_error": float(limit_error)} if limit_error else {}
+    if extra and verdict == Verdict.UNRESOLVED:
+        exact = [replace(answer, limit_error=None) for answer in evaluation.quantities]
+        other, *_ = _judge_quantity(context, quantity, truth, replace(evaluation, quantities=exact))
+        extra |= {} if other.verdict == Verdict.UNRESOLVED else {OWN_UNCERTAINTY: 1.0}
     row = context.make_row(
         "state",
         "-",
@@ -187,7 +204,7 @@ def _judge_quantity(
             "state": state,
             "body": body,
         }
-        | ({"limit_error": limit_error} if limit_error else {}),
+        | extra,
     )
     return row, worst, deviation
 
@@ -224,10 +241,13 @@ def _deviation(quantity: str, truth: StateTruth, evaluation: Evaluation) -> Devi
     return Deviation(vectors, np.broadcast_to(bound, vectors.shape[:2]) if has_entries else bound)
 
 
-def _worst_error_per_state(quantity: str, truth: StateTruth, deviation: Deviation) -> tuple[Columns, Array]:
+def _worst_error_per_state(
+    quantity: str, truth: StateTruth, deviation: Deviation
+) -> tuple[Columns, Array, Array]:
     """Per state (S,): error, bound and scale of the body with the largest ratio of error and bound.
 
-    Besides them the ratio of bound and scale (S, N) of every body; inf where a bound is not a number.
+    Besides them of every body (S, N) the ratio of bound and scale, inf where a bound is not a number, and
+    whether the error is within the loosest sharp bound.
     """
     error, bound = np.linalg.norm(deviation.vectors, axis=-1), deviation.tolerance
     if quantity == "mass_matrix":
@@ -237,7 +257,6 @@ def _worst_error_per_state(quantity: str, truth: StateTruth, deviation: Deviatio
     ratio = np.where(known, error / np.maximum(bound, TINY), -1.0)  # without a bound nothing is compared
     state, body = np.arange(len(error)), np.argmax(ratio, axis=1)
     at = state, body
-    relative = np.where(scale > 0, bound / np.where(scale > 0, scale, 1.0), np.where(bound > 0, np.inf, 0.0))
-    looseness = np.where(known, relative, np.inf)
+    is_small: Array = error <= MAX_RELATIVE_BOUND * scale
     worst = {"state": state, "body": body, "error": error[at], "bound": bound[at], "scale": scale[at]}
-    return worst, looseness
+    return worst, bound_over_scale(bound, scale), is_small

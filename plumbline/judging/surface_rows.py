@@ -6,6 +6,7 @@ One row per quantity, whichever calls of the engine give it; the worst of them i
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from plumbline.engines.engine_calls import Evaluation
 from plumbline.engines.missing_names import FAILED_PARTS, MISSING_NAMES
@@ -20,7 +21,7 @@ from plumbline.judging.rows import (
 )
 from plumbline.model.datatypes import Array
 from plumbline.truth.ground_truth import StateTruth
-from plumbline.truth.rounding_bound import MAX_RELATIVE_BOUND, TINY
+from plumbline.truth.rounding_bound import MAX_RELATIVE_BOUND, TINY, bound_over_scale
 from plumbline.truth.surface_truth import SURFACE_QUANTITIES, SurfaceTruth
 
 
@@ -40,8 +41,11 @@ def judge_surface(context: RowContext, truth: StateTruth, evaluation: Evaluation
     rows = [
         _row(context, name, truth.surface[name], evaluation)
         for name in SURFACE_QUANTITIES
-        if name in truth.surface and name in evaluation.surface
+        if name in truth.surface and evaluation.surface.get(name)
     ]
+    if unknown := sorted({*evaluation.surface} - {*SURFACE_QUANTITIES, FAILED_PARTS, MISSING_NAMES}):
+        reason = f"the surface of {context.title} has unknown quantities: {', '.join(unknown)}"
+        rows.append(context.make_row("surface", "-", "all", Verdict.FAILED, reason))
     if parts := sorted(evaluation.surface.get(FAILED_PARTS, ())):
         reason, place = ("; ".join(some) for some in zip(*parts, strict=True))
         rows.append(context.make_row("surface", "-", "all", Verdict.FAILED, reason, place=place))
@@ -54,14 +58,18 @@ def judge_surface(context: RowContext, truth: StateTruth, evaluation: Evaluation
 
 def _row(context: RowContext, quantity: str, true: SurfaceTruth, evaluation: Evaluation) -> Row:
     unit, name = SURFACE_QUANTITIES[quantity][0], quantity.replace("_", " ")
-    found = [(*_worst(value, true), ", ".join(call)) for call, value in evaluation.surface[quantity].items()]
-    ratio, error, tolerance, state, call = max(found)
-    wrong = {one[-1]: one[0] for one in found if one[0] > 1}
+    compared = {
+        ", ".join(call): _compare(value, true) for call, value in evaluation.surface[quantity].items()
+    }
+    ratio, error, tolerance, state, call = max((*one[:-1], call) for call, one in compared.items())
+    wrong = {call: one[0] for call, one in compared.items() if one[0] > 1}
     others = sorted(wrong.keys() - {call})
-    # single entries may have no scale
-    scale, loose = np.max(true.scale, axis=1), np.max(true.tolerance, axis=1)
-    looseness = np.where(scale > 0, loose / np.where(scale > 0, scale, 1.0), 0.0)
-    sharp, count, loosest = np.sum(looseness <= MAX_RELATIVE_BOUND), len(scale), np.max(looseness)
+    looseness = bound_over_scale(np.max(true.tolerance, axis=1), np.max(true.scale, axis=1))
+    count, loosest = max(len(one[-1]) for one in compared.values()), np.max(looseness)
+    is_sharp = looseness[:count] <= MAX_RELATIVE_BOUND
+    for *_, is_decided in compared.values():
+        is_sharp[: len(is_decided)][~is_decided] = False
+    sharp = np.sum(is_sharp)
     if ratio > 1:
         verdict = Verdict.DISAGREES
         reason = (
@@ -71,7 +79,9 @@ def _row(context: RowContext, quantity: str, true: SurfaceTruth, evaluation: Eva
         reason += f"; by {', '.join(others)} too" if others else ""
     elif 2 * sharp >= count:
         verdict = Verdict.AGREES
-        reason = f"{name} within {ratio:.2g} of the rounding bound at {sharp} states, by {len(found)} calls"
+        reason = (
+            f"{name} within {ratio:.2g} of the rounding bound at {sharp} states, by {len(compared)} calls"
+        )
     else:
         verdict = Verdict.UNRESOLVED
         reason = (
@@ -83,18 +93,24 @@ def _row(context: RowContext, quantity: str, true: SurfaceTruth, evaluation: Eva
         derivation="a formula on the certified motion; errors of its inputs are propagated to first order, "
         f"its terms are rounded once each; at most {loosest:.1g} of the scale at {count} states",
         cpu_time=evaluation.cpu_time,
-        extra={"states": count, "state": state, "calls": len(found)}
+        extra={"states": count, "state": state, "calls": len(compared)}
         | ({WRONG_CALL: most_wrong_call(wrong), FAILED_CALLS: "\n".join(sorted(wrong))} if wrong else {}),
     )  # fmt: skip
 
 
-def _worst(value: Array, true: SurfaceTruth) -> tuple[float, float, float, int]:
-    """The largest ratio of error and tolerance, with both and the state; infinite of what is no answer."""
+def _compare(value: Array, true: SurfaceTruth) -> tuple[float, float, float, int, NDArray[np.bool_]]:
+    """The largest ratio of error and tolerance, with both and the state; infinite of what is no answer.
+
+    Besides them whether a mistake would be seen at each state of the answer: in each entry with a scale the
+    tolerance is sharp, or the error as small as a sharp one.  Without a tolerance nothing is compared.
+    """
     first = slice(len(value))  # some calls are made at the first states only
     if not len(value) or value.shape != true.value[first].shape:
-        return np.inf, np.inf, 0.0, 0
+        return np.inf, np.inf, 0.0, 0, np.zeros(0, bool)
     error, tolerance = np.linalg.norm(value - true.value[first], axis=-1), true.tolerance[first]
-    error = np.where(np.isfinite(error), error, np.inf)
-    ratio = error / np.maximum(tolerance, TINY)
+    error, scale = np.where(np.isfinite(error), error, np.inf), true.scale[first]
+    ratio = np.where(np.isfinite(tolerance), error / np.maximum(tolerance, TINY), 0.0)
     at = np.unravel_index(int(np.argmax(ratio)), ratio.shape)
-    return float(ratio[at]), float(error[at]), float(tolerance[at]), int(at[0])
+    is_small = np.minimum(tolerance, error) <= MAX_RELATIVE_BOUND * scale
+    is_decided = np.all(is_small | (scale == 0), axis=1)
+    return float(ratio[at]), float(error[at]), float(tolerance[at]), int(at[0]), is_decided

@@ -72,6 +72,13 @@ INVERSE_SHARE = 1 / ROUNDING_FACTOR  # `Responses.errors_of_inverse` counts ever
 MAX_ENTRIES = 3_000_000  # of the responses of a batch of states: more do not fit the processor's cache
 
 
+def bound_over_scale(bound: Array, scale: Array) -> Array:
+    """Divide bounds by their scales: infinite where a bound is no number or has no scale, unless it is 0."""
+    has_scale, is_zero = scale > 0, bound == 0
+    found: Array = np.where(has_scale, bound, np.inf) / np.where(has_scale, scale, 1.0)
+    return np.where(is_zero, 0.0, np.where(np.isfinite(found), found, np.inf))
+
+
 @dataclass(frozen=True, eq=False)
 class RoundingBound:
     """Tolerances at one state; differences of 3-vectors are compared by their Euclidean norm.

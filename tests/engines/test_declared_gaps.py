@@ -55,6 +55,13 @@ def test_a_refusal_that_is_not_declared_counts(gap, monkeypatch):
     assert (row.verdict, row.known_issue) == ("unsupported", None)
 
 
+@pytest.mark.parametrize("gap", ["mass_matrix", "integrators"])
+def test_a_gap_of_a_quantity_or_of_motions_is_no_reason_to_refuse_states(gap, monkeypatch):
+    adapter = make_adapter(unsupported={gap: "there is none"}, _evaluate=refusing(gap))
+    (row,) = rows_of(adapter, monkeypatch)
+    assert (row.verdict, row.known_issue, row.is_declared) == ("unsupported", None, False)
+
+
 def test_a_refusal_for_what_the_mechanism_does_not_have_is_a_failure(monkeypatch):
     adapter = make_adapter(unsupported={"rods": "no rods here"}, _evaluate=refusing("rods"))
     (row,) = rows_of(adapter, monkeypatch)

@@ -24,6 +24,7 @@ HELLOS = {
     "an integrator twice": {"integrators": HELLO["integrators"] * 2},
     "endless name": {"title": "x" * 300},
     "unknown field": {"colour": "red"},
+    "accelerations twice": {"quantities": [*HELLO["quantities"], "joint_acceleration"]},
 }
 ANSWERS = {
     "not a number": {"kinetic_energy": float("nan")},
@@ -34,6 +35,7 @@ ANSWERS = {
     "a missing quantity": {"acceleration": None},
     "an undeclared quantity": {"potential_energy": 0.0},
     "an unknown quantity": {"colour": 1.0},
+    "accelerations twice": {"joint_acceleration": [0.0] * 6},
 }
 model = {}
 
@@ -57,6 +59,10 @@ def evaluate(question):
             return {"error": "the factorisation failed"}
         case "an undeclared refusal":
             return {"unsupported": "not today", "gap": "loads"}
+        case "a refusal for a quantity":
+            return {"unsupported": "not today", "gap": "mass_matrix"}
+        case "a refusal for a joint that it builds":
+            return {"unsupported": "not today", "gap": "joints"}
     return {"answers": found}
 
 

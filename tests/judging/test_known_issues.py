@@ -441,6 +441,28 @@ def test_an_entry_is_matched_by_cause_size_and_version_in_any_scenario(tmp_path,
     assert (judged.known_issue == "a") is is_known, judged.reason
 
 
+NEW_CAUSE = asdict(Cause("number", "gravity", "z", amount=(-9.80999,), nominal=(-9.81,)))
+CLOSE = asdict(Cause("unexplained", "acceleration", change="close", quantities=("acceleration",)))
+
+
+@pytest.mark.parametrize(
+    ("others", "quantities", "is_known"),
+    [
+        ([NEW_CAUSE], (), False),
+        ([NEW_CAUSE | {"quantities": ("acceleration",)}], ("joint_reaction",), False),
+        ([NEW_CAUSE | {"quantities": ("joint_reaction",)}], ("acceleration",), True),
+        ([], ("joint_reaction",), False),
+        ([CLOSE], ("joint_reaction",), True),
+        ([CLOSE, NEW_CAUSE], ("joint_reaction",), False),
+    ],
+)
+def test_every_cause_of_a_row_must_be_recorded(tmp_path, others, quantities, is_known):
+    changes = {"scenario": "*", "verdict": "disagrees", "cause": CAUSE, "max_ratio": 30}
+    found = replace(with_cause(), causes=(with_cause(quantities=quantities).causes[0], *others))
+    judged = judged_by([found], loaded(tmp_path, changes)).rows[0]
+    assert (judged.known_issue == "a") is is_known, judged.reason
+
+
 def test_an_entry_of_what_no_cause_explains_is_matched_by_needs(tmp_path):
     changes = {"scenario": "*", "verdict": "disagrees", "max_ratio": 30, "needs": ["motion"]}
     entries = loaded(tmp_path, changes)
@@ -497,6 +519,19 @@ def test_an_entry_covers_no_other_call_that_fails(tmp_path, calls, is_known):
     (found,) = excuses.mark_known([row], 3)
     assert (found.known_issue == "a") is is_known, found.reason
     assert is_known or "does not record that" in found.reason
+
+
+@pytest.mark.parametrize(("joint", "is_known"), [("RevoluteUnaligned", True), ("Spherical", False)])
+def test_spellings_without_rotors_excuse_no_other_spelling(joint, is_known):
+    entries = known_issues.KnownIssues(known_issues.project_known_issues(), has_extra_refinements=False)
+    context = RowContext("furuta-motor", "joint", "pinocchio", "Pinocchio", "4.1.0")
+    extra = {FAILED_CALLS: f"JointModel{joint}, JointData{joint}"}
+    row = context.make_row(
+        "surface", "-", "kinetic_energy_by_spelling", "disagrees", "why", value=9e13, tolerance=1.0,
+        extra=extra,
+    )  # fmt: skip
+    (found,) = entries.mark_known([row], 2, joints=("hinge", "hinge"))
+    assert (found.known_issue is not None) is is_known, found.reason
 
 
 def test_each_row_of_an_entry_must_occur(tmp_path):

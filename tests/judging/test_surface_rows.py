@@ -19,11 +19,12 @@ from plumbline.judging.findings import find_findings
 from plumbline.judging.rows import RowContext, Verdict, most_wrong_call
 from plumbline.judging.state_level import judge_variants
 from plumbline.judging.surface_rows import judge_surface
+from plumbline.model.datatypes import Unsupported
 from plumbline.model.kinematics import complete_state, quaternion_product, rotation_matrix
 from plumbline.model.sampling import random_states
 from plumbline.studies.exercised_names import exercised_names
-from plumbline.truth.ground_truth import state_truth
-from plumbline.truth.surface_truth import SURFACE_QUANTITIES
+from plumbline.truth.ground_truth import StateTruth, state_truth
+from plumbline.truth.surface_truth import SURFACE_QUANTITIES, SurfaceTruth
 from tests.helpers.catalogue import catalogue_scenario, states_of
 from tests.helpers.random_chains import tree_from_seed
 
@@ -244,7 +245,7 @@ def test_a_variant_that_fails_or_is_wrong_is_named(tree):
     assert set(bad) == {"all_by_option", "acceleration_by_option", "all_by_spelling"} and len(rows) > 3
     failed, refused = bad["all_by_option"], bad["all_by_spelling"]
     assert (failed.verdict, failed.reason) == (Verdict.FAILED, "by d: it crashed")
-    assert (refused.verdict, refused.reason) == (Verdict.INFORMATION, "by e: not so")
+    assert (refused.verdict, refused.reason) == (Verdict.UNSUPPORTED, "by e: not so")
     reason = bad["acceleration_by_option"].reason
     assert reason.startswith("by b, c: the acceleration of The engine is off by") and "too" not in reason
 
@@ -267,11 +268,92 @@ def test_an_answer_of_another_shape_disagrees_and_a_failure_is_a_row(tree):
     assert (row.verdict, row.quantity, row.reason) == (Verdict.FAILED, "all", "it crashed")
 
 
+def surface_rows_of_pinocchio(tree, monkeypatch, change):
+    """Rows where what the adapter returns at each state is changed."""
+    model, states, truth = tree
+
+    class Changed(type(load_adapter("pinocchio"))):
+        def _surface(self, model, states):
+            return change(super()._surface(model, states))
+
+    monkeypatch.setattr("plumbline.engines.engine_calls.load_adapter", lambda _: Changed())
+    return judge_surface(WHO, truth, evaluate_states("pinocchio", model, states, ["surface"]))
+
+
+def refused(_):
+    raise Unsupported("it has not converged")
+
+
+def without_first_velocity(answers):
+    del answers[0]["frame_velocity"]
+    return answers
+
+
+@pytest.mark.parametrize(
+    ("change", "verdict", "reason"),
+    [
+        (refused, Verdict.UNSUPPORTED, "it has not converged"),
+        (without_first_velocity, Verdict.FAILED, "is missing at state 0, but not at state 1"),
+        (lambda answers: answers[:1], Verdict.FAILED, "pinocchio._surface answered 1 of 3 states"),
+        (lambda answers: [one | {"frame_velocitty": {("f",): np.ones((1, 3))}} for one in answers],
+         Verdict.FAILED, "the surface of The engine has unknown quantities: frame_velocitty"),
+    ],
+)  # fmt: skip
+def test_nothing_that_an_engine_does_not_answer_as_asked_is_left_out(
+    tree, monkeypatch, change, verdict, reason
+):
+    rows = surface_rows_of_pinocchio(tree, monkeypatch, change)
+    (told,) = (row for row in rows if row.quantity == "all")
+    assert told.verdict == verdict and reason in told.reason
+
+
+def test_calls_are_compared_up_to_the_first_state_at_which_a_part_failed():
+    velocities = {"frame_velocity": {("f",): np.ones((1, 3))}}
+    failed = {FAILED_PARTS: {("f", ""): np.ones((1, 1))}}
+    found = stack_answers([velocities, velocities, failed, velocities])
+    assert len(found["frame_velocity"][("f",)]) == 2 and list(found[FAILED_PARTS]) == [("f", "")]
+    assert stack_answers([failed, velocities])["frame_velocity"] == {}
+
+
+def test_states_count_that_are_answered():
+    assert row_of_two_bodies([[0], [0]], [1e-12] * 2, [1.0] * 2, answered=3).extra["states"] == 3
+
+
 def test_a_loose_bound_is_no_agreement(tree):
     _, _, truth = tree
     mass = truth.surface["total_mass"]
     loose = replace(truth, surface={"total_mass": replace(mass, tolerance=mass.scale)})
     assert verdicts(loose, {"total_mass": {("f",): mass.value}}) == {"total_mass": Verdict.UNRESOLVED}
+
+
+def row_of_two_bodies(value, tolerance, scale, answered=8):
+    """The row of two calls that return (8, 2, 3) velocities at the first states, of which all are 0."""
+    true = SurfaceTruth(np.zeros((8, 2, 3)), np.full((8, 2), tolerance), np.full((8, 2), scale))
+    truth = StateTruth([], [], [], "none", surface={"frame_velocity": true})
+    answers = {("f",): np.full((8, 2, 1), value)[..., [0, 0, 0]] / np.sqrt(3), ("g",): true.value}
+    first = {call: values[:answered] for call, values in answers.items()}
+    (row,) = judge_surface(WHO, truth, Evaluation([], surface={"frame_velocity": first}))
+    return row
+
+
+@pytest.mark.parametrize(
+    ("value", "tolerance", "scale", "verdict"),
+    [
+        ([[0], [0]], [1e-12, 1e-12], [1.0, 1.0], Verdict.AGREES),
+        ([[0], [5]], [1e-12, np.nan], [1.0, 1.0], Verdict.UNRESOLVED),
+        ([[0], [5]], [1e-12, np.nan], [1.0, 0.0], Verdict.UNRESOLVED),
+        ([[5], [0]], [1e-12, np.nan], [1.0, 1.0], Verdict.DISAGREES),
+        ([[5], [5]], [1e3, 1e3], [0.0, 0.0], Verdict.UNRESOLVED),
+        ([[0], [0]], [0.0, 0.0], [0.0, 0.0], Verdict.AGREES),
+        ([[0], [1e-6]], [1e-12, 1e-5], [1e4, 1e-5], Verdict.UNRESOLVED),
+        ([[0], [1e-14]], [1e-12, 1e-5], [1e4, 1e-5], Verdict.AGREES),
+        ([[0], [1e-14]], [1e-12, 1e-12], [1.0, 0.0], Verdict.AGREES),
+    ],
+)
+def test_no_body_agrees_without_a_sharp_tolerance_of_its_own(value, tolerance, scale, verdict):
+    row = row_of_two_bodies(value, tolerance, scale)
+    assert row.verdict == verdict, row.reason
+    assert row.ratio >= 0 and "nan" not in row.reason
 
 
 def test_a_wrong_call_is_named(tree):
@@ -297,6 +379,7 @@ def test_calls_are_what_findings_are_about_whatever_quantities_they_get_wrong(tr
              for one in right]  # fmt: skip
     variants = {"option": {("a",): right, ("b", "c"): wrong}}
     rows = rows_of_variants(truth, variants)
+    assert {row.extra["failed_calls"] for row in rows if row.verdict == Verdict.DISAGREES} == {"b, c"}
     masses = dict.fromkeys((("e",), ("d",)), 2 * truth.surface["total_mass"].value)
     rows += judge_surface(WHO, truth, Evaluation([], surface={"total_mass": masses}))
     found = find_findings(rows, {"s": model.n})
@@ -321,6 +404,23 @@ def test_names_that_a_version_lacks_are_listed_and_the_rest_is_compared(tree, mo
         "this version of Pinocchio has no JointModelSphericalZYX"
     )
     assert {row.quantity for row in rows} > {"inverse_dynamics", "momentum", "frame_axes"}
+
+
+def test_a_variant_that_is_undecided_or_refuses_or_lacks_a_quantity_is_not_behind_others(tree):
+    _, _, truth = tree
+    right = truth.quantities[:2]
+    unsure = [replace(one, acceleration=2 * one.acceleration, limit_error={"acceleration": 1e9})
+              for one in right]  # fmt: skip
+    less = [right[0], replace(right[1], joint_reaction=None)]
+    variants = {"option": {("a",): right, ("b",): unsure, ("c", "d"): less, ("e",): NoAnswer("why", True)}}
+    rows = judge_variants(WHO, truth, Evaluation(list(truth.quantities), variants=variants))
+    found = {row.quantity: row for row in rows}
+    assert found["acceleration_by_option"].verdict == Verdict.UNRESOLVED
+    assert found["acceleration_by_option"].reason.startswith("by b: inconclusive: ")
+    assert found["joint_reaction_by_option"].verdict == Verdict.AGREES
+    missing = found["all_by_option"]
+    assert missing.verdict == Verdict.UNSUPPORTED and missing.extra["failed_calls"] == "c, d\ne"
+    assert missing.reason == "by c, d: it returns no joint reaction; by e: why"
 
 
 def test_a_name_that_this_project_lacks_is_a_failure(tree, monkeypatch):
