@@ -120,13 +120,17 @@ def pose_function(name: str, given: Sequence[Any], forms: Sequence[str]) -> list
         return [quaternion_product(q, np.array([np.cos(half), 0.0, 0.0, np.sin(half)]))]
     if name == "mjd_subQuat":
         q, other, between, spin = given
-        of_first = np.zeros((3, 3))
-        mujoco.mjd_subQuat(q, other, of_first, None)
-        return [rate_maps(Pose(np.zeros(3), between))["phidot"] @ of_first @ spin]
+        of_first, of_second = np.zeros((2, 3, 3))
+        mujoco.mjd_subQuat(q, other, of_first, of_second)
+        pose = Pose(np.zeros(3), between)
+        return [
+            rate_maps(pose)["phidot"] @ matrix @ moved
+            for matrix, moved in ((of_first, spin), (-of_second, pose.R @ spin))
+        ]
     if name == "mjd_quatIntegrate":
-        by_turn, by_velocity, by_scale = np.empty(9), np.empty(9), np.empty(3)
-        mujoco.mjd_quatIntegrate(*given, by_turn, by_velocity, by_scale)
-        return [by_turn.reshape(3, 3).T]
+        by_turn, by_velocity, by_scale = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+        mujoco.mjd_quatIntegrate(*given, by_turn.ravel(), by_velocity.ravel(), by_scale)
+        return [by_velocity] if forms[0].startswith("@") else [by_turn.T, by_scale]
     arguments = [np.ravel(x) if isinstance(x, np.ndarray) else x for x in given]
     results = [np.empty(SIZES[form.rpartition(".")[2]]) for form in forms]
     if name == "mju_quatIntegrate":  # in place
@@ -348,7 +352,7 @@ def _add_jacobians(s: Probed) -> None:
         axis = d.site_xmat[site].reshape(3, 3)[:, 0].copy()
         for call, arguments, quantities in (
             ("mj_jac", (p, r, point, b), AT_FRAME),
-            ("mj_jacPointAxis", (p, r, point, axis, b), AT_FRAME[:1]),
+            ("mj_jacPointAxis", (p, r, point, axis, b), AT_FRAME),
             ("mj_jacBody", (p, r, b), AT_BODY),
             ("mj_jacBodyCom", (p, r, b), AT_BODY),
             ("mj_jacSite", (p, r, site), AT_FRAME),
@@ -359,6 +363,10 @@ def _add_jacobians(s: Probed) -> None:
         ):
             getattr(mujoco, call)(m, d, *arguments)
             values = [p @ d.qvel, r @ d.qvel]
+            if call == "mj_jac":
+                along = axis * (axis @ values[1])
+            if call == "mj_jacPointAxis":  # ω × axis
+                values[1] = along + np.cross(axis, values[1])
             if call == "mj_jacDot":
                 values = [dp @ d.qvel + p @ d.qacc, dr @ d.qvel + r @ d.qacc]
             for quantity, value in zip(quantities, values, strict=False):
