@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pkgutil import resolve_name
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
+import mujoco
 import numpy as np
 import pinocchio
 
@@ -58,6 +60,90 @@ def with_outputs(factor: float, *numbers: int) -> Wrong:
     return wrong
 
 
+def with_argument(number: int, value: Any) -> Wrong:
+    """What ignores one of its arguments."""
+    return lambda right: lambda *given: right(*given[:number], value, *given[number + 1 :])
+
+
+def after(change: Callable[..., Any]) -> Wrong:
+    """What comes after a change of its arguments."""
+
+    def wrong(right: Function) -> Function:
+        def changed(*given: Any) -> Any:
+            change(*given)
+            return right(*given)
+
+        return changed
+
+    return wrong
+
+
+def with_members(**values: int) -> Wrong:
+    """An enumeration of which some members have other values."""
+    return lambda right: SimpleNamespace(**{name: int(x) for name, x in right.__members__.items()} | values)
+
+
+def _integrate_filters(m: Any, *_: Any) -> None:
+    m.actuator_dyntype[m.actuator_dyntype == mujoco.mjtDyn.mjDYN_FILTER] = mujoco.mjtDyn.mjDYN_INTEGRATOR
+
+
+def _forget_filters_decay(m: Any, *_: Any) -> None:
+    kinds = mujoco.mjtDyn
+    m.actuator_dyntype[m.actuator_dyntype == kinds.mjDYN_FILTEREXACT] = kinds.mjDYN_INTEGRATOR
+
+
+def _switch_all_on(_: Any, d: Any) -> None:
+    d.eq_active[:] = 1
+
+
+def _let_all_sleep(m: Any, *_: Any) -> None:
+    m.tree_sleep_policy[:] = mujoco.mjtSleepPolicy.mjSLEEP_ALLOWED
+
+
+def _forget_discrete_steps(m: Any, _: Any) -> None:
+    m.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_INVDISCRETE)
+
+
+def _copied_with(change: Callable[[Any], Any]) -> Wrong:
+    """What returns a description that is changed."""
+
+    def wrong(right: Function) -> Function:
+        def copied(*given: Any) -> Any:
+            found = right(*given)
+            change(found)
+            return found
+
+        return copied
+
+    return wrong
+
+
+def _forget_gravity(spec: Any) -> None:
+    spec.option.gravity = [0.0, 0.0, 0.0]
+
+
+def _double_masses(spec: Any) -> None:
+    for body in list(spec.bodies)[1:]:
+        body.mass = 2 * body.mass
+
+
+def _forget_stiffness(spec: Any) -> None:
+    for joint in spec.joints:
+        joint.stiffness = 0 * np.array(joint.stiffness)
+
+
+def _forget_own_defaults(right: Function) -> Function:
+    """Attach, and let the rotor of the other's default be that of every joint."""
+
+    def attach(whole: Any, part: Any, **given: Any) -> Any:
+        found = right(whole, part, **given)
+        for joint in whole.joints:
+            joint.armature = whole.default.joint.armature
+        return found
+
+    return attach
+
+
 class TwiceWrongCircle:
     """A group whose difference and step are wrong, and right together."""
 
@@ -101,6 +187,9 @@ SURFACE_PLANTS: Mapping[str, list[dict[str, Wrong]]] = {
         {"skew": with_entries(7.0, *DIAGONAL)},
     ],
     "mujoco": [
+        {"mju_quat2Vel": with_argument(2, 1.0)},
+        {"mju_quatIntegrate": with_argument(2, 1.0)},
+        {"mj_inverse": after(_forget_discrete_steps)},
         {"mj_jacPointAxis": with_outputs(-2, 3)},
         {"mjd_quatIntegrate": with_outputs(-3, -2)},
         {"mjd_quatIntegrate": with_outputs(-3, -1)},
@@ -129,3 +218,32 @@ SURFACE_PLANTS: Mapping[str, list[dict[str, Wrong]]] = {
         ),
     ],
 }
+# Of MuJoCo a name of the variant, and what is planted: in trees with elements, or in a loop.
+VARIANT_PLANTS: list[tuple[str, dict[str, Wrong]]] = [
+    (
+        "mj_integratePos",
+        {"mj_differentiatePos": with_argument(2, 1.0), "mj_integratePos": with_argument(3, 1.0)},
+    ),
+    ("mj_normalizeQuat", {"mj_normalizeQuat": constant(None)}),
+    ("mj_defaultOption", {"mj_defaultOption": constant(None)}),
+    ("MjsFrame", {"MjsBody.set_frame": constant(None)}),
+    ("MjsFrame", {"MjsFrame.set_frame": constant(None)}),
+    ("set_mjcb_act_dyn", {"set_mjcb_act_dyn": constant(None)}),
+    ("mjtDyn.mjDYN_FILTER", {"mj_forward": after(_integrate_filters)}),
+    ("mjtDyn.mjDYN_FILTEREXACT", {"mj_forward": after(_forget_filters_decay)}),
+    ("MjsDefault", {"MjSpec.attach": _forget_own_defaults}),
+    ("MjSpec", {"MjSpec.copy": _copied_with(_forget_gravity)}),
+    ("MjSpec", {"MjSpec.copy": _copied_with(_double_masses)}),
+    ("MjSpec", {"MjSpec.copy": _copied_with(_forget_stiffness)}),
+    ("mjtSleepPolicy", {"mj_step": after(_let_all_sleep)}),
+    ("mj_comVel", {"mj_comVel": constant(None)}),
+    ("mj_comVel", {"mj_passive": constant(None)}),
+    ("mj_comVel", {"mj_rne": constant(None)}),
+    ("mjtDisableBit.mjDSBL_SPRING", {"mjtDisableBit": with_members(mjDSBL_SPRING=0)}),
+    ("mjtDisableBit.mjDSBL_DAMPER", {"mjtDisableBit": with_members(mjDSBL_DAMPER=0)}),
+    ("mjtDisableBit.mjDSBL_LIMIT", {"mjtDisableBit": with_members(mjDSBL_LIMIT=0, mjDSBL_CONSTRAINT=0)}),
+]
+LOOP_PLANTS: list[tuple[str, dict[str, Wrong]]] = [
+    ("MjData.eq_active", {"mj_forward": after(_switch_all_on)}),
+    ("mj_referenceConstraint", {"mj_referenceConstraint": constant(None)}),
+]

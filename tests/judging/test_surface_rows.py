@@ -2,6 +2,7 @@
 
 import os
 import signal
+from copy import copy
 from dataclasses import replace
 from functools import partial
 
@@ -25,7 +26,7 @@ from plumbline.studies.exercised_names import exercised_names
 from plumbline.truth.ground_truth import state_truth
 from plumbline.truth.surface_truth import SURFACE_QUANTITIES
 from tests.helpers.catalogue import catalogue_scenario, states_of
-from tests.helpers.planted_functions import SURFACE_PLANTS, wrong_functions
+from tests.helpers.planted_functions import LOOP_PLANTS, SURFACE_PLANTS, VARIANT_PLANTS, wrong_functions
 from tests.helpers.random_chains import tree_from_seed
 
 WHO = RowContext("s", "f", "e", "The engine", "0")
@@ -122,6 +123,40 @@ def red_surface_rows(tree, few_bodies):
 def test_a_wrong_function_of_an_engine_is_seen(engine, plants, red_surface_rows):
     with wrong_functions(engine, plants):
         assert red_surface_rows(engine) - WRONG.get(engine, set())
+
+
+@pytest.fixture(scope="module")
+def moving_parts():
+    """Trees without loads and with elements, and a loop."""
+    bare = tree_from_seed(2, 3, ("hinge", "ball", "free"), loads=False)
+    sprung = tree_from_seed(2, 4, ("hinge", "slide", "ball"), elements=("stiffness", "damping", "effort"))
+    loop = catalogue_scenario("slider-crank")
+    states = [random_states(bare, 2, 2), random_states(sprung, 2, 2), states_of(loop, 2)[:1]]
+    models = bare, sprung, loop.model
+    return {
+        name: (model, own, state_truth(model, own))
+        for name, model, own in zip(("bare", "sprung", "loop"), models, states, strict=True)
+    }
+
+
+@pytest.mark.parametrize(
+    ("given", "name", "plants"),
+    [
+        pytest.param(given, name, plants, id=f"{name}-{'-'.join(plants)}-{number}")
+        for given, some in (("tree", VARIANT_PLANTS), ("loop", LOOP_PLANTS))
+        for number, (name, plants) in enumerate(some)
+    ],
+)
+def test_a_wrong_function_is_seen_by_the_variant_of_its_name(given, name, plants, moving_parts):
+    if given == "tree":
+        given = "bare" if name.startswith(("mjtDisableBit", "mjtSleep")) else "sprung"
+    model, states, truth = moving_parts[given]
+    adapter = copy(load_adapter("mujoco"))
+    adapter.variants = [one for one in adapter.variants if name in one.names]
+    assert_agree(rows_of_variants(truth, evaluate_variants(adapter, model, states)))
+    with wrong_functions("mujoco", plants):
+        rows = rows_of_variants(truth, evaluate_variants(adapter, model, states))
+    assert {row.verdict for row in rows} & {Verdict.DISAGREES, Verdict.FAILED}
 
 
 def test_exudyns_sum_of_two_sensors_tells_them_apart(few_bodies, monkeypatch):
