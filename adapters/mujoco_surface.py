@@ -310,7 +310,7 @@ def _add_cranks(s: Probed) -> None:
     mujoco.mj_fwdVelocity(own, other)
     along, speed = arms @ axis, s.sensors("FRAMELINVEL") @ axis
     rest = along - other.actuator_length[cranks]
-    distance, by = np.sqrt(L**2 + along**2 - rest**2), "mjtTrn.mjTRN_SLIDERCRANK"
+    distance, by = np.sqrt(L**2 + along**2 - rest * np.abs(rest)), "mjtTrn.mjTRN_SLIDERCRANK"
     moment = dense_rows(other.actuator_moment, own, other, "moment")
     s.add("frame_distance", f"MjData.actuator_length {by}", distance[:, None])
     for name, rate in (("velocity", other.actuator_velocity[cranks]), ("moment", moment[cranks] @ s.d.qvel)):

@@ -14,7 +14,7 @@ import numpy as np
 import pinocchio
 
 Function = Callable[..., Any]
-Wrong = Callable[[Function], Function]  # takes a right function to a wrong one
+Wrong = Callable[[Any], Any]  # takes a right function, or an enumeration, to a wrong one
 
 
 def times(factor: float) -> Wrong:
@@ -81,6 +81,21 @@ def after(change: Callable[..., Any]) -> Wrong:
 def with_members(**values: int) -> Wrong:
     """An enumeration of which some members have other values."""
     return lambda right: SimpleNamespace(**{name: int(x) for name, x in right.__members__.items()} | values)
+
+
+def _with_other_cranks(right: Function) -> Function:
+    """Let sliders be on the other side of their cranks' ends."""
+
+    def changed(m: Any, d: Any) -> None:
+        right(m, d)
+        for a in np.flatnonzero(m.actuator_trntype == mujoco.mjtTrn.mjTRN_SLIDERCRANK):
+            end, slider = m.actuator_trnid[a]
+            arm = d.site_xpos[end] - d.site_xpos[slider]
+            along = arm @ d.site_xmat[slider].reshape(3, 3)[:, 2]
+            root = np.sqrt(max(0.0, m.actuator_cranklength[a] ** 2 + along**2 - arm @ arm))
+            d.actuator_length[a] += 2 * root
+
+    return changed
 
 
 def _integrate_filters(m: Any, *_: Any) -> None:
@@ -190,6 +205,7 @@ SURFACE_PLANTS: Mapping[str, list[dict[str, Wrong]]] = {
         {"mju_quat2Vel": with_argument(2, 1.0)},
         {"mju_quatIntegrate": with_argument(2, 1.0)},
         {"mj_inverse": after(_forget_discrete_steps)},
+        {"mj_fwdPosition": _with_other_cranks},
         {"mj_jacPointAxis": with_outputs(-2, 3)},
         {"mjd_quatIntegrate": with_outputs(-3, -2)},
         {"mjd_quatIntegrate": with_outputs(-3, -1)},
