@@ -354,15 +354,15 @@ class Exudyn(ExudynAdapter):
         return parts | {"fields": fields}
 
     def _surface(self, model: Model, states: Sequence[State]) -> Sequence[SurfaceAnswer]:
-        found = list[Answer]()
+        found, first = list[Answer](), next((k for k, state in enumerate(states) if np.any(state.omega)), 0)
         with silence_engine():
-            for state in states:
+            for k, state in enumerate(states):
                 chain = ExudynChain(model, state, has_probes=True)
                 _evaluate_state(chain)
                 assert chain.probes is not None
                 chain.probes.add_all()
                 found.append(chain.probes.found)
-                if state is states[0] and model.n <= FEW_BODIES:
+                if k <= first and model.n <= FEW_BODIES:  # where nothing turns, all would be 0 = 0
                     chain.probes.add_once(model, state)
             add_pose_answers(found, states, "exudyn", pose_function)
         return found

@@ -24,6 +24,7 @@ from plumbline.engines.missing_names import add_parts
 from plumbline.model.datatypes import Array, Model, State
 from plumbline.model.probe_frames import PROBE_TURN, probe_points
 
+FACTORS = [0.5, 1.5]  # of a velocity in the world's axes and in the body's in a sum
 FEW_BODIES = 3  # of mechanisms on which what does not depend on the mechanism is compared
 
 
@@ -100,9 +101,10 @@ class _Output(NamedTuple):
     read: Callable[[Array], Array] = np.asarray
 
 
-def _weighted_sum(
+def weighted_sum(
     mbs: Any, t: float, sensors: Sequence[Any], factors: Sequence[float], configuration: Any
 ) -> list[float]:
+    """Add what sensors read, each times a factor."""
     values = [
         factor * np.array(mbs.GetSensorValues(sensor, configuration))
         for sensor, factor in zip(sensors, factors, strict=True)
@@ -167,12 +169,11 @@ class Probes(SurfaceRecord):
             for one in outputs:
                 make = partial(getattr(items, kind), outputVariableType=getattr(Output, one.name), **silent)
                 self.readers.append((one, function, kind, given, [mbs.AddSensor(make(**x)) for x in given]))
-        law = {"factors": [0.5, 1.5], "sensorUserFunction": _weighted_sum}
+        law = {"factors": FACTORS, "sensorUserFunction": weighted_sum}
+        own = {one.quantity: sensors for one, _, kind, _, sensors in self.readers if kind == "SensorBody"}
         self.sums = [
-            mbs.AddSensor(items.SensorUserFunction(sensorNumbers=[sensor, sensor], **law, **silent))
-            for one, _, kind, _, sensors in self.readers
-            if (one.quantity, kind) == ("frame_velocity", "SensorBody")
-            for sensor in sensors
+            mbs.AddSensor(items.SensorUserFunction(sensorNumbers=list(pair), **law, **silent))
+            for pair in zip(own["frame_velocity"], own["frame_velocity_local"], strict=True)
         ]
 
     def add_all(self) -> None:
@@ -191,7 +192,7 @@ class Probes(SurfaceRecord):
             *(partial(self._add_coordinates, *one) for one in OF_COORDINATES.items()),
             self._add_sums,
             self._add_dictionary,
-            *(partial(self._add_configuration, one) for one in ("Initial", "Current", "StartOfStep")),
+            self._add_configurations,
         )
         for kind, markers in self.markers_of_centres.items():
             for name, quantity in (("Position", "body_position"), ("Velocity", "body_velocity")):
@@ -205,7 +206,7 @@ class Probes(SurfaceRecord):
             self.add("body_position", by, self._own(total, kind))
 
     def add_once(self, model: Model, state: State) -> None:
-        """Add what does not depend on the mechanism, and what is slow: of one state."""
+        """Add what does not depend on the mechanism, and what is slow: of few states."""
         add_point_answers(self, state)
         add_item_answers(self, model, state)
         if not model.has_loops:
@@ -228,11 +229,25 @@ class Probes(SurfaceRecord):
     def _add_sums(self) -> None:
         values = np.array([self.mbs.GetSensorValues(sensor) for sensor in self.sums])
         call = "itemInterface.SensorUserFunction itemInterface.SensorUserFunctionSensorUserFunction"
-        self.add("frame_velocity", call, values / 2)
+        turns = [self.mbs.GetObjectOutputBody(body, Output.RotationMatrix) for body in self.bodies]
+        laws = FACTORS[0] * np.eye(3) + FACTORS[1] * np.reshape(turns, (-1, 3, 3)).swapaxes(1, 2)
+        self.add("frame_velocity", call, np.linalg.solve(laws, values[..., None])[..., 0])
 
-    def _add_configuration(self, name: str) -> None:
-        rates = self.mbs.systemData.GetODE2Coordinates_t(getattr(exudyn.ConfigurationType, name))
-        self.add("body_velocity", f"ConfigurationType.{name}", self._own(rates))
+    def _add_configurations(self) -> None:
+        """Give each configuration rates of its own, but for the initial one, and read them."""
+        data, kinds = self.mbs.systemData, exudyn.ConfigurationType
+        rates, multiples = (
+            np.array(data.GetODE2Coordinates_t()),
+            {"Initial": 1, "Current": 2, "StartOfStep": 3},
+        )
+        for name, factor in multiples.items():
+            if factor > 1:
+                data.SetODE2Coordinates_t(factor * rates, getattr(kinds, name))
+        for name, factor in multiples.items():
+            own = np.array(data.GetODE2Coordinates_t(getattr(kinds, name))) / factor
+            self.add("body_velocity", f"ConfigurationType.{name}", self._own(own))
+        for name in ("Current", "StartOfStep"):
+            data.SetODE2Coordinates_t(rates, getattr(kinds, name))
 
     def _add_dictionary(self) -> None:
         rates = self.mbs.systemData.GetSystemStateDict()["ODE2Coords_t"]

@@ -46,6 +46,7 @@ PID: Ways = {"pid": {"gaintype": "mjtGain.mjGAIN_PID"}}
 PID_GAINS = np.array([3.0, 2.0, 4.0])  # of position, velocity and integral
 CALLBACKS = "set_mjcb_act_gain set_mjcb_act_bias set_mjcb_act_dyn"
 SERVO: Ways = {"servo": {"biastype": "mjtBias.mjBIAS_AFFINE"}, "motor": {}}
+USER_RATE = 0.5  # of an activation, per control
 GROUP_OFF = 3  # of actuators that are off
 FAR = 1e6  # of limits that are never reached [rad, m, N or N m]
 
@@ -72,6 +73,7 @@ def with_actuators(ways: Ways, read: str = "") -> Callable[[Any], Any]:
                         total = sum(map(int, (inputs.mjINPUT_POS, inputs.mjINPUT_VEL, inputs.mjINPUT_FF)))
                         kp, kv, ki = PID_GAINS
                         actuator.set_to_pid(kp=kp, kv=kv, ki=ki, ctrlspec=total)
+                    actuator.actearly = "dyntype" in members
                     if actuator.dyntype == mujoco.mjtDyn.mjDYN_USER:
                         actuator.actdim = 1
         if read:
@@ -125,9 +127,22 @@ def _set_efforts(m: Any, d: Any, ways: Ways, effort: Array) -> None:
             if way == "pid":
                 _set_pid(m, d, a, wanted / GEAR, (j, rate))
             elif "dyntype" in members:
-                d.act[m.actuator_actadr[a]] = wanted / GEAR
+                _set_activation(m, d, a, wanted / GEAR)
             else:
                 d.ctrl[_control(m, a)] = wanted / GEAR
+
+
+def _set_activation(m: Any, d: Any, a: int, force: float) -> None:
+    """Let the force be there at the end of a step, which it is taken from early."""
+    kind, share = mujoco.mjtDyn(m.actuator_dyntype[a]), m.opt.timestep / m.actuator_dynprm[a, 0]
+    control = d.ctrl[_control(m, a)] = 2.0 * force
+    if kind == mujoco.mjtDyn.mjDYN_FILTEREXACT:
+        share = 1 - np.exp(-share)
+    is_filter = kind in (mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT)
+    by_control = (
+        share if is_filter else m.opt.timestep * (USER_RATE if kind == mujoco.mjtDyn.mjDYN_USER else 1.0)
+    )
+    d.act[m.actuator_actadr[a]] = (force - by_control * control) / (1.0 - share * is_filter)
 
 
 def _set_pid(m: Any, d: Any, a: int, force: float, place: tuple[int, int]) -> None:
@@ -220,7 +235,10 @@ def forward_by_callbacks(m: Any, d: Any) -> None:
     def bias(_: Any, data: Any, a: int) -> float:
         return float(-data.ctrl[_control(m, a)])
 
-    with callbacks(act_gain=lambda *_: 2.0, act_bias=bias, act_dyn=lambda *_: 0.5):
+    def rate(_: Any, data: Any, a: int) -> float:
+        return float(USER_RATE * data.ctrl[_control(m, a)])
+
+    with callbacks(act_gain=lambda *_: 2.0, act_bias=bias, act_dyn=rate):
         forward_by_actuators(BY_CALLBACK)(m, d)
 
 

@@ -15,6 +15,7 @@ DOFS = {
     mujoco.mjtJoint.mjJNT_FREE: 6, mujoco.mjtJoint.mjJNT_BALL: 3,
     mujoco.mjtJoint.mjJNT_HINGE: 1, mujoco.mjtJoint.mjJNT_SLIDE: 1,
 }  # fmt: skip
+MAX_AWAKE = 12  # steps after which what may sleep does
 
 
 def member(name: str) -> Any:

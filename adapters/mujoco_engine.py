@@ -63,6 +63,7 @@ from numpy.typing import NDArray
 
 from adapters.mujoco_common import (
     add_actuator,
+    children_of,
     compiler_of,
     full_mass_matrix,
     member,
@@ -413,16 +414,20 @@ class _MujocoChain:
         _add_equalities(spec, links, constraints)
         if has_probes:
             add_probes(spec, links, model)
+        if change.is_described:
+            self._describe_elements(spec, links)
         spec = change.describe(spec)
         m = spec.compile()
-        m.opt.gravity = model.gravity
+        if not change.is_described:
+            m.opt.gravity = model.gravity
         # 3.2.0 always resets, which the contract's checks report
         disabled = mujoco.mjtDisableBit
         no_reset = getattr(disabled, "mjDSBL_AUTORESET", 0)
         # From the accelerations of the step before, Newton's method may end before the second iteration.
         m.opt.disableflags = disabled.mjDSBL_CONTACT | disabled.mjDSBL_WARMSTART | no_reset
         # After compiling: the compiler refuses massless bodies, and cannot adjust what it does not see.
-        given = np.full(m.nbody, True) if not change.has_own_inertia else np.array(self.mass) == 0
+        is_own = change.has_own_inertia or change.is_described
+        given = np.full(m.nbody, True) if not is_own else np.array(self.mass) == 0
         m.body_mass[given] = np.array(self.mass)[given]
         m.body_inertia[given] = np.array(self.inertia)[given]
         self.m = m
@@ -493,6 +498,8 @@ class _MujocoChain:
             J = turn * moments @ turn.T
             full = J[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
             set_attributes(body, mass=mass, inertia=np.zeros(3), iquat=UNTURNED, fullinertia=full)
+        elif mass and self.change.is_described:
+            set_attributes(body, mass=mass, inertia=moments)
         if joint is not None:
             for one in self.change.ball_joints:
                 set_attributes(body.add_joint(), pos=joint, **one)
@@ -500,6 +507,21 @@ class _MujocoChain:
         self.mass.append(mass)
         self.inertia.append(moments)
         return body
+
+    def _describe_elements(self, spec: Any, links: list[Any]) -> None:
+        """Write gravity, rotors, dampers and springs into the description, but no rest of a ball."""
+        model, _ = self.model, mujoco.MjSpec.attach  # 3.2.0 lacks this, and cannot return a spec's option
+        compiler_of(spec).degree = False
+        spec.option.gravity = model.gravity
+        for k, (kind, link) in enumerate(zip(model.kinds, links, strict=True)):
+            for i, joint in enumerate(children_of(link, "joint")[: kind.element_count]):
+                _set_springs(joint, model.stiffness[k, i], model.damping[k, i])
+                joint.armature, joint.springref = model.armature[k, i], model.rest[k, i]
+        numbers = zip(model.spring_stiffness, model.spring_damping, model.spring_length, strict=True)
+        for i, (stiffness, damping, length) in enumerate(numbers):
+            tendon = spec.tendon(f"spring {i}")
+            _set_springs(tendon, stiffness, damping)
+            tendon.springlength = [length, length]
 
     def _set_elements(self) -> None:
         """Set rotors, dampers, springs and efforts of the joints, and the springs between points."""
@@ -511,10 +533,14 @@ class _MujocoChain:
                 rest = (
                     kinematics.ball_spring_rest(model, k) if kind.is_spherical else model.rest[k, i : i + 1]
                 )
-                m.dof_armature[dofs], m.dof_damping[dofs] = model.armature[k, i], model.damping[k, i]
-                m.jnt_stiffness[joint], self.effort[dofs] = model.stiffness[k, i], model.effort[k, i]
-                if model.stiffness[k, i]:
+                self.effort[dofs] = model.effort[k, i]
+                if model.stiffness[k, i] and (kind.is_spherical or not self.change.is_described):
                     m.qpos_spring[m.jnt_qposadr[joint] + np.arange(len(rest))] = rest
+                if not self.change.is_described:
+                    m.dof_armature[dofs], m.dof_damping[dofs] = model.armature[k, i], model.damping[k, i]
+                    m.jnt_stiffness[joint] = model.stiffness[k, i]
+        if self.change.is_described:
+            return
         springs = slice(len(model.spring_body))
         m.tendon_stiffness[springs], m.tendon_damping[springs] = model.spring_stiffness, model.spring_damping
         m.tendon_lengthspring[springs] = model.spring_length[:, None]
@@ -872,6 +898,12 @@ def _add_tendon(spec: Any, links: list[Any], name: str, bodies: NDArray[np.intp]
         owner = links[body] if body >= 0 else spec.worldbody
         set_attributes(owner.add_site(), name=f"{name} {side}", pos=point)
         tendon.wrap_site(f"{name} {side}")
+
+
+def _set_springs(element: Any, stiffness: float, damping: float) -> None:
+    """Set a linear spring and damper of a joint or tendon; later versions have polynomials of them."""
+    for name, value in (("stiffness", stiffness), ("damping", damping)):
+        setattr(element, name, np.append(value, [0.0, 0.0]) if np.ndim(getattr(element, name)) else value)
 
 
 def _add_equalities(spec: Any, links: list[Any], constraints: _Constraints) -> None:

@@ -123,9 +123,10 @@ def welds_as_points(spec: Any) -> Any:
 
 
 def attached(spec: Any) -> Any:
-    """Attach the whole to an empty one, whose defaults have another rotor, damper and spring of joints."""
+    """Attach the whole to an empty one, whose default has another rotor of joints."""
     attach, other = mujoco.MjSpec.attach, mujoco.MjSpec()
-    compiler_of(other).autolimits = False
+    compiler_of(other).autolimits = compiler_of(other).degree = False
+    other.option.gravity = spec.option.gravity
     other.default.joint.armature = 3.0
     attach(other, spec, frame=other.worldbody.add_frame(), prefix="attached ")
     return other

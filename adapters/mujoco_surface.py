@@ -19,6 +19,7 @@ import numpy as np
 from adapters.mujoco_arrays import ARRAYS
 from adapters.mujoco_common import (
     DOFS,
+    MAX_AWAKE,
     add_actuator,
     add_sensor,
     data_like,
@@ -81,7 +82,6 @@ OBJECT_MOTIONS = {
 # Of a Jacobian the quantities of its two parts, point and rotation.
 AT_FRAME = ("frame_velocity", "frame_angular_velocity")
 AT_BODY = ("body_velocity", "frame_angular_velocity")
-MAX_AWAKE = 12  # steps after which what may sleep does
 INVERSE_STAGES = ("mj_invPosition", "mj_invVelocity", "mj_invConstraint")
 STILL_SENSORS = {"FRAMELINACC": False, "ACCELEROMETER": True}  # by name whether in own axes
 
@@ -107,6 +107,7 @@ CLAMPS = (
           "mjtGain.mjGAIN_AFFINE mjtDyn.mjDYN_INTEGRATOR"),
 )  # fmt: skip
 SENSOR_STAGES = ("mj_sensorPos", "mj_sensorVel", "mj_sensorAcc")
+TIME = 0.7  # s, of a turn
 SIZES = {"p": 4, "R": 9, "r": 3, "phi": 3, "w": 3, "pdot": 4, "2pdot": 4}
 
 
@@ -120,17 +121,25 @@ def pose_function(name: str, given: Sequence[Any], forms: Sequence[str]) -> list
         return [quaternion_product(q, np.array([np.cos(half), 0.0, 0.0, np.sin(half)]))]
     if name == "mjd_subQuat":
         q, other, between, spin = given
-        of_first = np.zeros((3, 3))
-        mujoco.mjd_subQuat(q, other, of_first, None)
-        return [rate_maps(Pose(np.zeros(3), between))["phidot"] @ of_first @ spin]
+        of_first, of_second = np.zeros((2, 3, 3))
+        mujoco.mjd_subQuat(q, other, of_first, of_second)
+        pose = Pose(np.zeros(3), between)
+        return [
+            rate_maps(pose)["phidot"] @ matrix @ moved
+            for matrix, moved in ((of_first, spin), (-of_second, pose.R @ spin))
+        ]
     if name == "mjd_quatIntegrate":
-        by_turn, by_velocity, by_scale = np.empty(9), np.empty(9), np.empty(3)
-        mujoco.mjd_quatIntegrate(*given, by_turn, by_velocity, by_scale)
-        return [by_turn.reshape(3, 3).T]
+        by_turn, by_velocity, by_scale = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+        mujoco.mjd_quatIntegrate(*given, by_turn.ravel(), by_velocity.ravel(), by_scale)
+        return [by_velocity] if forms[0].startswith("@") else [by_turn.T, by_scale]
+    if name == "mju_quat2Vel":
+        velocity = np.empty(3)
+        mujoco.mju_quat2Vel(velocity, given[0], TIME)
+        return [TIME * velocity]
     arguments = [np.ravel(x) if isinstance(x, np.ndarray) else x for x in given]
     results = [np.empty(SIZES[form.rpartition(".")[2]]) for form in forms]
     if name == "mju_quatIntegrate":  # in place
-        results = [arguments.pop(0).copy()]
+        results, arguments = [given[0].copy()], [given[1] / TIME, TIME]
     getattr(mujoco, name)(*results, *arguments)
     return results
 
@@ -301,7 +310,7 @@ def _add_cranks(s: Probed) -> None:
     mujoco.mj_fwdVelocity(own, other)
     along, speed = arms @ axis, s.sensors("FRAMELINVEL") @ axis
     rest = along - other.actuator_length[cranks]
-    distance, by = np.sqrt(L**2 + along**2 - rest**2), "mjtTrn.mjTRN_SLIDERCRANK"
+    distance, by = np.sqrt(L**2 + along**2 - rest * np.abs(rest)), "mjtTrn.mjTRN_SLIDERCRANK"
     moment = dense_rows(other.actuator_moment, own, other, "moment")
     s.add("frame_distance", f"MjData.actuator_length {by}", distance[:, None])
     for name, rate in (("velocity", other.actuator_velocity[cranks]), ("moment", moment[cranks] @ s.d.qvel)):
@@ -348,7 +357,7 @@ def _add_jacobians(s: Probed) -> None:
         axis = d.site_xmat[site].reshape(3, 3)[:, 0].copy()
         for call, arguments, quantities in (
             ("mj_jac", (p, r, point, b), AT_FRAME),
-            ("mj_jacPointAxis", (p, r, point, axis, b), AT_FRAME[:1]),
+            ("mj_jacPointAxis", (p, r, point, axis, b), AT_FRAME),
             ("mj_jacBody", (p, r, b), AT_BODY),
             ("mj_jacBodyCom", (p, r, b), AT_BODY),
             ("mj_jacSite", (p, r, site), AT_FRAME),
@@ -359,6 +368,10 @@ def _add_jacobians(s: Probed) -> None:
         ):
             getattr(mujoco, call)(m, d, *arguments)
             values = [p @ d.qvel, r @ d.qvel]
+            if call == "mj_jac":
+                along = axis * (axis @ values[1])
+            if call == "mj_jacPointAxis":  # ω × axis
+                values[1] = along + np.cross(axis, values[1])
             if call == "mj_jacDot":
                 values = [dp @ d.qvel + p @ d.qacc, dr @ d.qvel + r @ d.qacc]
             for quantity, value in zip(quantities, values, strict=False):
@@ -418,12 +431,6 @@ def _add_torques(s: Probed) -> None:
     dynamics |= _joint_forces(m, d)
     dynamics[" ".join(INVERSE_STAGES)] = _inverse_by_stages(m, d)
     add_parts(s.found, partial(_add_implicit_steps, s), partial(_add_sum, s))
-    if not np.any(m.dof_damping):
-        flags = m.opt.enableflags
-        m.opt.enableflags = flags | int(mujoco.mjtEnableBit.mjENBL_INVDISCRETE)
-        mujoco.mj_inverse(m, d)
-        dynamics["mjtEnableBit.mjENBL_INVDISCRETE"] = d.qfrc_inverse + d.qfrc_passive - rotors
-        m.opt.enableflags = flags
     d.qvel[:] = 0.0
     mujoco.mj_fwdVelocity(m, d)
     mujoco.mj_rne(m, d, 0, gravity)
@@ -495,12 +502,14 @@ def _add_implicit_steps(s: Probed) -> None:
         mujoco.mj_forward(own, other)
         if name == "EULER":
             mujoco.mj_Euler(own, other)
+            _add_discrete_inverse(s, own, name, other)
             L = dense_rows(other.qH, m, other, "M")
             pivots, added = v + (L - np.diag(np.diag(L))) @ v, h * m.dof_damping @ v**2
             s.add("kinetic_energy", "MjData.qH", (np.diag(L) @ pivots**2 - added) / 2)
             s.add("kinetic_energy", "MjData.qHDiagInv", ((pivots / other.qHDiagInv) @ pivots - added) / 2)
             continue
         mujoco.mj_implicit(own, other)
+        _add_discrete_inverse(s, own, name, other)
         D = dense_rows(other.qDeriv, m, other, "D")
         if name == "IMPLICIT":
             LU = dense_rows(other.qLU, m, other, "D")
@@ -509,6 +518,17 @@ def _add_implicit_steps(s: Probed) -> None:
         call = f"mj_implicit mjtIntegrator.mjINT_{name}"
         _add_force_of_step(s, f"{call} MjData.qDeriv mjtDisableBit.mjDSBL_ACTUATION", other, D, h)
         add_parts(s.found, *(partial(_add_clamped_step, s, own, clamp, call, D) for clamp in CLAMPS))
+
+
+def _add_discrete_inverse(s: Probed, m: Any, name: str, end: Any) -> None:
+    """Add what inverse dynamics make of the change of the velocities in a step by an integrator."""
+    own, other = copy(m), data_like(m, s.d)
+    own.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_INVDISCRETE)
+    other.qacc[:] = (end.qvel - s.d.qvel) / m.opt.timestep
+    mujoco.mj_inverse(own, other)
+    force = other.qfrc_inverse + s.d.qfrc_passive - m.dof_armature * s.d.qacc
+    call = f"mjtEnableBit.mjENBL_INVDISCRETE mjtIntegrator.mjINT_{name}"
+    s.add_forces("inverse_dynamics", {call: force})
 
 
 def _add_force_of_step(s: Probed, call: str, end: Any, D: Array, h: float) -> None:

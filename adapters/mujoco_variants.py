@@ -23,11 +23,21 @@ import numpy as np
 
 from adapters import mujoco_actuation as actuation
 from adapters import mujoco_shapes as shapes
-from adapters.mujoco_common import bodies_of, compiler_of, dense_rows, member, through_inverse
-from adapters.pose_functions import FIXED_PLACE, Pose, rate_maps
+from adapters.mujoco_common import (
+    DOFS,
+    MAX_AWAKE,
+    bodies_of,
+    compiler_of,
+    dense_rows,
+    member,
+    named_joints,
+    set_attributes,
+    through_inverse,
+)
+from adapters.pose_functions import FIXED_PLACE, OTHER_TURN, Pose, rate_maps
 from plumbline.engines.variants import Suits, Variant, both, every, has, names_of_column, variants_of
-from plumbline.model.datatypes import Array, Model, Unsupported
-from plumbline.model.kinematics import quaternion_conjugate, quaternion_product, rotation_matrix
+from plumbline.model.datatypes import Array, EngineFailure, Model, Unsupported
+from plumbline.model.kinematics import quaternion_product
 from plumbline.model.probe_frames import PROBE_ATTITUDE
 
 HINGE_ANGLES = np.array([0.4, -0.7, 1.1])  # rad, about x, y, z in turn: far from singular ones
@@ -48,6 +58,8 @@ HINGES, SLIDES = (
 
 
 FEW_JOINTS = 4
+WRONG = "wrong"  # of what is switched off
+TIMES = 0.7, 0.4  # s
 LONG_STEP = 2.0**20  # s: of one step of Euler's method, in which v₁ = v₀ + h a to the rounding of h a
 # Of what rows of constraints demand, what a solver may leave: 1e-15 was measured where PGS had converged, and
 # 1e-10 to 1e-7 where it had not.
@@ -76,6 +88,11 @@ PARTS = (  # the functions that the stages of positions and velocities call, aft
     "mj_makeM mj_factorM mj_makeConstraint mj_projectConstraint mj_transmission mj_energyPos mj_fwdVelocity "
     f"mj_comVel mj_passive mj_referenceConstraint {BIAS} mj_energyVel {LAST_STAGES}"
 )
+# By function what it finds once more, after `mj_fwdVelocity`.
+FOUND_AGAIN = {
+    "mj_comVel": "cvel cdof_dot", "mj_passive": "qfrc_passive", BIAS: "qfrc_bias",
+    "mj_referenceConstraint": "efc_aref",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -87,13 +104,15 @@ class Change:
     reset: Callable[[Any, Any], None] = mujoco.mj_resetData
     forward: Callable[[Any, Any], None] = mujoco.mj_forward
     has_own_inertia: bool = False  # whether principal inertias are those that MuJoCo computes
+    # whether the description has all numbers, but for what no massless body can have
+    is_described: bool = False
     ball_joints: Sequence[Mapping[str, Any]] = BALL  # of bodies and of rods
     free_joints: Sequence[Mapping[str, Any]] = FREE
 
     @property
     def is_after_compiling(self) -> bool:
         """Whether the description is the usual one."""
-        usual = self.describe is _no_change and not self.has_own_inertia
+        usual = self.describe is _no_change and not self.has_own_inertia and not self.is_described
         return usual and self.ball_joints is BALL and self.free_joints is FREE
 
 
@@ -110,6 +129,13 @@ def _set_options(**values: Any) -> Callable[[Any, Any], tuple[Any, Any]]:
         return m, mujoco.MjData(m)
 
     return remake
+
+
+def _with_needless(m: Any, d: Any) -> tuple[Any, Any]:
+    """Give joints springs, dampers and limits, all of them switched off."""
+    m.jnt_stiffness[:] = m.dof_damping[:] = 1.0
+    m.jnt_limited[m.jnt_type != FREE[0]["type"]], m.jnt_range[:] = True, [10.0, 11.0]
+    return _set_options(disableflags=NEEDLESS)(m, d)
 
 
 def is_constrained(model: Model) -> bool:
@@ -141,6 +167,8 @@ def _forward_by(parts: str) -> Callable[[Any, Any], None]:
 
     def forward(m: Any, d: Any) -> None:
         for part in parts.split():
+            for name in FOUND_AGAIN.get(part, "").split():
+                getattr(d, name)[:] = 1.0
             more = (0, d.qfrc_bias) if part == BIAS else ()
             getattr(mujoco, part)(m, d, *more)
 
@@ -202,11 +230,11 @@ def _forward_after_keyframe(m: Any, d: Any) -> None:
 
 
 def _forward_from_reference(m: Any, d: Any) -> None:
-    """Reach the positions from those of the model by the motion that leads there in one second."""
-    motion = np.zeros(m.nv)
-    mujoco.mj_differentiatePos(m, motion, 1.0, m.qpos0, d.qpos)
+    """Reach the positions from those of the model by a motion that leads there, and in less time."""
+    motion, (slow, fast) = np.zeros(m.nv), TIMES
+    mujoco.mj_differentiatePos(m, motion, slow, m.qpos0, d.qpos)
     d.qpos[:] = m.qpos0
-    mujoco.mj_integratePos(m, d.qpos, motion, 1.0)
+    mujoco.mj_integratePos(m, d.qpos, motion * (slow / fast), fast)
     mujoco.mj_forward(m, d)
 
 
@@ -269,11 +297,12 @@ def _forward_by_rollout(m: Any, d: Any) -> None:
 
 def _forward_with_checks(m: Any, d: Any) -> None:
     """Normalise quaternions that are too long, and check all numbers."""
-    for j, kind in enumerate(m.jnt_type):
-        at = m.jnt_qposadr[j] + 3 * (kind == mujoco.mjtJoint.mjJNT_FREE)
-        if kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL):
-            d.qpos[at : at + 4] *= 1.5
+    balls, free = (m.jnt_qposadr[m.jnt_type == kind[0]["type"]] for kind in (BALL, FREE))
+    at = np.append(balls, free + 3)[:, None] + np.arange(4)
+    d.qpos[at] *= 1.5
     mujoco.mj_normalizeQuat(m, d.qpos)
+    if not np.allclose(np.linalg.norm(d.qpos[at], axis=1), 1.0, rtol=0.0, atol=ROUNDING):
+        raise EngineFailure("mj_normalizeQuat leaves quaternions that are not of length 1")
     mujoco.mj_checkPos(m, d)
     mujoco.mj_checkVel(m, d)
     mujoco.mj_forward(m, d)
@@ -281,8 +310,9 @@ def _forward_with_checks(m: Any, d: Any) -> None:
 
 
 def _default_options(m: Any, d: Any) -> tuple[Any, Any]:
-    """Set all options anew."""
+    """Set all options anew, among them a thick medium in motion."""
     flags, gravity = m.opt.disableflags, m.opt.gravity.copy()
+    m.opt.density, m.opt.viscosity, m.opt.wind = 1e3, 1.0, np.ones(3)
     mujoco.mj_defaultOption(m.opt)
     m.opt.disableflags, m.opt.gravity = flags, gravity
     return m, d
@@ -332,12 +362,19 @@ def _forward_by_islands(m: Any, d: Any) -> None:
 
 
 def _forward_by_switched_welds(m: Any, d: Any) -> None:
-    """Switch the equalities on that are off in the model."""
-    d.eq_active[:] = 1
+    """Switch the equalities on that are off in the model, but for those that would hold what moves."""
+    d.eq_active[:] = [not m.equality(i).name.startswith(WRONG) for i in range(m.neq)]
     mujoco.mj_forward(m, d)
 
 
 def _switched_off(spec: Any) -> Any:
+    """Switch all equalities off, and others that would hold hinges and slides where they are not."""
+    joints = [joint for joint in named_joints(spec) if DOFS[joint.type] == 1]
+    for joint in joints:
+        equality = set_attributes(spec.add_equality(), type=mujoco.mjtEq.mjEQ_JOINT, name1=joint.name)
+        equality.name, equality.data[0] = f"{WRONG} {joint.name}", 10.0
+        if hasattr(equality, "objtype"):
+            equality.objtype = mujoco.mjtObj.mjOBJ_JOINT
     for equality in spec.equalities:
         equality.active = False
     return spec
@@ -350,16 +387,28 @@ def _never_asleep(spec: Any) -> Any:
     return spec
 
 
+def _forward_after_steps(m: Any, d: Any) -> None:
+    """Take steps of no time, after which what may sleep does."""
+    step, m.opt.timestep = m.opt.timestep, 0.0
+    d.xfrc_applied[:] += 0.0  # −0 is a load that keeps bodies awake
+    for _ in range(MAX_AWAKE):
+        mujoco.mj_step(m, d)
+    m.opt.timestep = step
+    mujoco.mj_forward(m, d)
+
+
 def _keep(m: Any, d: Any) -> None:
     """Leave what the last state left in the data."""
 
 
 def _in_frames(spec: Any) -> Any:
     """Put every body in two frames, one in the other."""
+    frames = Pose(FIXED_PLACE, PROBE_ATTITUDE), Pose(FIXED_PLACE[::-1], OTHER_TURN)
+    back = (frames[0] * frames[1]).inverse()
     for body in bodies_of(spec):
-        back = quaternion_conjugate(PROBE_ATTITUDE)
-        outer = body.parent.add_frame(pos=FIXED_PLACE, quat=PROBE_ATTITUDE)
-        inner = body.parent.add_frame(pos=-rotation_matrix(back) @ FIXED_PLACE, quat=back)
+        outer, inner = (body.parent.add_frame(pos=frame.r, quat=frame.p) for frame in frames)
+        own = back * Pose(np.array(body.pos), np.array(body.quat) / np.linalg.norm(body.quat))
+        body.pos, body.quat = own.r, own.p
         inner.set_frame(outer)
         body.set_frame(inner)
     return spec
@@ -481,7 +530,7 @@ VARIANTS = (
     _option("mj_step2", forward=_forward_by_step("mj_step1 mj_step2")),
     _option("set_mjcb_passive", forward=_forward_by_callback("passive")),
     _option("set_mjcb_control", forward=_forward_by_callback("control")),
-    _option(NEEDLESS, lambda model: not model.has_elements, remake=_set_options(disableflags=NEEDLESS)),
+    _option(NEEDLESS, lambda model: not model.has_elements, remake=_with_needless),
     _option("MjData", reset=_keep),
     _option("mj_copyData", remake=_copied_data),
     _option("MjModel", remake=lambda m, d: pickle.loads(pickle.dumps((m, d)))),
@@ -518,6 +567,7 @@ VARIANTS = (
         describe=_never_asleep,
         # of what may sleep, all is slow enough
         remake=_set_options(sleep_tolerance=1e9, enableflags="mjtEnableBit.mjENBL_SLEEP"),
+        forward=_forward_after_steps,
     ),
     _options(iterations=3, **SPARSE),
     _options(**SPARSE, solver="mjtSolver.mjSOL_CG", disableflags="mjtDisableBit.mjDSBL_WARMSTART"),
@@ -573,13 +623,13 @@ VARIANTS = (
         forward=actuation.forward_without_gravity,
     ),
     _option("mjtDisableBit.mjDSBL_GRAVITY", forward=actuation.forward_without_gravity),
-    _spelling("MjSpec", describe=lambda spec: spec.copy()),
+    _spelling("MjSpec", _has_inertia, is_described=True, describe=lambda spec: spec.copy()),
     _spelling("MjsFrame", describe=_in_frames),
     _oriented("EULER", lambda pose: pose.forms["xyz"]),
     _oriented("AXISANGLE", lambda pose: np.append(pose.forms["axis"], pose.forms["angle"])),
     _oriented("XYAXES", lambda pose: pose.R[:, :2].T.ravel()),
     _spelling("mjtOrientation.mjORIENTATION_ZAXIS", describe=shapes.in_z_frames),
-    _spelling("MjsDefault", describe=shapes.attached),
+    _spelling("MjsDefault", _has_inertia, is_described=True, describe=shapes.attached),
     _spelling(
         "MjsBody mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE",
         _has_inertia,

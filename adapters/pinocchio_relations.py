@@ -5,7 +5,7 @@ mechanism:
 
     configurations   a step s leads from q₋ = q ⊖ s to q and from there to q₊: differences, distances and
                      interpolation of these lead back to q.  d = q ⊖ q₋ has ḋ = ∂d/∂q v, and v is the velocity
-                     that `dIntegrate` makes of it; q̇ = T v gives v by T's inverse.
+                     that `dIntegrate` makes of it; q̇ = T v gives v by our own formulas.
     derivatives      terms of velocities are of second degree, so that
                      v̇ = ½ ∂v̇/∂v v + ∂v̇/∂τ (τ − g), of closed loops too.  Of trees ∂v̇/∂τ is M⁻¹, and has lost
                      digits (pinocchio-computeMinverse-loses-digits): it is compared by itself, and taken off
@@ -26,9 +26,12 @@ from adapters.pinocchio_common import armature, axis_of, rebuilt
 from adapters.pinocchio_probes import Probed
 from plumbline.engines.missing_names import add_parts
 from plumbline.model.datatypes import Array
+from plumbline.model.kinematics import angular_velocity, rotation_matrix
 
 SHORT = 3  # joints up to which articulated bodies keep their digits (pinocchio-aba-loses-digits)
 STEP = 0.2  # rad, and of translations this share of the distance of the bodies
+SHARE = 0.3  # of the way between two configurations, from the first
+LONG = 1.5  # of quaternions
 ARG0, ARG1 = pin.ArgumentPosition.ARG0, pin.ArgumentPosition.ARG1
 
 
@@ -53,7 +56,16 @@ def _step(s: Probed) -> Array:
 
 def _add_configurations(s: Probed) -> None:
     m, q, step, data = s.m, s.q, _step(s), s.workspace()
-    before, after, length = pin.integrate(m, q, -step), pin.integrate(m, q, step), np.linalg.norm(step)
+    before, beyond = pin.integrate(m, q, -step), pin.integrate(m, q, step * (1 - SHARE) / SHARE)
+    length, long = np.linalg.norm(step), np.array(q)
+    for at in _quaternions(m):
+        long[at] *= LONG
+
+    def is_told_apart() -> bool:
+        """Whether q, and of others only q, is said to be normalized and the same as q."""
+        is_unit = [pin.isNormalized(m, x) for x in (q, long)]
+        is_same = [pin.isSameConfiguration(m, q, x, 1e-9) for x in (q.copy(), before)]
+        return is_unit == [True, bool(np.array_equal(q, long))] and is_same == [True, False]
 
     def led(tangent: Array) -> Array:
         return np.asarray(pin.integrate(m, before, tangent))
@@ -62,12 +74,10 @@ def _add_configurations(s: Probed) -> None:
         "difference integrate": lambda: led(pin.difference(m, before, q)),
         "distance": lambda: led(step * (pin.distance(m, before, q) / length)),
         "squaredDistance": lambda: led(step * np.sqrt(np.sum(pin.squaredDistance(m, before, q))) / length),
-        "interpolate": lambda: pin.interpolate(m, before, after, 0.5),
-        "isSameConfiguration isNormalized": lambda: (
-            q if pin.isNormalized(m, q) and pin.isSameConfiguration(m, q, q.copy(), 1e-9) else before
-        ),
+        "interpolate": lambda: pin.interpolate(m, before, beyond, SHARE),
+        "isSameConfiguration isNormalized": lambda: q if is_told_apart() else before,
         "lieGroup LieGroup": lambda: pin.lieGroup(m).integrate(before, pin.lieGroup(m).difference(before, q)),
-        "normalize framesForwardKinematics": lambda: pin.normalize(m, q),
+        "normalize framesForwardKinematics": lambda: pin.normalize(m, long),
         "Model Model.idx_qs Model.nqs": lambda: np.concatenate(
             [q[at : at + n] for at, n in zip(m.idx_qs, m.nqs, strict=True)]
         ),
@@ -89,31 +99,54 @@ def _add_velocities(s: Probed) -> None:
     before, after = pin.integrate(m, q, -step), pin.integrate(m, q, step)
     of_q, of_step = (s.square(pin.dIntegrate(m, q, step, at)) for at in (ARG0, ARG1))
     to_here = s.square(pin.dIntegrate(m, before, step, ARG1))
-    from_here = s.square(pin.dDifference(m, q, after, ARG0))
+    from_here, to_there = (s.square(pin.dDifference(m, q, after, at)) for at in (ARG0, ARG1))
     found = {
         "dDifference ArgumentPosition ArgumentPosition.ARG1": to_here
         @ s.square(pin.dDifference(m, before, q, ARG1))
         @ v,
         "dDifference ArgumentPosition.ARG0": np.linalg.solve(of_q, -of_step @ from_here @ v),
     }
-    for at, matrix in ((ARG0, of_q), (ARG1, of_step)):
+    for at in (ARG0, ARG1):  # ∂(q ⊕ s)/∂q and ∂(q ⊕ s)/∂s times v, of which the difference is s
         moved = np.ravel(pin.dIntegrateTransport(m, q, step, v[:, None], at))
+        back = to_there @ moved
         call = f"dIntegrateTransport dIntegrate ArgumentPosition.{at}"
-        found[call] = np.linalg.solve(matrix, moved)
+        found[call] = np.linalg.solve(from_here, -back) if at == ARG0 else back
     s.add_velocities(found)
 
 
+def _quaternions(m: pin.Model) -> list[slice]:
+    """Where the configuration has them."""
+    balls = ("JointModelSpherical", "JointModelFreeFlyer")
+    ends = [joint.idx_q + joint.nq for joint in m.joints if joint.shortname() in balls]
+    return [slice(end - 4, end) for end in ends]
+
+
+def _velocity_map(s: Probed) -> Array:
+    """Return the matrix that takes q̇ to v by our own formulas."""
+    m, found = s.m, np.zeros((s.m.nv, s.m.nq))
+    for joint in list(m.joints)[1:]:
+        own = found[joint.idx_v : joint.idx_v + joint.nv, joint.idx_q : joint.idx_q + joint.nq]
+        if joint.nq == joint.nv:
+            own[:] = np.eye(joint.nq)
+            continue
+        p = np.roll(s.q[joint.idx_q : joint.idx_q + joint.nq][-4:], 1)
+        own[-3:, -4:] = np.roll(np.stack([angular_velocity(p, rate) for rate in np.eye(4)], 1), -1, axis=1)
+        own[:-3, :-4] = rotation_matrix(p).T[: joint.nv - 3, : joint.nv - 3]
+    return found
+
+
 def _add_tangent_maps(s: Probed) -> None:
-    m, q, v = s.m, s.q, s.v
-    T, rate = s.square(pin.tangentMap(m, q)), np.ravel(pin.tangentMapProduct(m, q, v[:, None]))
-    back, inverse = np.ravel(pin.tangentMapTransposeProduct(m, q, rate[:, None])), np.linalg.pinv(T)
+    m, q, v, back = s.m, s.q, s.v, _velocity_map(s)
+    T = np.linalg.pinv(back)
     compact = np.reshape(pin.compactTangentMap(m, q), (m.nq, -1))
     sizes, starts = map(list, pin.getTangentToConfigurationSparsitySegment(m))
     rows = [row[:n] @ v[at : at + n] for row, at, n in zip(compact, starts, sizes, strict=True)]
+    turned = np.ravel(pin.tangentMapTransposeProduct(m, q, (T @ v)[:, None]))
     s.add_velocities({
-        "tangentMap tangentMapProduct": inverse @ rate,
-        "compactTangentMap getTangentToConfigurationSparsitySegment": inverse @ np.array(rows),
-        "tangentMapTransposeProduct": np.linalg.solve(T.T @ T, back),
+        "tangentMap": back @ (s.square(pin.tangentMap(m, q)) @ v),
+        "tangentMapProduct": back @ np.ravel(pin.tangentMapProduct(m, q, v[:, None])),
+        "compactTangentMap getTangentToConfigurationSparsitySegment": back @ np.array(rows),
+        "tangentMapTransposeProduct": np.linalg.solve(T.T @ T, turned),
     })  # fmt: skip
 
 
@@ -129,7 +162,9 @@ def _add_spatial(s: Probed) -> None:
         twist = pin.Motion(data.v[j])
         rate, turn, arm = data.a[j], twist.angular, place.translation
         here = rate.linear + np.cross(turn, twist.linear) + np.cross(rate.angular, arm)
-        square.append(data.oMi[j].rotation @ (here + pin.skewSquare(turn, turn) @ arm))
+        # ω × (ω × r), with two factors that differ, as r × r = 0
+        other = turn + np.linalg.norm(turn) / (np.linalg.norm(arm) or 1.0) * arm
+        square.append(data.oMi[j].rotation @ (here + pin.skewSquare(turn, other) @ arm))
         own = s.columns(j)
         spatial.append(dAdv[:3, own] @ s.v[own] / 2 + J[:3, own] @ s.a[own])
         pin.computeJointJacobian(m, chain, s.q, j)

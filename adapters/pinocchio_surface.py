@@ -23,6 +23,7 @@ import pinocchio as pin
 from adapters.pinocchio_common import armature, joint_of
 from adapters.pinocchio_probes import Probed
 from adapters.pinocchio_relations import mimics, relations
+from adapters.pose_functions import Pose, about
 from plumbline.engines.missing_names import FAILED_PARTS, MISSING_NAMES, add_parts
 from plumbline.model.datatypes import Array
 from plumbline.model.kinematics import cross
@@ -44,6 +45,7 @@ FRAMES = {
     "WORLD": _Frame("_at_origin"),
 }
 OF_MOTIONS = ("exp6", "Jexp6")  # take a pin.Motion
+PLANE_SHIFT = 0.5  # rad, of a step in the plane, and of translations this share
 ANGULAR = {"velocity": "velocity", "acceleration": "acceleration", SPATIAL: "acceleration"}
 # Ways that take the rates of the joints' axes, and what is compared of them where joints are composite.
 BY_RATES = ("jacobian_rate", "map_rate", "coriolis_matrix", "derivative", "inverse")
@@ -112,13 +114,19 @@ def pose_function(name: str, given: Sequence[Any], _: Sequence[str]) -> list[Any
 
 
 def _plane_function(group: Any, height: float, *given: float) -> list[Any]:
-    """Step from one place in the plane, or from one angle, to another as the group's difference says."""
+    """Step from one place in the plane, or from one angle, to another: by our tangent and by the group's."""
     *place, angle = given
     before, there = (
         np.array([*(x * (1.0 - shift) for x in place), np.cos(angle - shift), np.sin(angle - shift)])
-        for shift in (0.5, 0.0)
+        for shift in (PLANE_SHIFT, 0.0)
     )
-    *moved, c, s = group.integrate(before, group.difference(before, there))
+    tangent, turn = np.array([PLANE_SHIFT]), about(2, angle - PLANE_SHIFT)
+    if place:
+        shift = turn.T @ [*(PLANE_SHIFT * np.array(place)), 0.0]
+        half = PLANE_SHIFT / 2
+        tangent = Pose(shift, np.array([np.cos(half), 0.0, 0.0, np.sin(half)])).forms["xi"][[0, 1, 5]]
+    ways = tangent, group.difference(before, there)
+    *moved, c, s = np.mean([group.integrate(before, way) for way in ways], axis=0)
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     return [turn, np.array([*moved, height])][: 1 + bool(place)]
 

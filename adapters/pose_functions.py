@@ -34,9 +34,9 @@ quotes, are given as they stand.
 from __future__ import annotations
 
 import json
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache, cached_property, partial
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -62,6 +62,7 @@ FIXED_TURN, OTHER_TURN = (
     np.array(x) / np.sqrt(102.0) for x in ([8.0, 3.0, -2.0, 5.0], [9.0, -2.0, 4.0, 1.0])
 )
 POSE_STATES = 2  # at which they are called
+REST = 1e-12  # relative to a matrix's largest entry: rounding of entries that say what others say, too
 TERMS = 40  # of a series in rotation vectors up to π
 
 
@@ -81,6 +82,13 @@ def homogeneous(turn: Float[Array, "3 3"], place: Float[Array, "3"]) -> Float[Ar
     """Return the matrix of a pose."""
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = turn, place
+    return pose
+
+
+def plucker(turn: Float[Array, "3 3"], place: Float[Array, "3"]) -> Float[Array, "6 6"]:
+    """Return the Plücker matrix of a pose."""
+    pose = np.kron(np.eye(2), turn)
+    pose[3:, :3] = cross_matrix(place) @ turn
     return pose
 
 
@@ -123,10 +131,7 @@ class Pose:
         phi, xyz = rotation_vector(self.p), xyz_angles(self.R)
         H, G = homogeneous(self.R, self.r), np.eye(7)
         G[:3, :3], G[3:6, 6] = self.R, self.r
-        X = np.kron(np.eye(2), self.R)
-        X[3:, :3] = cross_matrix(self.r) @ self.R
-        XI = np.kron(np.eye(2), self.R.T)
-        XI[3:, :3] = -self.R.T @ cross_matrix(self.r)
+        X, XI = plucker(self.R, self.r), plucker(self.R.T, -self.R.T @ self.r)
         xi = np.append(np.linalg.solve(_mean_of_exponential(cross_matrix(phi)), self.r), phi)
         angle = float(np.linalg.norm(phi))
         named: dict[str, Any] = {
@@ -213,6 +218,10 @@ class _Body:
         pose, _, form = form.rpartition(".")
         axes = "frame_axes_by_whole_turns" if form.endswith("+") else "frame_axes"
         form = form.removesuffix("+")
+        if np.ndim(value) > 1 and not np.allclose(
+            value, _whole(form, value), REST, REST * np.max(np.abs(value))
+        ):
+            value = np.nan * value
         found, above = {}, self.pose * self.poses[pose].inverse() if pose else None
         if (turn := self._attitude(form, value)) is not None:
             found[axes] = ((above.R @ turn if above else turn) @ PROBE_TURN).T
@@ -238,6 +247,26 @@ class _Body:
             is_other = np.arange(3) != "xyz".index(name[1])
             return np.asarray(sign * _shift(value) + is_other * self.pose.r)
         return sign * PLACES[name](value) if name in PLACES else None
+
+
+def _whole(form: str, value: Array) -> Array:
+    """What a matrix is by the entries that are read of it."""
+    name = form.removeprefix("-")
+    if name in ("skew", "S"):
+        return cross_matrix(_vector_of(value))
+    if name == "log":
+        return np.vstack([np.column_stack([cross_matrix(_vector_of(value)), value[:3, 3]]), np.zeros(4)])
+    turn = np.eye(3) if name[0] == "T" else value[:3, :3]
+    moves = float(name not in ("Rx", "Ry", "Rz"))
+    if len(value) == 4:
+        return homogeneous(turn, moves * value[:3, 3])
+    if len(value) == 6:
+        return plucker(turn, moves * _vector_of(value[3:, :3] @ turn.T))
+    if len(value) == 7:
+        whole = np.eye(7)
+        whole[:3, :3], whole[3:6, 6] = turn, value[3:6, 6]
+        return whole
+    return value
 
 
 def _shift(value: Array) -> Array:
@@ -267,8 +296,8 @@ ATTITUDES = _by_form(
     ("rpy", lambda x: turned(-x).T),
     ("zyz", lambda x: about(2, x[0]) @ about(1, x[1]) @ about(2, x[2])),
     ("H G", lambda x: x[:3, :3]),
-    ("X", lambda x: (x[:3, :3] + x[3:, 3:]) / 2),  # both blocks are the turn
-    ("XI", lambda x: (x[:3, :3] + x[3:, 3:]).T / 2),
+    ("X", lambda x: x[:3, :3]),
+    ("XI", lambda x: x[:3, :3].T),
 )
 PLACES = _by_form(
     ("r rp rxyzw rphi rxyz", lambda x: x[:3]),
@@ -324,20 +353,24 @@ def _bodies(state: State) -> list[_Body]:
 def _add_pose_answer(
     answer: Answer, function: tuple[str, str], call: PoseFunction, bodies: Callable[[], Sequence[_Body]]
 ) -> None:
-    """Call a function, whose name and forms are given, on all bodies."""
-    rows: dict[str, list[Array]] = {}
+    """Call a function, whose name and forms are given, on all bodies; average what says the same of one."""
+    rows = defaultdict[str, list[Array]](list)
     name, texts = function
-    for body, text in product(bodies(), texts.split("; ")):
-        given, _, returned = text.partition(" -> ")
-        forms = returned.split()
-        results = call(
-            name, [body.given(one) for one in given.split()], [form.removesuffix("+") for form in forms]
-        )
-        if forms[0].startswith("@"):
-            rate = body.given(forms.pop(0)[1:])
-            results = [np.reshape(results[0], (-1, len(rate))) @ rate]
-        for form, value in zip(forms, results, strict=True):
-            for quantity, vector in body.read(form, np.asarray(value, float)).items():
-                rows.setdefault(quantity, []).append(np.atleast_2d(vector))
+    for body in bodies():
+        own = defaultdict[str, list[Array]](list)
+        for text in texts.split("; "):
+            given, _, returned = text.partition(" -> ")
+            forms = returned.split()
+            results = call(
+                name, [body.given(one) for one in given.split()], [form.removesuffix("+") for form in forms]
+            )
+            if forms[0].startswith("@"):
+                rate = body.given(forms.pop(0)[1:])
+                results = [np.reshape(results[0], (-1, len(rate))) @ rate]
+            for form, value in zip(forms, results, strict=True):
+                for quantity, vector in body.read(form, np.asarray(value, float)).items():
+                    own[quantity].append(np.atleast_2d(vector))
+        for quantity, vectors in own.items():
+            rows[quantity].append(np.mean(vectors, axis=0))
     for quantity, vectors in rows.items():
         answer.setdefault(quantity, {})[name,] = np.concatenate(vectors)

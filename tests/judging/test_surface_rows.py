@@ -2,6 +2,7 @@
 
 import os
 import signal
+from copy import copy
 from dataclasses import replace
 from functools import partial
 
@@ -9,7 +10,7 @@ import numpy as np
 import pinocchio
 import pytest
 
-from adapters import mujoco_surface
+from adapters import exudyn_surface, mujoco_surface
 from plumbline.engines.engine_calls import Evaluation, evaluate_states, evaluate_variants, stack_answers
 from plumbline.engines.missing_names import FAILED_PARTS, IS_APART, add_parts
 from plumbline.engines.no_answer import NoAnswer
@@ -26,6 +27,7 @@ from plumbline.studies.exercised_names import exercised_names
 from plumbline.truth.ground_truth import StateTruth, state_truth
 from plumbline.truth.surface_truth import SURFACE_QUANTITIES, SurfaceTruth
 from tests.helpers.catalogue import catalogue_scenario, states_of
+from tests.helpers.planted_functions import LOOP_PLANTS, SURFACE_PLANTS, VARIANT_PLANTS, wrong_functions
 from tests.helpers.random_chains import tree_from_seed
 
 WHO = RowContext("s", "f", "e", "The engine", "0")
@@ -97,6 +99,81 @@ def test_every_call_agrees_and_a_relative_change_of_1e_6_is_seen(engine, given, 
     calls = {name for by_call in answers.values() for call in by_call for name in call}
     evaluation = Evaluation([], surface=answers)
     assert set(exercised_names(truth, evaluation)) == calls
+
+
+@pytest.fixture(scope="module")
+def red_surface_rows(tree, few_bodies):
+    """Return what lists the rows of an engine that do not agree."""
+
+    def red(engine):
+        model, states, truth = few_bodies if engine == "exudyn" else tree
+        found = verdicts(truth, answers_of(engine, model, states))
+        return {name for name, verdict in found.items() if verdict != Verdict.AGREES}
+
+    return red
+
+
+@pytest.mark.parametrize(
+    ("engine", "plants"),
+    [
+        pytest.param(engine, plants, id=f"{engine}-{'-'.join(plants)}")
+        for engine, some in SURFACE_PLANTS.items()
+        for plants in some
+    ],
+)
+def test_a_wrong_function_of_an_engine_is_seen(engine, plants, red_surface_rows):
+    with wrong_functions(engine, plants):
+        assert red_surface_rows(engine) - WRONG.get(engine, set())
+
+
+@pytest.fixture(scope="module")
+def moving_parts():
+    """Trees without loads and with elements, and a loop."""
+    bare = tree_from_seed(2, 3, ("hinge", "ball", "free"), loads=False)
+    sprung = tree_from_seed(2, 4, ("hinge", "slide", "ball"), elements=("stiffness", "damping", "effort"))
+    loop = catalogue_scenario("slider-crank")
+    states = [random_states(bare, 2, 2), random_states(sprung, 2, 2), states_of(loop, 2)[:1]]
+    models = bare, sprung, loop.model
+    return {
+        name: (model, own, state_truth(model, own))
+        for name, model, own in zip(("bare", "sprung", "loop"), models, states, strict=True)
+    }
+
+
+@pytest.mark.parametrize(
+    ("given", "name", "plants"),
+    [
+        pytest.param(given, name, plants, id=f"{name}-{'-'.join(plants)}-{number}")
+        for given, some in (("tree", VARIANT_PLANTS), ("loop", LOOP_PLANTS))
+        for number, (name, plants) in enumerate(some)
+    ],
+)
+def test_a_wrong_function_is_seen_by_the_variant_of_its_name(given, name, plants, moving_parts):
+    if given == "tree":
+        given = "bare" if name.startswith(("mjtDisableBit", "mjtSleep")) else "sprung"
+    model, states, truth = moving_parts[given]
+    adapter = copy(load_adapter("mujoco"))
+    adapter.variants = [one for one in adapter.variants if name in one.names]
+    assert_agree(rows_of_variants(truth, evaluate_variants(adapter, model, states)))
+    with wrong_functions("mujoco", plants):
+        rows = rows_of_variants(truth, evaluate_variants(adapter, model, states))
+    assert {row.verdict for row in rows} & {Verdict.DISAGREES, Verdict.FAILED}
+
+
+def test_exudyns_sum_of_two_sensors_tells_them_apart(few_bodies, monkeypatch):
+    model, states, truth = few_bodies
+    weighted = exudyn_surface.weighted_sum
+    exchanged = lambda mbs, t, sensors, *rest: weighted(mbs, t, sensors[::-1], *rest)  # noqa: E731
+    monkeypatch.setattr(exudyn_surface, "weighted_sum", exchanged)
+    assert verdicts(truth, answers_of("exudyn", model, states))["frame_velocity"] == Verdict.DISAGREES
+
+
+def test_what_exudyn_is_asked_once_is_asked_until_something_turns(few_bodies):
+    model, states, _ = few_bodies
+    still = replace(states[0], v=0 * states[0].v, omega=0 * states[0].omega, xdot=0 * states[0].xdot)
+    answers = load_adapter("exudyn").surface(model, [complete_state(model, still), *states[:2]])
+    asked = ["degrees_of_freedom" in answer for answer in answers]
+    assert asked == [True, True, False]
 
 
 def test_exudyns_solvers_and_items_are_compared_on_few_bodies(few_bodies):
