@@ -63,6 +63,7 @@ from numpy.typing import NDArray
 
 from adapters.mujoco_common import (
     add_actuator,
+    children_of,
     compiler_of,
     full_mass_matrix,
     member,
@@ -880,10 +881,11 @@ def _add_equalities(spec: Any, links: list[Any], constraints: _Constraints) -> N
         _add_tendon(spec, links, f"tie {i}", tie.bodies, tie.points)
         _add_equality(spec, "TENDON", f"tie {i}")
     for k, motions in enumerate(constraints.held):
+        joints = children_of(links[k], "joint") if motions else []
         for i in motions:
-            joint = set_attributes(links[k].joints[i], name=f"held {k} {i}")
+            joint = set_attributes(joints[i], name=f"held {k} {i}")
             if pitch := constraints.pitches[k]:  # slide = pitch × hinge
-                turn = set_attributes(links[k].joints[1 - i], name=f"turn {k}")
+                turn = set_attributes(joints[1 - i], name=f"turn {k}")
                 equality = _add_equality(spec, "JOINT", joint.name, turn.name)
                 equality.data[:5] = 0.0, pitch, 0.0, 0.0, 0.0
             else:

@@ -120,7 +120,7 @@ def test_memory_has_a_limit_of_its_own():
     with WorkerPool(1, limits) as pool:
         task = Task("memory", evaluate_states, (specification("memory"), MODEL, STATES), limits)
         (outcome,) = pool.run([task])
-    assert "MemoryError" in outcome.value.failure and "exited with code 1" in outcome.value.failure
+    assert "MemoryError" in (said := outcome.value.no_answer.message) and "exited with code 1" in said
 
 
 def test_a_program_that_does_not_exist_cannot_be_loaded():
