@@ -156,6 +156,7 @@ class PinocchioChain:
             append_parts(self.pin_model, joint, parts[k], self.placements[k])
             add_frame(self.pin_model, f"com {k}", joint, translation(self.placements[k].translation))
             self.body_joints.append(joint)
+        self._add_rotors()
         self.pin_model = change.remake(self.pin_model)
         self.com_frames = [self.pin_model.getFrameId(f"com {k}") for k in range(model.n)]
         self.renew_data()
@@ -218,8 +219,16 @@ class PinocchioChain:
         joint = joints[0] if len(joints) == 1 else composite(*joints)
         return self._add_joint(parent, joint, hang * far, f"body {k}")
 
+    def _add_rotors(self) -> None:
+        model = self.source_model
+        for kind, rotors, j in zip(model.kinds, model.armature, self.body_joints, strict=True):
+            if np.any(rotors):
+                joint = self.pin_model.joints[j]
+                own = rotors[: 1 if kind.is_spherical else joint.nv]
+                self.pin_model.armature[joint.idx_v : joint.idx_v + joint.nv] += own
+
     def _init_elements(self) -> None:
-        """Set the joints' rotors, dampers, springs and efforts, (nv,) each, and where springs read q."""
+        """Set the joints' dampers, springs and efforts, (nv,) each, and where springs read q."""
         model, nv = self.source_model, self.pin_model.nv
         self.damping, self.stiffness, self.effort, rest = np.zeros((4, nv))
         scalars: list[tuple[int, int]] = []  # places in q and in v
@@ -231,8 +240,6 @@ class PinocchioChain:
             joint = self.joints[row]
             is_ball = model.kinds[k].is_spherical
             at, own = slice(joint.idx_v, joint.idx_v + joint.nv), slice(1 if is_ball else joint.nv)
-            if np.any(model.armature[k, own]):
-                self.pin_model.armature[at] += model.armature[k, own]
             self.damping[at], self.effort[at] = model.damping[k, own], model.effort[k, own]
             self.stiffness[at] = model.stiffness[k, own]
             if not is_ball:
