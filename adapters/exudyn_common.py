@@ -66,7 +66,7 @@ class ExudynAdapter(MetamorphicHooks):
     """Declarations common to all columns of Exudyn."""
 
     package = "exudyn"
-    supported_versions = ">=1.7,<2"
+    supported_versions = ">=1.7,<2"  # of 1.7 states only: it cannot call a function after each step
     extra_requirements = (("<1.9", "numpy<2"),)  # beside NumPy 2 every array reads as zeros
 
     def version(self) -> str:

@@ -209,8 +209,9 @@ def _add_started_bodies(s: _Items) -> None:
     first, then = (rotation_matrix(quaternion_exponential(0.3 * axis)) for axis in AXES[:2])
     call, bodies, attitude = "MainSystem.CreateRigidBody", [], first @ then
     for one in s.bodies:
-        given = {"referencePosition": one.place / 2, "initialDisplacement": one.place / 2}
-        given |= {"referenceRotationMatrix": first, "initialRotationMatrix": then}
+        # lists, as 1.7 and 1.8 ask whether these are None by !=
+        given = {"referencePosition": one.place / 2, "initialDisplacement": (one.place / 2).tolist()}
+        given |= {"referenceRotationMatrix": first, "initialRotationMatrix": then.tolist()}
         given |= {"initialVelocity": one.velocity, "initialAngularVelocity": one.spin}
         inertia = utilities.RigidBodyInertia(one.mass, AXES)
         bodies.append(s.mbs.CreateRigidBody(**given, inertia=inertia))

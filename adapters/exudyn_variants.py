@@ -182,7 +182,10 @@ def _made(owner: str, name: str, given: str, turn: Float[Array, "3 3"] | None = 
             return mbs.AddObject(getattr(items, name)(**own))
         if owner == "rigidBodyUtilities":
             own["mbs"] = mbs
-        made = getattr(utilities if "mbs" in own else mbs, name)(**own)
+        create = getattr(utilities if "mbs" in own else mbs, name)
+        if "bodyNumbers" in own:
+            own |= items_argument(create, own.pop("bodyNumbers"))
+        made = create(**own)
         return made[0] if isinstance(made, list | tuple) else made  # of older versions with its markers
 
     return add

@@ -103,7 +103,14 @@ from plumbline.model.datatypes import (
     Trajectory,
     Unsupported,
 )
-from plumbline.model.loops import PER_BODY, STABILISATION, cut_open, determinate_part, wrench_length
+from plumbline.model.loops import (
+    PER_BODY,
+    STABILISATION,
+    cut_open,
+    determinate_part,
+    motion_without_inertia,
+    wrench_length,
+)
 from plumbline.model.redescription import (
     HELD_KINDS,
     PITCHED_KINDS,
@@ -120,6 +127,9 @@ DENSE, TENDONS, HELD = "dense mass matrix", "tendon equalities", "joint equaliti
 TENDON_MOTIONS = (
     "motions on tendons are not compared: their equality lacks J̇ q̇, so that they stretch; the lack itself is "
     "computed and compared at states"
+)
+SINGULAR = (
+    "MuJoCo solves for constraints with the mass matrix of the tree that they hold: here it is singular"
 )
 SOFTNESS = ("body_invweight0", "dof_invweight0", "tendon_invweight0")  # R is proportional to
 JOINT_TYPES = {"turn": mujoco.mjtJoint.mjJNT_HINGE, "slide": mujoco.mjtJoint.mjJNT_SLIDE}
@@ -143,7 +153,7 @@ NO_SAME_FRAME = 0  # mjSAMEFRAME_NONE; the first versions have no enumeration
 MAX_ORDER_ERROR = 0.1
 MIN_SOFTNESS = 1e-9  # a smaller relative effect of R is rounding
 MAX_NOISE = 1e-11  # relative, of differences that grow as R falls: more is too much to extrapolate
-ROD_AXIAL_INERTIA = 0.01  # J_z of a rod over the mean principal inertia of the body that it carries
+ROD_AXIAL_INERTIA = 0.01 / 3  # J_z of a rod over `kinematics.rod_inertias`
 UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])
 Run = tuple[Array, Integrator, float]  # times, and by what step
 Turned = tuple[Array, Array]  # a vector, and the quaternion of axes
@@ -158,7 +168,7 @@ HOLDING: Any = {
 def _euler(implicit_forces: Literal["joint dampers", "applied", "all"], note: str) -> Any:
     """An integrator of order 1."""
     method = JointSpaceMethod(
-        "semi-implicit Euler", "joint rotations", ROD_AXIAL_INERTIA / 3, implicit_forces=implicit_forces,
+        "semi-implicit Euler", "joint rotations", ROD_AXIAL_INERTIA, implicit_forces=implicit_forces,
         **HOLDING,
     )  # fmt: skip
     return {"order": 1, "error_exponents": (1, 2, 3, 4, 5, 6), "note": note, "method": method}
@@ -186,7 +196,7 @@ class Mujoco(MetamorphicHooks):
             4,
             (4, 5, 6, 7, 8),
             note="classical Runge–Kutta on the rotation group",
-            method=classical_runge_kutta("joint rotations", ROD_AXIAL_INERTIA / 3, **HOLDING),
+            method=classical_runge_kutta("joint rotations", ROD_AXIAL_INERTIA, **HOLDING),
         ),
     )
     options = loop_options = (DENSE,)
@@ -197,6 +207,7 @@ class Mujoco(MetamorphicHooks):
     gaps: ClassVar[Mapping[str, str]] = {
         "mass_matrix": "MuJoCo holds the pitch of a joint by an equality of a slide and a hinge: its mass "
         "matrix has both",
+        "turns without inertia": SINGULAR,
     }
     builds_trees = builds_elements = moves_loops = True
     welding_unsupported_reason = ""
@@ -403,7 +414,7 @@ class _MujocoChain:
         for k, (kind, far) in enumerate(zip(model.kinds, model.body[:, 0], strict=True)):
             parent, hang = links[far] if far >= 0 else spec.worldbody, model.point[k, 0]
             if kind.holds_distance:
-                axial = np.array([0, 0, ROD_AXIAL_INERTIA * _principal_inertia(model.inertia[k])[0].mean()])
+                axial = np.array([0, 0, ROD_AXIAL_INERTIA * kinematics.rod_inertias(model)[k]])
                 parent = self._add_body(parent, (hang, UNTURNED), 0.0, (axial, UNTURNED), np.zeros(3))
                 hang = np.array([0, 0, -model.length[k]])
             pieces = (parts or undivided_bodies(model))[k]
@@ -749,11 +760,13 @@ class _Mechanism:
         return other
 
     def state(self, state: State) -> State:
-        """The state of the tree."""
+        """The state of the tree; refused where MuJoCo cannot solve for what holds it."""
         there = self.rodless.state(state) if self.rodless else state
         there = self.cut.state(there)
         if self.tree.model.kind != self.opened.kind:
             there = state_of_cylinders(self.opened, self.tree.model, there)
+        if motion_without_inertia(self.tree.model, there) is not None:
+            raise Unsupported(SINGULAR, "turns without inertia")
         return there
 
     def places(self) -> tuple[Int[Indices, "bodies"], Int[Indices, "joints"]]:
@@ -912,10 +925,11 @@ def _add_equalities(spec: Any, links: list[Any], constraints: _Constraints) -> N
         _add_tendon(spec, links, f"tie {i}", tie.bodies, tie.points)
         _add_equality(spec, "TENDON", f"tie {i}")
     for k, motions in enumerate(constraints.held):
+        joints = children_of(links[k], "joint") if motions else []
         for i in motions:
-            joint = set_attributes(links[k].joints[i], name=f"held {k} {i}")
+            joint = set_attributes(joints[i], name=f"held {k} {i}")
             if pitch := constraints.pitches[k]:  # slide = pitch × hinge
-                turn = set_attributes(links[k].joints[1 - i], name=f"turn {k}")
+                turn = set_attributes(joints[1 - i], name=f"turn {k}")
                 equality = _add_equality(spec, "JOINT", joint.name, turn.name)
                 equality.data[:5] = 0.0, pitch, 0.0, 0.0, 0.0
             else:

@@ -64,6 +64,14 @@ def append_parts(pin_model: pin.Model, joint: int, parts: tuple[RigidPart, ...],
         pin_model.appendBodyToJoint(joint, inertia, placement * translation(part.centre))
 
 
+def field_of(data: Any, name: str) -> Any:
+    """Return a field; one whose type is unknown to Python in the engine's version is a missing name."""
+    try:
+        return getattr(data, name)
+    except TypeError as error:
+        raise AttributeError(str(error), name=name, obj=data) from error
+
+
 def composite(*joints: Any) -> pin.JointModelComposite:
     """Make one joint of several.
 

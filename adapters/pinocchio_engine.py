@@ -79,6 +79,7 @@ from plumbline.model.datatypes import (
     StateQuantities,
     SurfaceAnswer,
     Trajectory,
+    Unsupported,
 )
 from plumbline.model.kinematics import (
     cross_matrix,
@@ -89,15 +90,16 @@ from plumbline.model.kinematics import (
     quaternion_product,
     quaternion_rate,
     remembered_velocity_jacobian,
+    rod_inertias,
     rotation_matrix,
     rotation_vector,
     turn_of_z,
 )
-from plumbline.model.loops import STABILISATION, CutMechanism, cut_open
+from plumbline.model.loops import STABILISATION, CutMechanism, cut_open, motion_without_inertia
 from plumbline.model.step_methods import SERIES_TURN, JointSpaceMethod, classical_runge_kutta
 from plumbline.model.welding import BodyParts, undivided_bodies
 
-ROD_AXIAL_INERTIA = 1 / 3  # of a rod about its own axis, over the trace of the inertia that it carries
+ROD_AXIAL_INERTIA = 1 / 3  # of a rod about its own axis, over `rod_inertias`
 # Of steps: coordinates of joints, and of free bodies and of gaps of loops.
 ROTATIONS: tuple[Literal["joint rotations"], float] = "joint rotations", ROD_AXIAL_INERTIA
 # exp3 and exp6 take series below the same turn.
@@ -154,6 +156,7 @@ class PinocchioChain:
             append_parts(self.pin_model, joint, parts[k], self.placements[k])
             add_frame(self.pin_model, f"com {k}", joint, translation(self.placements[k].translation))
             self.body_joints.append(joint)
+        self._add_rotors()
         self.pin_model = change.remake(self.pin_model)
         self.com_frames = [self.pin_model.getFrameId(f"com {k}") for k in range(model.n)]
         self.renew_data()
@@ -216,8 +219,16 @@ class PinocchioChain:
         joint = joints[0] if len(joints) == 1 else composite(*joints)
         return self._add_joint(parent, joint, hang * far, f"body {k}")
 
+    def _add_rotors(self) -> None:
+        model = self.source_model
+        for kind, rotors, j in zip(model.kinds, model.armature, self.body_joints, strict=True):
+            if np.any(rotors):
+                joint = self.pin_model.joints[j]
+                own = rotors[: 1 if kind.is_spherical else joint.nv]
+                self.pin_model.armature[joint.idx_v : joint.idx_v + joint.nv] += own
+
     def _init_elements(self) -> None:
-        """Set the joints' rotors, dampers, springs and efforts, (nv,) each, and where springs read q."""
+        """Set the joints' dampers, springs and efforts, (nv,) each, and where springs read q."""
         model, nv = self.source_model, self.pin_model.nv
         self.damping, self.stiffness, self.effort, rest = np.zeros((4, nv))
         scalars: list[tuple[int, int]] = []  # places in q and in v
@@ -229,8 +240,6 @@ class PinocchioChain:
             joint = self.joints[row]
             is_ball = model.kinds[k].is_spherical
             at, own = slice(joint.idx_v, joint.idx_v + joint.nv), slice(1 if is_ball else joint.nv)
-            if np.any(model.armature[k, own]):
-                self.pin_model.armature[at] += model.armature[k, own]
             self.damping[at], self.effort[at] = model.damping[k, own], model.effort[k, own]
             self.stiffness[at] = model.stiffness[k, own]
             if not is_ball:
@@ -693,8 +702,8 @@ def _pull(place: pin.SE3) -> Float[Array, "6 3"]:
 
 
 def _axial_inertia(model: Model, k: int) -> Float[Array, "3 3"]:
-    """Return that of the rod that carries body k: any does; this one keeps its size when units change."""
-    return np.diag([0.0, 0.0, ROD_AXIAL_INERTIA * np.trace(model.inertia[k])])
+    """Return that of the rod that carries body k."""
+    return np.diag([0.0, 0.0, ROD_AXIAL_INERTIA * rod_inertias(model)[k]])
 
 
 def _placed(placement: pin.SE3) -> tuple[Array, Array]:
@@ -779,6 +788,17 @@ class Pinocchio(PinocchioAdapter):
     variants = VARIANTS
     column_names = COLUMN_NAMES
     usual_algorithm: ClassVar[str] = "crba"  # for the accelerations of state evaluation
+    gaps: ClassVar[Mapping[str, str]] = {
+        "turns without inertia": "Pinocchio solves for constraints with the mass matrix of the tree that "
+        "they hold: here it is singular"
+    }
+
+    def _opened(self, cut: CutMechanism, state: State) -> State:
+        """The state of the tree; refused where Pinocchio cannot solve for what closes its loops."""
+        there = cut.state(state)
+        if cut.ends and motion_without_inertia(cut.model, there) is not None:
+            raise Unsupported(self.gaps["turns without inertia"], "turns without inertia")
+        return there
 
     def _built(self, model: Model, algorithm: str, change: Change = Change()) -> Built:  # noqa: B008
         """Build a mechanism, with its loops cut open."""
@@ -791,13 +811,13 @@ class Pinocchio(PinocchioAdapter):
         cut, chain = self._built(model, self.option or self.usual_algorithm, change)
         if change.joints:
             return [_SpelledTree(chain, change, state).quantities(state) for state in states]
-        return [cut.source_quantities(chain.quantities(cut.state(state))) for state in states]
+        return [cut.source_quantities(chain.quantities(self._opened(cut, state))) for state in states]
 
     def written(self, model: Model, state: State, moves: bool = False) -> dict[str, Any]:
         """Return the numbers of the engine's model at a state, see `PinocchioChain.written`."""
         algorithm = "aba" if moves and not model.has_loops else self.option or self.usual_algorithm
         cut, chain = self._built(model, algorithm)
-        found = chain.written(cut.state(state))
+        found = chain.written(self._opened(cut, state))
         found["fields"] |= {"bodies": cut.place[: model.n], "joints": cut.place}
         return found
 
@@ -843,7 +863,7 @@ class Pinocchio(PinocchioAdapter):
         cut, chain = self._built(model, "crba" if integrator.kind == "tolerance" else "aba")
         for weld in chain.welds:
             set_corrector(weld, STABILISATION)
-        start = chain.coordinates(cut.state(state))
+        start = chain.coordinates(self._opened(cut, state))
         if integrator.kind == "tolerance":
             return cut.source_run(chain.trajectory(times, *dop853(chain, *start, times, resolution)))
         step = FIXED_STEPS[integrator.name]

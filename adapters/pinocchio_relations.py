@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from adapters.pinocchio_common import armature, axis_of, rebuilt
+from adapters.pinocchio_common import armature, axis_of, field_of, rebuilt
 from adapters.pinocchio_probes import Probed
 from plumbline.engines.missing_names import add_parts
 from plumbline.model.datatypes import Array
@@ -216,10 +216,11 @@ def _add_body_forces(s: Probed) -> None:
     m, data, coriolis = s.m, s.workspace(), s.workspace()
     pin.computeRNEADerivatives(m, data, s.q, s.v, s.a)
     pin.computeCoriolisMatrix(m, coriolis, s.q, s.v)
-    own = [np.array(x) for x in coriolis.B]
+    shared = field_of(coriolis, "B")
+    own = [np.array(x) for x in shared]
     for j in range(m.njoints - 1, 0, -1):
         if m.parents[j]:
-            own[m.parents[j]] = own[m.parents[j]] - np.array(coriolis.B[j])
+            own[m.parents[j]] = own[m.parents[j]] - np.array(shared[j])
     forces = []
     for j, place in zip(s.joints, s.places, strict=True):
         force = data.oMi[j].act(m.inertias[j]) * data.oa_gf[j] + pin.Force(own[j] @ data.ov[j].vector)

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from adapters.pinocchio_common import axis_of, composite, joint_of, parts_of
+from adapters.pinocchio_common import armature, axis_of, composite, joint_of, parts_of
 from plumbline.engines.variants import Suits, Variant, has, variants_of
 from plumbline.model.datatypes import Array, Float, Model
 
@@ -138,21 +138,22 @@ def _saved(form: str, end: str) -> Callable[[pin.Model], pin.Model]:
 
 
 def _with_locked_joint(model: pin.Model) -> pin.Model:
-    """Add a joint that carries nothing, and lock it; the others keep their rotors, which are taken off."""
+    """Add a joint that carries nothing, and lock it; the others keep larger rotors, which are taken off."""
     other = model.copy()
     joint = other.addJoint(other.njoints - 1, pin.JointModelRY(), pin.SE3.Identity(), "locked")
     other.addJointFrame(joint, 0)
-    rotors = 1.0 + np.arange(model.nv)
+    rotors = model.armature + 1.0 + np.arange(model.nv)
     other.armature = np.append(rotors, 0.0)
     reduced = pin.buildReducedModel(other, [joint], pin.neutral(other))
-    reduced.armature = reduced.armature - rotors
+    reduced.armature = (reduced.armature - rotors) + model.armature  # without rounding where all are kept
     return reduced
 
 
 def _appended(model: pin.Model) -> pin.Model:
     """Append the model to one without joints."""
     other = pin.appendModel(pin.Model(), model, 0, pin.SE3.Identity())
-    other.gravity = model.gravity  # which it does not take over (docs/surface/pinocchio_append_model.py)
+    # which it does not take over (docs/surface/pinocchio_append_model.py)
+    other.gravity, other.armature = model.gravity, armature(model)
     return other
 
 
@@ -177,7 +178,7 @@ def _appended_to_first(model: pin.Model) -> pin.Model:
     for frame in list(model.frames)[1:]:
         rest.addFrame(pin.Frame(frame.name, joint_of(frame) - 1, 0, frame.placement, frame.type))
     whole = pin.appendModel(first, rest, place, pin.SE3.Identity())
-    whole.gravity = model.gravity  # as above
+    whole.gravity, whole.armature = model.gravity, armature(model)  # as above
     return whole
 
 

@@ -1,7 +1,7 @@
 """Exudyn: CreateRigidBody converts the initial angular velocity with the reference attitude.
 
 A body that starts at another attitude than that of its reference, by initialRotationMatrix, has another
-angular velocity than the one that is given in the world.
+angular velocity than the one that is given in the world.  Before 1.9 it has another attitude, too.
 """
 
 import exudyn as exu
@@ -16,7 +16,7 @@ def started(turn):
     container = exu.SystemContainer()
     mbs = container.AddSystem()
     body = mbs.CreateRigidBody(
-        initialRotationMatrix=turn,
+        initialRotationMatrix=turn.tolist(),  # 1.7 and 1.8 take no array
         initialAngularVelocity=GIVEN,
         inertia=RigidBodyInertia(1.0, np.eye(3)),
     )

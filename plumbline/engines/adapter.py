@@ -77,6 +77,7 @@ MODEL_GAPS: Mapping[str, Callable[[Model], bool]] = {
     "pitches": lambda model: any(kind.has_pitch for kind in model.kinds),
     "universal springs": lambda model: _has_elements(model, _TWO_TURNS, "stiffness"),
     "point masses": lambda model: model.lacks_inertia,
+    "turns without inertia": lambda model: model.lacks_inertia,
     "bodies": lambda model: model.n > 1,
     "angles": lambda model: any(kind.has_attitude for kind in model.kinds),
     "elements": lambda model: model.has_elements,
@@ -86,7 +87,8 @@ MODEL_GAPS: Mapping[str, Callable[[Model], bool]] = {
 }
 # What columns without `builds_trees` cannot express.
 TREE_GAPS = "point masses", "elements", "other joints", "branches", "pivots"
-PARTIAL_GAPS = {"bodies", "angles"}  # of some such mechanisms, which the adapter refuses itself
+# Of some such mechanisms, which the adapter refuses itself.
+PARTIAL_GAPS = {"bodies", "angles", "turns without inertia"}
 
 
 @dataclass(frozen=True)

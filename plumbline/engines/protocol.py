@@ -80,7 +80,8 @@ class Hello:
     integrators: tuple[IntegratorAnswer, ...] = ()
     # what of these it builds; a mechanism with another is not sent
     has: tuple[Literal["trees", "loads", "elements", "loops", "loop motions"], ...] = ()
-    # further gaps: a key of `MODEL_GAPS` or `UNSUPPORTED_KINDS`, and the reason in a sentence
+    # further gaps, each with the reason in a sentence: a key of `MODEL_GAPS` or `UNSUPPORTED_KINDS`, or a
+    # quantity that some mechanisms lack
     gaps: Mapping[str, str] = field(default_factory=dict)
     # `joint_acceleration` of balls: ω̇′, or the rate of the relative angular velocity in near or far axes
     ball_rates: BallRates = "body"
@@ -245,6 +246,7 @@ class ServedEngine(Adapter):
         described = to_json(model)
         name = hashlib.sha256(json.dumps(described).encode()).hexdigest()[:16]
         if program.model_id != name:
+            program.model_id = ""  # it may keep a mechanism that it refuses
             program.ask({"ask": "model", "model_id": name, "model": described})
             program.model_id = name
         return program.ask({**question, "model_id": name})
@@ -341,6 +343,9 @@ def served_engine(command: Sequence[str], variables: Mapping[str, str]) -> Serve
     if not hello.integrators:
         gaps["integrators"] = f"{title} evaluates states and does not simulate"
     gaps |= {"joints": f"{title} builds other kinds of joints", **hello.gaps}
+    # A quantity that it returns is a gap of some mechanisms only.
+    never = {*UNSUPPORTED_KINDS} - {*hello.quantities}
+    unsupported = {name: why for name, why in gaps.items() if name in never}
     declared = {
         "command": tuple(command),
         "variables": dict(variables),
@@ -349,10 +354,8 @@ def served_engine(command: Sequence[str], variables: Mapping[str, str]) -> Serve
         "title": title,
         "package": hello.name,
         "integrators": tuple(Integrator(**vars(one)) for one in hello.integrators),
-        "unsupported": {name: why for name, why in gaps.items() if name in UNSUPPORTED_KINDS},
-        "gaps": {
-            name: why for name, why in gaps.items() if name in MODEL_GAPS or name not in UNSUPPORTED_KINDS
-        },
+        "unsupported": unsupported,
+        "gaps": {name: why for name, why in gaps.items() if name in MODEL_GAPS or name not in unsupported},
         "is_lifted": "joint_acceleration" in hello.quantities,
         "builds_trees": "trees" in hello.has,
         "builds_elements": "elements" in hello.has,

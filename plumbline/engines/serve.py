@@ -36,7 +36,7 @@ class _Server:
             "loops": loops,
             "loop motions": adapter.moves_loops,
         }
-        names = IntegratorAnswer.__dataclass_fields__
+        names, keys = IntegratorAnswer.__dataclass_fields__, {*MODEL_GAPS, *UNSUPPORTED_KINDS, *QUANTITIES}
         return {
             "protocol": max({*VERSIONS} & {*question["protocols"]}, default=VERSIONS[0]),
             "name": adapter.name,
@@ -46,7 +46,7 @@ class _Server:
             "quantities": [name for name in QUANTITIES if name not in adapter.unsupported],
             "integrators": [{name: getattr(one, name) for name in names} for one in adapter.integrators],
             "has": [name for name, is_there in has.items() if is_there],
-            "gaps": {k: why for k, why in gaps.items() if k in MODEL_GAPS or k in UNSUPPORTED_KINDS},
+            "gaps": {name: why for name, why in gaps.items() if name in keys},
         }
 
     def echo(self, question: Message) -> Message:

@@ -553,6 +553,15 @@ def velocity_jacobian(model: Model, state: State) -> Float[Array, "... rows nu"]
 remembered_velocity_jacobian = lru_cache(maxsize=64)(velocity_jacobian)
 
 
+def rod_inertias(model: Model) -> Float[Array, "bodies"]:
+    """Return what the axial inertia of a rod is a share of [kg m²]: positive, also below a point mass.
+
+    tr J + m ℓ² of the body that hangs by it, which keeps its size when units change.
+    """
+    of_joints = model.mass * model.length[: model.n] ** 2
+    return np.asarray(np.trace(model.inertia, axis1=1, axis2=2) + of_joints)
+
+
 def mass_matrix(model: Model, state: State) -> Float[Array, "... nu nu"]:
     """Return M = Wᵀ diag(m_k I, J_k) W with W of `velocity_jacobian`: the kinetic energy is ½ νᵀ M ν.
 

@@ -41,8 +41,8 @@ class JointSpaceMethod:
 
     formula: Literal["semi-implicit Euler", "positions first", "velocity Verlet", "Runge-Kutta"]
     coordinates: Literal["joint rotations", "joint angles"]
-    # A rod's inertia about its own axis over the trace of the inertia that it carries. It changes no motion,
-    # but a step: relative rates on a rod give it an axial spin of O(h²).
+    # A rod's inertia about its own axis over `rod_inertias`. It changes no motion, but a step: relative rates
+    # on a rod give it an axial spin of O(h²).
     rod_axial_inertia: float = 1.0
     # forces in D: dampers of joints; drag and all dampers; all forces, Coriolis terms included
     implicit_forces: Literal["none", "joint dampers", "applied", "all"] = "none"

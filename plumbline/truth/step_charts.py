@@ -38,6 +38,7 @@ from plumbline.model.kinematics import (
     quaternion_conjugate,
     quaternion_exponential,
     quaternion_product,
+    rod_inertias,
     rotate_vectors,
     rotation_matrix,
     rotation_vector,
@@ -435,7 +436,7 @@ class StepCharts:
         """Return the inertia of rod k about itself, of which only relative rotations take account."""
         if self.method.coordinates == "joint angles":
             return LongDouble(0)
-        return LongDouble(self.method.rod_axial_inertia) * np.trace(self.model.inertia[k].astype(LongDouble))
+        return LongDouble(self.method.rod_axial_inertia) * LongDouble(rod_inertias(self.model)[k])
 
     def _on_one_path(self) -> Array:
         """(nv, nv) whether a branch of the tree has both coordinates: the sparsity of M."""

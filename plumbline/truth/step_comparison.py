@@ -37,6 +37,7 @@ from plumbline.model.kinematics import (
     bodies_beyond,
     complete_state,
     cross,
+    rod_inertias,
     rotate_vectors,
     rotation_matrix,
     stack_states,
@@ -495,8 +496,8 @@ def _passed_on(
         for x in (sizes["angular_acceleration"], sizes["acceleration"] * (slides @ path > 0))
     )
     if method.coordinates == "joint rotations":
-        axial = method.rod_axial_inertia * np.trace(model.inertia, axis1=1, axis2=2)
-        # bodies on rods have inertia; of others there is no torque here
+        axial = method.rod_axial_inertia * rod_inertias(model)
+        # of other joints there is no torque here
         above = above + np.divide(torque, axial, out=np.zeros_like(torque), where=torque > 0)
     leaked, passed = (count * np.minimum(1.0, h * W) * (x @ path.T) for x in (above, shifted))
     return {"step_rate": leaked, "step_velocity": leaked * _arms(model, sizes) + passed}

@@ -7,11 +7,12 @@ import pytest
 
 from plumbline.engines.registry import load_adapter
 from plumbline.model.datatypes import KINDS, EngineFailure, Unsupported
-from plumbline.model.loops import assembled, cut_open, loop_gaps
+from plumbline.model.loops import assembled, cut_open, loop_gaps, motion_without_inertia
 from plumbline.model.random_mechanisms import LOOP_KINDS, random_loop_mechanism
 from plumbline.model.sampling import random_loop_states
 from plumbline.truth.certified_state import certify_state
 from plumbline.truth.rounding_bound import state_rounding_bound
+from tests.helpers.catalogue import catalogue_scenario
 from tests.helpers.nightly_tests import SLOW
 from tests.helpers.planting import number_change, turned_by
 from tests.helpers.shared_answers import sharing
@@ -107,6 +108,23 @@ def test_a_fault_in_a_loop_is_seen(engine, fault):
     except EngineFailure:  # the loop cannot be closed
         return
     assert_reported(found, truth, bound)
+
+
+@pytest.mark.parametrize("engine", [engine for engine in ENGINES if engine != "pinocchio-maximal"])
+def test_a_cut_that_lets_a_point_turn_is_refused(engine):
+    """A rocker that is a point where it is hinged, and has its inertia from the loop."""
+    s = catalogue_scenario("four-bar")
+    model = replace(s.model, inertia=s.model.inertia * np.array([1.0, 1.0, 0.0])[:, None, None])
+    model.point[2, 1] = 0.0
+    state, adapter = assembled(model, s.state), load_adapter(engine)
+    assert motion_without_inertia(model, state) is None
+    if engine in ("mujoco", "pinocchio"):
+        with pytest.raises(Unsupported) as refusal:
+            adapter.evaluate(model, [state])
+        assert refusal.value.gap in adapter.gaps
+        return
+    (found,) = adapter.evaluate(model, [state])
+    assert_within_bound(found, certify_state(model, state).quantities, state_rounding_bound(model, state))
 
 
 def test_the_parts_of_a_cut_body_add_up_to_it():

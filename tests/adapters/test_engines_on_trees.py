@@ -67,6 +67,37 @@ def test_bodies_without_inertia_are_right_where_they_are_determinate(engine):
     assert compared >= 3
 
 
+@pytest.mark.parametrize("engine", [engine for engine in ENGINES if engine != "pinocchio-maximal"])
+def test_a_rod_that_ends_in_a_point_which_carries_a_body_is_right(engine):
+    alone = tree_from_seed(0, 2, ("weld",))
+    inertia = alone.inertia * np.array([0.0, 1.0])[:, None, None]
+    joints = {"kind": ("rod", "weld"), "body": np.array([[-1, 0], [0, 1]]), "length": np.array([0.5, 0.0])}
+    model = replace(alone, inertia=inertia, **joints)
+    model.point[0, 1] = 0.0  # the rod ends where the mass is
+    (state,) = random_states(model, 1, 0)
+    assert motion_without_inertia(model, state) is None
+    (found,) = load_adapter(engine).evaluate(model, [state])
+    truth, bound = certify_state(model, state).quantities, state_rounding_bound(model, state)
+    assert_within_bound(found, truth, bound)
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "pinocchio"])
+def test_a_screw_through_a_point_is_refused_where_it_is_a_slide_and_a_turn(engine):
+    model = tree_from_seed(0, 1, ("helical",))
+    model = replace(model, inertia=0 * model.inertia)
+    model.point[0, 1] = 0.0
+    (state,) = random_states(model, 1, 0)
+    adapter = load_adapter(engine)
+    if engine == "mujoco":
+        with pytest.raises(Unsupported) as refusal:
+            adapter.evaluate(model, [state])
+        assert refusal.value.gap in adapter.gaps
+        return
+    (found,) = adapter.evaluate(model, [state])
+    truth = certify_state(model, state).quantities
+    np.testing.assert_allclose(found.acceleration, truth.acceleration, rtol=1e-12)
+
+
 def test_a_turn_without_inertia_is_found():
     model = without_inertia(1)
     (state,) = random_states(model, 1, 1)

@@ -45,6 +45,27 @@ def by(algorithm):
 
 
 @in_engine_process
+def test_rotors_that_a_copy_of_the_model_loses_are_seen():
+    s, engine = catalogue_scenario("furuta-motor"), Pinocchio()
+    (copying,) = (variant for variant in engine.variants if variant.names == ("Model.copy",))
+
+    def mass_matrix(remake):
+        change = replace(copying.change, remake=remake)
+        other = engine.with_variant(replace(copying, change=change))
+        return other.evaluate(s.model, [s.state])[0].mass_matrix
+
+    def without_rotors(model):
+        other = model.copy()
+        other.armature = 0 * model.armature
+        return other
+
+    lost = mass_matrix(copying.change.remake) - mass_matrix(without_rotors)
+    rotors = s.model.armature[:, 0]
+    assert np.any(rotors)
+    np.testing.assert_allclose(lost, np.diag(rotors), rtol=0, atol=1e-14)
+
+
+@in_engine_process
 def test_aba_loses_the_symmetry_of_articulated_inertias():
     """A finding about pin: if this fails, its aba got better; then crba can leave the adapter's docstring."""
     error, asymmetry = {}, {}

@@ -148,7 +148,8 @@ def answer(question):
             return {"values": [x * (1 + 2**-52) if LIE == "rounded" and x < 1 else x for x in values]}
         case "model":
             model.update(question["model"])
-            return {}
+            is_refused = LIE == "refusal of one body" and len(model["mass"]) == 1
+            return {"unsupported": "not one body"} if is_refused else {}
         case "simulate":
             return simulate(question)
     misbehave(question)
