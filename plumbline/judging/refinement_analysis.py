@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,6 +12,7 @@ from plumbline.engines.engine_calls import RefinementRun
 from plumbline.judging.rows import RowContext, Verdict, first_decided
 from plumbline.measurements.order_and_limit import (
     ORDER_MARGIN,
+    ROUNDING_FLOOR_FACTOR,
     ExtrapolatedLimit,
     ObservedOrder,
     max_norm,
@@ -29,7 +31,7 @@ from plumbline.model.invariants import (
     motion_scales,
 )
 from plumbline.model.kinematics import angular_velocity
-from plumbline.truth.ground_truth import RUN_ROUNDING, MotionTruth
+from plumbline.truth.ground_truth import DETECTABLE_PARAMETER_ERROR, RUN_ROUNDING, MotionTruth
 
 
 class WindowVerdict(NamedTuple):
@@ -196,6 +198,8 @@ class RefinementAnalysis:
         for number in self.window_lengths(self.horizon):
             floor = float(self.rounding[number - 1] / 8)  # trials found 115 ε G at most, an eighth of it
             order = observed_order([y[:number] for y in self.scaled_states], floor, self.integrator.order)
+            if ROUNDING_FLOOR_FACTOR * floor > DETECTABLE_PARAMETER_ERROR:  # it hides mistakes too
+                order = replace(order, is_at_rounding_floor=False)
             tried.append((order, float(self.times[number - 1])))
             is_high = order.value is not None and order.value > self.integrator.order + ORDER_MARGIN
             if order.is_at_rounding_floor or (order.is_asymptotic and not is_high):
