@@ -66,9 +66,10 @@ def _invariant_row(study: RefinementAnalysis, quantity: str, unit: str, samples:
         tolerance = limit.uncertainty + floor + uncertainty
     except ValueError as error:
         failure = str(error)
-    if drift[end] <= floor:
+    allowed = min(floor, DETECTABLE_PARAMETER_ERROR * scale)  # step control may accept more
+    if drift[end] <= allowed:
         reason = f"{name} {with_unit(drift[end], unit)}: rounding"
-        return row(Verdict.AGREES, reason, end, floor, limit_tolerance=tolerance[end])
+        return row(Verdict.AGREES, reason, end, allowed, limit_tolerance=tolerance[end])
     if failure:
         return row(Verdict.UNRESOLVED, failure, end, floor)
     limit_drift = np.maximum.accumulate(np.max(np.linalg.norm(limit.y, axis=-1), axis=1))

@@ -311,9 +311,12 @@ def test_a_method_with_a_tolerance_has_no_order_and_its_tightest_run_is_the_limi
     irregular = (1e-7, 5e-8, 4.9e-8, 1e-9, 9e-10, 0)  # no order of any kind
     off = judged_rows(refinement_study([1e-6 + e for e in irregular]), method)["position_limit"]
     assert off.verdict == "disagrees", "trusted without any order"
-    floor = found["energy_drift"]
-    each = ROUNDING_PER_STEP + STEPS[-1]
-    assert floor.tolerance == pytest.approx(each * 100 * floor.extra["scale"], rel=1e-12)
+    still = trajectory_with_error(0.0)
+    tight = RefinementStudy([RefinementRun(rtol, still) for rtol in (1e-5, 1e-7)])
+    floor = judged_rows(tight, method)["energy_drift"]
+    assert floor.tolerance == pytest.approx(
+        (ROUNDING_PER_STEP + 1e-7) * 100 * floor.extra["scale"], rel=1e-12
+    )
     constant = judged_rows(refinement_study([0.5 + e for e in (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 0)]), method)[
         "joint_gap"
     ]
@@ -480,6 +483,21 @@ def test_a_drift_of_rounding_agrees_at_once(steps, counted):
         grown = TRUE_TRAJECTORY.p * (1 + factor * base.tolerance * TIMES / 2)[:, None, None]
         held.runs[-1] = replace(held.runs[-1], trajectory=replace(held.runs[-1].trajectory, p=grown))
         assert judged_rows(held)["norm_drift"].reason.endswith("rounding") is reported
+
+
+@pytest.mark.parametrize(("rtol", "steps"), [(1e-6, 3000), (1e-10, 10**9), (1e-6, 90)])
+def test_step_control_cannot_accept_what_a_mistake_makes(rtol, steps):
+    method, scale = Integrator("DOP853", "tolerance", 8), judged_rows()["energy_drift"].extra["scale"]
+
+    def energy_drift(speed):
+        run = trajectory_with_error(0.0, speed=speed, steps=steps)
+        row = judged_rows(RefinementStudy([RefinementRun(100 * rtol, run), RefinementRun(rtol, run)]), method)
+        return row["energy_drift"]
+
+    small, large = energy_drift(1e-6), energy_drift(1e-3)
+    assert small.verdict == "agrees" and small.tolerance == pytest.approx(min(rtol * steps, 1e-4) * scale)
+    assert 1e-4 * scale < large.value < 0.1 * scale
+    assert large.verdict == ("disagrees" if rtol * steps < 1e-4 else "unresolved")
 
 
 def test_what_the_quadrature_of_the_work_leaves_open_is_allowed():
