@@ -209,7 +209,13 @@ def _rows_against_truth(study: RefinementAnalysis, name: str) -> list[Row]:
         reason = f"{words} limit {with_unit(off[at], unit)} off {until}, but no order is observed"
         return Verdict.UNRESOLVED, reason
 
-    verdict, reason, at, remark = study.decide(judge_window, study.horizon, study.truth.wanted_time)
+    verdict, reason, at, remark = study.decide(
+        judge_window,
+        [motion_error(name, y, true) for y in samples],
+        truth_uncertainty + rounding,
+        study.horizon,
+        study.truth.wanted_time,
+    )
     end = float(study.times[at])
     if study.has_steps:
         resolution = "step"

@@ -82,6 +82,22 @@ def max_norm(y: Float[Array, "... width"]) -> float:
     return size if np.isfinite(size) else np.inf
 
 
+def falls_with_resolution(errors: Sequence[float], floor: float) -> bool:
+    """Find out whether the errors of runs fall, however slowly, as their resolution is made finer.
+
+    Args:
+        errors: of each run, coarse to fine; runs whose error is not finite are left out.
+        floor: what rounding explains.
+
+    Returns:
+        Whether those of the finer half are at most half as large as those of the coarser one, or rounding.
+
+    """
+    finite = [error for error in errors if np.isfinite(error)]
+    coarse, fine = finite[: len(finite) // 2], finite[len(finite) // 2 :]
+    return max(fine, default=np.inf) <= max(floor, max(coarse, default=np.inf) / 2)
+
+
 @dataclass(frozen=True)
 class ObservedOrder:
     """The order of a refinement study in one window of time."""

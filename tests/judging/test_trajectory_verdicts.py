@@ -255,6 +255,25 @@ def test_a_shorter_window_may_tell_where_the_long_one_cannot():
     assert short.compared_until == 0.5
 
 
+KICKS = (0.05, -0.02, 0.08, -0.06, 0.03, -0.04)
+
+
+@pytest.mark.parametrize(("sizes", "verdict"), [(KICKS, "unresolved"), (STEPS, "agrees")])
+def test_a_half_window_does_not_overrule_errors_that_do_not_fall(sizes, verdict):
+    """Right to 1 s, then off by so much in each run."""
+    late = (TIMES > 1)[:, None, None]
+    study = refinement_study()
+    for index, (run, size) in enumerate(zip(study.runs, sizes, strict=True)):
+        right = run.trajectory
+        off = replace(right, r=right.r + late * size * DIRECTION, v=right.v * (1 + late * size))
+        study.runs[index] = replace(run, trajectory=off)
+    rows = judged_rows(study)
+    for name in ("position_limit", "velocity_limit", "energy_drift", "joint_gap", "gap_rate"):
+        assert rows[name].verdict == verdict and rows[name].compared_until == (
+            2.0 if verdict != "agrees" else 1.0
+        )
+
+
 def test_the_border_is_the_tolerance_and_the_tolerance_what_is_visible():
     tolerance = judged_rows()["position_limit"].tolerance
     for shift, verdict in ((0.95 * tolerance / 2, "agrees"), (1.05 * tolerance / 2, "disagrees")):

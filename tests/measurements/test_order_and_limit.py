@@ -11,6 +11,7 @@ from plumbline.measurements.order_and_limit import (
     ORDER_MARGIN,
     STEP_EXPONENTS,
     extrapolated_order,
+    falls_with_resolution,
     max_norm,
     observed_order,
     refinement_resolutions,
@@ -140,6 +141,25 @@ def test_the_largest_length_is_over_everything_but_the_last_axis():
     assert max_norm(np.zeros((0, 3, 2))) == 0.0
     y[0, 0, 0] = np.nan
     assert max_norm(y) == np.inf
+
+
+@pytest.mark.parametrize(
+    ("errors", "falls"),
+    [
+        ((64.0, 16.0, 4.0, 1.0), True),
+        ((4.0, 2.0), True),
+        ((4.0, 2.1), False),
+        ((4.0, 4.0, 2.0, 2.0, 1.0), True),
+        ((4.0, 4.0, 4.0, 4.0, 0.1), False),
+        ((0.3, 0.2, 0.3, 0.5), True),  # rounding
+        ((0.3, 0.2, 0.3, 0.6), False),
+        ((np.inf, np.nan, 4.0, 2.0), True),
+        ((np.inf, 4.0), True),
+        ((4.0, np.inf, 4.0), False),
+    ],
+)
+def test_errors_fall_where_the_finer_half_is_smaller(errors, falls):
+    assert falls_with_resolution(errors, 0.5) is falls
 
 
 def runs_with_differences(*differences):
