@@ -12,7 +12,14 @@ from packaging.specifiers import InvalidSpecifier, SpecifierSet
 from packaging.version import InvalidVersion, Version
 from pydantic import ConfigDict, PydanticUserError, TypeAdapter, ValidationError
 
-from plumbline.model.datatypes import EngineFailure, Model, StateQuantities, Trajectory, shape_words
+from plumbline.model.datatypes import (
+    STEP_ORDERS,
+    EngineFailure,
+    Model,
+    StateQuantities,
+    Trajectory,
+    shape_words,
+)
 from plumbline.model.kinematics import rate_count
 from plumbline.processes.exceptions import MAX_TEXT, one_line
 
@@ -199,6 +206,9 @@ def check_declarations(adapter: Any) -> None:
         if one.order < 1 or any(np.diff(one.error_exponents) <= 0):
             raise EngineFailure(f"{label}.integrators: {one.name} has order {one.order} and error exponents "
                                 f"{one.error_exponents}, must be at least 1 and ascend")  # fmt: skip
+        if one.kind == "step" and one.has_motions and one.order not in STEP_ORDERS:
+            raise EngineFailure(f"{label}.integrators: {one.name} has fixed steps of order {one.order}, "
+                                f"must be one of {', '.join(map(str, STEP_ORDERS))}")  # fmt: skip
     names = [one.name for one in adapter.integrators]
     if len({*names}) < len(names):
         raise EngineFailure(f"{label}.integrators has a name twice: {', '.join(names)}")

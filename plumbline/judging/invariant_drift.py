@@ -41,7 +41,8 @@ def _invariant_row(study: RefinementAnalysis, quantity: str, unit: str, samples:
     accepted = 0.0 if study.has_steps else study.runs[-1].resolution  # by step control in every step
     floor, per_step = rounding_floor(steps, scale, accepted), ROUNDING_PER_STEP + accepted
     uncertainty = study.invariant_uncertainty(quantity)
-    drift = np.maximum.accumulate(np.max(np.linalg.norm(samples[-1], axis=-1), axis=1))
+    drifts = [np.max(np.linalg.norm(y, axis=-1), axis=1) for y in samples]
+    drift = np.maximum.accumulate(drifts[-1])
     rounding = f"{steps} steps, {per_step:.1g} × {with_unit(scale, unit, 3)} each: {floor:.2g}"
 
     def row(
@@ -66,9 +67,10 @@ def _invariant_row(study: RefinementAnalysis, quantity: str, unit: str, samples:
         tolerance = limit.uncertainty + floor + uncertainty
     except ValueError as error:
         failure = str(error)
-    if drift[end] <= floor:
+    allowed = min(floor, DETECTABLE_PARAMETER_ERROR * scale)  # step control may accept more
+    if drift[end] <= allowed:
         reason = f"{name} {with_unit(drift[end], unit)}: rounding"
-        return row(Verdict.AGREES, reason, end, floor, limit_tolerance=tolerance[end])
+        return row(Verdict.AGREES, reason, end, allowed, limit_tolerance=tolerance[end])
     if failure:
         return row(Verdict.UNRESOLVED, failure, end, floor)
     limit_drift = np.maximum.accumulate(np.max(np.linalg.norm(limit.y, axis=-1), axis=1))
@@ -85,7 +87,8 @@ def _invariant_row(study: RefinementAnalysis, quantity: str, unit: str, samples:
         return Verdict.UNRESOLVED, f"{name} {with_unit(drift[at], unit)}: {at_zero} does not decide"
 
     duration = float(times[-1])
-    verdict, reason, at, _ = study.decide(judge_window, duration, duration)
+    allowed_drift = np.full(len(times), floor + uncertainty)
+    verdict, reason, at, _ = study.decide(judge_window, drifts, allowed_drift, duration, duration)
     to_limit = np.max(np.linalg.norm((samples[-1] - limit.y)[: at + 1], axis=-1))
     is_off = limit_drift[at] > tolerance[at] and is_trusted
     return row(

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,8 +12,10 @@ from plumbline.engines.engine_calls import RefinementRun
 from plumbline.judging.rows import RowContext, Verdict, first_decided
 from plumbline.measurements.order_and_limit import (
     ORDER_MARGIN,
+    ROUNDING_FLOOR_FACTOR,
     ExtrapolatedLimit,
     ObservedOrder,
+    falls_with_resolution,
     max_norm,
     observed_order,
     romberg,
@@ -29,7 +32,7 @@ from plumbline.model.invariants import (
     motion_scales,
 )
 from plumbline.model.kinematics import angular_velocity
-from plumbline.truth.ground_truth import RUN_ROUNDING, MotionTruth
+from plumbline.truth.ground_truth import DETECTABLE_PARAMETER_ERROR, RUN_ROUNDING, MotionTruth
 
 
 class WindowVerdict(NamedTuple):
@@ -161,18 +164,33 @@ class RefinementAnalysis:
         return [number for number in dict.fromkeys(numbers) if number >= 3] or [min(3, len(self.times))]
 
     def decide(
-        self, judge: Callable[[int], tuple[Verdict, str]], until: float, wanted: float
+        self,
+        judge: Callable[[int], tuple[Verdict, str]],
+        errors: Sequence[Float[Array, "samples"]],
+        floor: Float[Array, "samples"],
+        until: float,
+        wanted: float,
     ) -> WindowVerdict:
         """Return the verdict in the longest window that decides; where none does, in the longest one.
 
         Args:
             judge: from the index of a window's last sample to verdict and reason.
+            errors: of each run.  Where they do not fall from run to run in a window, no shorter one decides:
+                what happens later is then no matter of the step.
+            floor: what rounding explains of them.
             until: end of the longest window [s].
             wanted: how much of the scenario can be compared at best [s]; a decision needs half of it.
 
         """
-        windows = (WindowVerdict(*judge(number - 1), number - 1) for number in self.window_lengths(until))
-        verdict, reason, at, _ = first_decided(windows)
+
+        def windows() -> Iterator[WindowVerdict]:
+            for number in self.window_lengths(until):
+                yield WindowVerdict(*judge(number - 1), number - 1)
+                largest = [float(np.max(error[:number])) for error in errors]
+                if not falls_with_resolution(largest, float(np.max(floor[:number]))):
+                    return
+
+        verdict, reason, at, _ = first_decided(windows())
         if verdict != Verdict.UNRESOLVED and self.is_too_short(at, wanted):
             verdict, reason = Verdict.UNRESOLVED, f"too short a time to decide: {reason}"
         remark, duration = "", self.times[-1] * (1 - 1e-12)
@@ -205,6 +223,8 @@ class RefinementAnalysis:
         for number in self.window_lengths(self.horizon):
             floor = float(self.rounding[number - 1] / 8)  # trials found 115 ε G at most, an eighth of it
             order = observed_order([y[:number] for y in self.scaled_states], floor, self.integrator.order)
+            if ROUNDING_FLOOR_FACTOR * floor > DETECTABLE_PARAMETER_ERROR:  # it hides mistakes too
+                order = replace(order, is_at_rounding_floor=False)
             tried.append((order, float(self.times[number - 1])))
             is_high = order.value is not None and order.value > self.integrator.order + ORDER_MARGIN
             if order.is_at_rounding_floor or (order.is_asymptotic and not is_high):

@@ -144,7 +144,7 @@ def _order_row(study: RefinementAnalysis) -> Row:
     listed = ", ".join(f"{o:.2f}" if np.isfinite(o) else "–" for o in order.orders)
     error = None if order.value is None else abs(order.value - declared)
     if order.is_at_rounding_floor:
-        verdict, error = Verdict.AGREES, None
+        verdict, error = Verdict.INFORMATION, None  # the limits are compared, of attitudes too
         reason = f"order not observable: differences are rounding at every step ({steps})"
     elif not order.is_asymptotic or error is None:
         verdict, reason = Verdict.UNRESOLVED, f"not in the asymptotic range: orders {listed} over {steps}"
@@ -209,7 +209,13 @@ def _rows_against_truth(study: RefinementAnalysis, name: str) -> list[Row]:
         reason = f"{words} limit {with_unit(off[at], unit)} off {until}, but no order is observed"
         return Verdict.UNRESOLVED, reason
 
-    verdict, reason, at, remark = study.decide(judge_window, study.horizon, study.truth.wanted_time)
+    verdict, reason, at, remark = study.decide(
+        judge_window,
+        [motion_error(name, y, true) for y in samples],
+        truth_uncertainty + rounding,
+        study.horizon,
+        study.truth.wanted_time,
+    )
     end = float(study.times[at])
     if study.has_steps:
         resolution = "step"
@@ -239,7 +245,7 @@ def _rows_against_truth(study: RefinementAnalysis, name: str) -> list[Row]:
         f"rounding {study.rounding_description} × {with_unit(study.motion_scales[name], unit, 3)} = "
         f"{rounding[at]:.2g}; a mistake of {DETECTABLE_PARAMETER_ERROR:g} in a parameter changes it by "
         f"{detectable[at]:.2g}",
-        extra={"visible": min(detectable[at], 1e308), "growth": study.truth.growth[at]},
+        extra={"visible": detectable[at], "growth": study.truth.growth[at]},
         **common,
     )
     finest_row = make_row(

@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from plumbline.engines.no_answer import NoAnswer
-from plumbline.measurements.order_and_limit import ORDER_MARGIN
+from plumbline.measurements.order_and_limit import ORDER_MARGIN, falls_with_resolution
 from plumbline.measurements.refinement_study import ROUNDING_PER_STEP
 from plumbline.model.datatypes import Array, Float, Integrator
 
@@ -23,6 +23,7 @@ MAX_RELATIVE_DRIFT = 0.1  # of an invariant's scale: beyond, the step is too coa
 BLOCK_COUNT = 16  # blocks of time in each window
 MIN_ORDER_IN_TOLERANCE = 0.5  # order of a drift in the tolerance of a method with step control, at least
 SIGMA_FACTOR = 3.0
+SAME_DRIFT = 0.01  # relative difference of drifts that runs have in common
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,6 +171,18 @@ class InvariantDrift:
         """
         exponent = order.halvings * (SIGMA_FACTOR * order.order_error - self.required_order)
         return order.coarse_mean * 2**exponent + self.rounding_floor(BLOCK_COUNT)
+
+    @property
+    def is_matter_of_steps(self) -> bool:
+        """Whether the largest drift falls from the coarsest run to the finest, or is allowed.
+
+        Where a run leaves the motion's range, drifts need not fall: unless all runs have the same one.
+        """
+        windows = [run.windows.get(self.quantity, {}).get(self.end) for run in self.runs]
+        drifts = [np.inf if window is None else window.max_drift for window in windows]
+        if len(self.usable_runs) < len(self.runs) and self.max_drift > self.allowed_drift:
+            return not np.allclose(drifts, self.max_drift, rtol=SAME_DRIFT, atol=0.0)
+        return falls_with_resolution([drifts[0], drifts[-1]], self.allowed_drift)
 
     @property
     def falls_too_slowly(self) -> bool:

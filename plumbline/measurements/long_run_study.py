@@ -144,7 +144,7 @@ def run_long_run_study(
                 times = _samples(seconds, spacing)
                 found = attempt(adapter.simulate, model, state, times, integrator, resolution)
                 if not isinstance(found, NoAnswer):
-                    trajectory = found
+                    trajectory = replace(found, t=times)  # the engine's own sum of steps is rounded
                     break
                 if found.is_refusal:
                     return LongRunStudy(runs, plan, found), None

@@ -18,6 +18,7 @@ from plumbline.model.datatypes import Array, Float, Integrator
 ORDER_MARGIN = 0.1  # two consecutive orders this near to the declared one show it (verification.md)
 ORDER_CHANGE_FACTOR = 3.0  # three consecutive orders this many of their changes away show another order
 ROUNDING_FLOOR_FACTOR = 32.0  # a difference this many times rounding gives its order to 0.05: log2(1 + 1/32)
+MAX_RISE = 1.5  # of errors from run to run where they fall on the whole: coarse runs may be of any error
 STEP_EXPONENTS = {1: (9, 15), 2: (8, 12), 4: (5, 12)}  # by order: coarsest and finest step, -log2 of seconds
 MAX_BODY_STEPS = 2**19  # most steps × bodies of the finest run, without extra refinements
 RTOL_FACTORS = 1e2, 1.0  # relative tolerances of an adaptive method, over its tightest: no verdict needs more
@@ -80,6 +81,25 @@ def max_norm(y: Float[Array, "... width"]) -> float:
     """
     size = float(np.max(np.linalg.norm(y, axis=-1), initial=0.0))
     return size if np.isfinite(size) else np.inf
+
+
+def falls_with_resolution(errors: Sequence[float], floor: float) -> bool:
+    """Find out whether the errors of runs fall, however slowly, as their resolution is made finer.
+
+    Args:
+        errors: of each run, coarse to fine; runs whose error is not finite are left out.
+        floor: what rounding explains.
+
+    Returns:
+        Whether the last one is at most half of the first, and none above `MAX_RISE` times the one before it;
+        or rounding.
+
+    """
+    finite = [error for error in errors if np.isfinite(error)]
+    if len(finite) < 2:
+        return True
+    pairs = [(*pair, MAX_RISE) for pair in itertools.pairwise(finite)] + [(finite[0], finite[-1], 0.5)]
+    return all(fine <= max(floor, factor * coarse) for coarse, fine, factor in pairs)
 
 
 @dataclass(frozen=True)

@@ -193,6 +193,9 @@ class StepRun:
     limit_error: Float[Array, "samples 4"] | None = None
 
 
+STEP_ORDERS = (1, 2, 4)  # of methods with fixed steps whose motions are compared
+
+
 @dataclass(frozen=True)
 class Integrator:
     """One integration method of an engine.

@@ -236,7 +236,7 @@ def detectable_effect(model: Model, runs: Sequence[Trajectory]) -> dict[str, Arr
     """Measure the smallest effect of the parameter errors on a motion.
 
     Errors without effect in this scenario (the mass of a single body, any parameter of a body at rest) are
-    ignored.
+    ignored; where all are, an error of the same part of the motion's scale must be detectable.
 
     Args:
         runs: the true motion, then those of K perturbed models.
@@ -248,21 +248,21 @@ def detectable_effect(model: Model, runs: Sequence[Trajectory]) -> dict[str, Arr
     scales = motion_scales(model, runs[0], float(np.sum(stretched_length(model)))) | {"attitude": 1.0}
     effects = [motion_errors(runs[0], wrong) for wrong in runs[1:]]
     return {
-        q: least_detectable_effect([e[q] for e in effects], 1e-3 * DETECTABLE_PARAMETER_ERROR * scale)
+        q: least_detectable_effect([e[q] for e in effects], DETECTABLE_PARAMETER_ERROR * scale)
         for q, scale in scales.items()
     }
 
 
-def least_detectable_effect(effects: Sequence[Array], threshold: float) -> Array:
-    """Take the smallest of several effects, without those that stay below a threshold.
+def least_detectable_effect(effects: Sequence[Array], usual: float) -> Array:
+    """Take the smallest of several effects, without those that stay below a thousandth of the usual one.
 
     Args:
         effects: arrays (T,) in one unit.
-        threshold: effects that never exceed it are ignored.
+        usual: effect that the error has where it has one.
 
     Returns:
-        (T,) smallest running maximum; infinite where all effects are ignored.
+        (T,) smallest running maximum; the usual effect where all are ignored.
 
     """
-    visible = [np.maximum.accumulate(e) for e in effects if np.max(e) > threshold]
-    return np.asarray(np.min(visible, axis=0)) if visible else np.full(len(effects[0]), np.inf)
+    visible = [np.maximum.accumulate(e) for e in effects if np.max(e) > 1e-3 * usual]
+    return np.asarray(np.min(visible, axis=0)) if visible else np.full(len(effects[0]), usual)

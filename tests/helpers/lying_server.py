@@ -21,6 +21,7 @@ HELLOS = {
     "unknown quantity": {"quantities": ["acceleration", "colour"]},
     "single precision": {"precision": "single"},
     "order zero": {"integrators": [{"name": "still", "kind": "step", "order": 0}]},
+    "order three": {"integrators": [{"name": "still", "kind": "step", "order": 3}]},
     "an integrator twice": {"integrators": HELLO["integrators"] * 2},
     "endless name": {"title": "x" * 300},
     "unknown field": {"colour": "red"},

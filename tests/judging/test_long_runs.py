@@ -20,7 +20,8 @@ from plumbline.measurements.long_run_study import (
     plan_long_run,
     run_long_run_study,
 )
-from plumbline.model.datatypes import Integrator
+from plumbline.model.datatypes import Integrator, State, Trajectory
+from plumbline.model.kinematics import angular_velocity, complete_state, normalised
 from plumbline.processes.worker_pool import Limits
 from plumbline.scenario.generator import random_motion
 from plumbline.scenario.loader import load_scenario
@@ -115,6 +116,33 @@ OPENING_JOINTS = sample_change(lambda run: {"r": run.r + 1e-9 * run.t[:, None, N
 def test_planted_leaks_are_seen(use_defect, defect, verdict, quantities):
     rows = run_long("tumbling-ball", use_defect(defect), "RK4", 25.0)
     assert {q for q, row in rows.items() if row.verdict == verdict} >= quantities
+
+
+def kicked(factor):
+    """Runs whose rates are multiplied once, at 4 s, and which go on from there."""
+
+    def alter(simulate, model, state, times, *how):
+        number = int(np.searchsorted(times, 4.0))
+        if number >= len(times) - 1:
+            return simulate(model, state, times, *how)
+        before = simulate(model, state, times[: number + 1], *how)
+        rates = factor * angular_velocity(before.p[-1], before.pdot[-1])
+        kick = complete_state(model, State(normalised(before.p[-1]), rates))
+        after = simulate(model, kick, times[number:] - times[number], *how)
+        joined = {
+            name: np.concatenate([getattr(before, name), getattr(after, name)[1:]])
+            for name in ("r", "p", "v", "pdot")
+        }
+        return Trajectory(times, **joined, steps=before.steps + after.steps)
+
+    return alter
+
+
+@pytest.mark.parametrize("factor", [1.02, 1.5], ids=["in-range", "out-of-range"])
+def test_what_one_kick_adds_at_every_step_is_no_matter_of_too_long_a_time(use_defect, factor):
+    rows = run_long("tumbling-ball", use_defect(Defect("kick", run=kicked(factor))), "RK4", 20.0)
+    for name in ("energy_drift_long", "momentum_drift_long"):
+        assert rows[name].verdict == "unresolved" and rows[name].compared_until == 20.0
 
 
 def test_another_order_than_its_name_is_seen(use_defect):

@@ -181,8 +181,19 @@ def test_an_order_that_stays_away_disagrees_and_one_on_its_way_decides_nothing()
     assert lost.verdict == "unresolved" and lost.reason.startswith("not in the asymptotic range: orders ")
     assert lost.compared_until == 2.0, "the longest window, where none shows an order"
     floor = judged_rows(refinement_study([1e-16, 0, 1e-16, 0, 1e-16, 0]))["order"]
-    assert (floor.verdict, floor.order, floor.value) == ("agrees", None, None)
+    assert (floor.verdict, floor.order, floor.value) == ("information", None, None)
     assert "not observable" in floor.reason and floor.compared_until == 2.0
+
+
+@pytest.mark.parametrize(("solver_rtol", "verdict"), [(1e-9, "information"), (1e-3, "unresolved")])
+def test_a_solver_that_hides_mistakes_hides_no_order(solver_rtol, verdict):
+    """An order 1 of a method whose order is 2, below what the engine says of its solver."""
+    study = refinement_study([1e-9 * h for h in STEPS])
+    for index, run in enumerate(study.runs):
+        study.runs[index] = replace(run, trajectory=replace(run.trajectory, solver_rtol=solver_rtol))
+    rows = judged_rows(study)
+    assert rows["order"].verdict == verdict
+    assert {rows[name].verdict for name in LIMITS} == {"agrees" if verdict == "information" else "unresolved"}
 
 
 @pytest.mark.parametrize(("factor", "until"), [(0.98, 2.0), (1.02, 1.0)])
@@ -253,10 +264,27 @@ def test_a_shorter_window_may_tell_where_the_long_one_cannot():
     assert both["position"].verdict == "information"
     assert (blind.verdict, blind.compared_until) == ("unresolved", 2.0)
     assert "is above the 1e-14 m that a mistake of 0.0001 would make" in blind.reason
-    endless = judged_rows(detectable=of_each(DETECTABLE, position=np.inf))["position_limit"]
-    assert endless.verdict == "agrees" and endless.extra["visible"] == 1e308
     short = judged_rows(horizon=0.5)["position_limit"]
     assert short.compared_until == 0.5
+
+
+KICKS = (0.05, -0.02, 0.08, -0.06, 0.03, -0.04)
+
+
+@pytest.mark.parametrize(("sizes", "verdict"), [(KICKS, "unresolved"), (STEPS, "agrees")])
+def test_a_half_window_does_not_overrule_errors_that_do_not_fall(sizes, verdict):
+    """Right to 1 s, then off by so much in each run."""
+    late = (TIMES > 1)[:, None, None]
+    study = refinement_study()
+    for index, (run, size) in enumerate(zip(study.runs, sizes, strict=True)):
+        right = run.trajectory
+        off = replace(right, r=right.r + late * size * DIRECTION, v=right.v * (1 + late * size))
+        study.runs[index] = replace(run, trajectory=off)
+    rows = judged_rows(study)
+    for name in ("position_limit", "velocity_limit", "energy_drift", "joint_gap", "gap_rate"):
+        assert rows[name].verdict == verdict and rows[name].compared_until == (
+            2.0 if verdict != "agrees" else 1.0
+        )
 
 
 def test_the_border_is_the_tolerance_and_the_tolerance_what_is_visible():
@@ -315,9 +343,12 @@ def test_a_method_with_a_tolerance_has_no_order_and_its_tightest_run_is_the_limi
     irregular = (1e-7, 5e-8, 4.9e-8, 1e-9, 9e-10, 0)  # no order of any kind
     off = judged_rows(refinement_study([1e-6 + e for e in irregular]), method)["position_limit"]
     assert off.verdict == "disagrees", "trusted without any order"
-    floor = found["energy_drift"]
-    each = ROUNDING_PER_STEP + STEPS[-1]
-    assert floor.tolerance == pytest.approx(each * 100 * floor.extra["scale"], rel=1e-12)
+    still = trajectory_with_error(0.0)
+    tight = RefinementStudy([RefinementRun(rtol, still) for rtol in (1e-5, 1e-7)])
+    floor = judged_rows(tight, method)["energy_drift"]
+    assert floor.tolerance == pytest.approx(
+        (ROUNDING_PER_STEP + 1e-7) * 100 * floor.extra["scale"], rel=1e-12
+    )
     constant = judged_rows(refinement_study([0.5 + e for e in (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 0)]), method)[
         "joint_gap"
     ]
@@ -484,6 +515,21 @@ def test_a_drift_of_rounding_agrees_at_once(steps, counted):
         grown = TRUE_TRAJECTORY.p * (1 + factor * base.tolerance * TIMES / 2)[:, None, None]
         held.runs[-1] = replace(held.runs[-1], trajectory=replace(held.runs[-1].trajectory, p=grown))
         assert judged_rows(held)["norm_drift"].reason.endswith("rounding") is reported
+
+
+@pytest.mark.parametrize(("rtol", "steps"), [(1e-6, 3000), (1e-10, 10**9), (1e-6, 90)])
+def test_step_control_cannot_accept_what_a_mistake_makes(rtol, steps):
+    method, scale = Integrator("DOP853", "tolerance", 8), judged_rows()["energy_drift"].extra["scale"]
+
+    def energy_drift(speed):
+        run = trajectory_with_error(0.0, speed=speed, steps=steps)
+        row = judged_rows(RefinementStudy([RefinementRun(100 * rtol, run), RefinementRun(rtol, run)]), method)
+        return row["energy_drift"]
+
+    small, large = energy_drift(1e-6), energy_drift(1e-3)
+    assert small.verdict == "agrees" and small.tolerance == pytest.approx(min(rtol * steps, 1e-4) * scale)
+    assert 1e-4 * scale < large.value < 0.1 * scale
+    assert large.verdict == ("disagrees" if rtol * steps < 1e-4 else "unresolved")
 
 
 def test_what_the_quadrature_of_the_work_leaves_open_is_allowed():

@@ -11,6 +11,7 @@ from plumbline.measurements.order_and_limit import (
     ORDER_MARGIN,
     STEP_EXPONENTS,
     extrapolated_order,
+    falls_with_resolution,
     max_norm,
     observed_order,
     refinement_resolutions,
@@ -18,7 +19,7 @@ from plumbline.measurements.order_and_limit import (
     step_unit,
     tightest_tolerance_limit,
 )
-from plumbline.model.datatypes import Integrator
+from plumbline.model.datatypes import STEP_ORDERS, Integrator
 
 TIMES = np.linspace(0, 2, 17)
 
@@ -140,6 +141,29 @@ def test_the_largest_length_is_over_everything_but_the_last_axis():
     assert max_norm(np.zeros((0, 3, 2))) == 0.0
     y[0, 0, 0] = np.nan
     assert max_norm(y) == np.inf
+
+
+@pytest.mark.parametrize(
+    ("errors", "falls"),
+    [
+        ((64.0, 16.0, 4.0, 1.0), True),
+        ((4.0, 2.0), True),
+        ((4.0, 2.1), False),
+        ((4.0, 4.0, 5.9, 4.0, 1.0), True),
+        ((4.0, 4.0, 6.1, 4.0, 1.0), False),
+        ((0.3, 0.2, 0.4, 0.5), True),  # rounding
+        ((0.3, 0.2, 0.4, 0.7), False),
+        ((np.inf, np.nan, 4.0, 2.0), True),
+        ((np.inf, 4.0), True),
+        ((4.0, np.inf, 4.0), False),
+    ],
+)
+def test_errors_fall_on_the_whole_and_never_rise_by_much(errors, falls):
+    assert falls_with_resolution(errors, 0.5) is falls
+
+
+def test_all_orders_of_fixed_steps_have_a_study():
+    assert tuple(STEP_EXPONENTS) == STEP_ORDERS
 
 
 def runs_with_differences(*differences):

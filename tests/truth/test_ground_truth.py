@@ -47,11 +47,11 @@ def test_stretched_length_is_the_largest_extent_of_each_body():
 
 def test_the_least_effect_ignores_invisible_ones():
     effects = [np.array([0, 1.0, 3, 2]), np.array([0, 5.0, 1, 9]), np.array([0, 1e-9, 2e-9, 0])]
-    assert least_detectable_effect(effects, 1e-6).tolist() == [0, 1, 3, 3]
-    assert least_detectable_effect(effects, 1e-10).tolist() == [0, 1e-9, 2e-9, 2e-9]
-    assert least_detectable_effect(effects, 5.0).tolist() == [0, 5, 5, 9]
-    assert least_detectable_effect(effects, 9.0).tolist() == [np.inf] * 4
-    assert least_detectable_effect(effects[:1], 9.0).tolist() == [np.inf] * 4
+    assert least_detectable_effect(effects, 1e-3).tolist() == [0, 1, 3, 3]
+    assert least_detectable_effect(effects, 1e-7).tolist() == [0, 1e-9, 2e-9, 2e-9]
+    assert least_detectable_effect(effects, 5e3).tolist() == [0, 5, 5, 9]
+    assert least_detectable_effect(effects, 9e3).tolist() == [9e3] * 4, "none is visible"
+    assert least_detectable_effect(effects[:1], 9e3).tolist() == [9e3] * 4
 
 
 @pytest.mark.parametrize("joints", ["b", "rb"])
@@ -84,6 +84,12 @@ def test_each_perturbed_model_has_one_kind_of_error_of_one_part_in_ten_thousand(
             assert np.array_equal(getattr(state, name), getattr(lifted, name))
     offsets = found[3][0].proximal / model.proximal
     assert np.any(offsets > 1) and np.any(offsets < 1), "signs are drawn"
+
+
+def test_a_motion_that_no_mistake_changes_must_be_seen_to_change():
+    model = pendulums.make_model("b").changed(gravity=np.zeros(3))
+    found = motion_truth(model, pendulums.state_from_seed(model, seed=2, rate=0.0), TIMES, None)
+    assert np.array_equal(found.detectable["attitude"], np.full(9, DETECTABLE_PARAMETER_ERROR))
 
 
 def test_detectable_effects_are_the_least_on_each_quantity():
