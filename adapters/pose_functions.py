@@ -87,7 +87,8 @@ def homogeneous(turn: Float[Array, "3 3"], place: Float[Array, "3"]) -> Float[Ar
 
 def plucker(turn: Float[Array, "3 3"], place: Float[Array, "3"]) -> Float[Array, "6 6"]:
     """Return the Plücker matrix of a pose."""
-    pose = np.kron(np.eye(2), turn)
+    pose = np.zeros((6, 6))
+    pose[:3, :3] = pose[3:, 3:] = turn
     pose[3:, :3] = cross_matrix(place) @ turn
     return pose
 

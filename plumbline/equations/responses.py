@@ -122,7 +122,7 @@ class Responses:
 
         """
         S, rows = self._count, self._rows_of_ends(self._A.reshape(self._count, self.n, 6, -1))
-        free = rows @ np.linalg.pinv(self._H, hermitian=True)
+        free = rows @ np.linalg.pinv(self._H)
         unit = np.sqrt(np.maximum(np.einsum("sij,sij->si", free, rows), 0.0))
         units = np.broadcast_to(np.eye(rows.shape[-1]), self._H.shape)
         moved = self.solution[:, :, :2].reshape(S, -1, 1) - self._coasting.reshape(S, -1, 1)
@@ -260,7 +260,7 @@ class Responses:
 
     def _yielding(self) -> Array:
         """(S, 6 N, 1) roots of the relative accelerations by unit wrenches at each joint alone."""
-        inverse, found = np.linalg.pinv(self._inertia, hermitian=True), np.zeros((self._count, self.n, 6))
+        inverse, found = np.linalg.pinv(self._inertia), np.zeros((self._count, self.n, 6))
         for k, far in enumerate(self.far):
             for body, arm in ((k, self._near[:, k]), (far, self._far[:, k])):
                 if body >= 0:

@@ -222,7 +222,7 @@ def _check_references(tree: Element, kind: Format, file: Path, root: Path, hint:
             shown = str(Path(tree.source.file).parent / element.attributes["file"])
             model = read_xml(inside, shown)
             if (kind_of_model := _format_of(model, shown)) == "mjcf":
-                mjcf.expand_includes(model, inside, root, shown)
+                mjcf.expand_includes(model, root, shown)
             pending.append((model, kind_of_model, inside))
 
 
