@@ -321,7 +321,7 @@ def _joint_space_edits(declared: JointSpaceMethod, model: Model) -> Iterator[Edi
     for applies, name, words in (
         (True, "step_factor", "it took a step {} times as long as asked"),
         (has_rods, "rod_axial_inertia",
-         "the axial inertia of rods were {} of what they carry (tr J + m ℓ²)"),
+         "the axial inertia of rods were {} of the trace of the inertia that they carry"),
         (declared.implicit_forces != "none", "damping_factor",
          "the derivatives of forces in the matrix were {} times as large"),
         (declared.formula == "semi-implicit Euler", "new_velocity_share",

@@ -554,12 +554,12 @@ remembered_velocity_jacobian = lru_cache(maxsize=64)(velocity_jacobian)
 
 
 def rod_inertias(model: Model) -> Float[Array, "bodies"]:
-    """Return what the axial inertia of a rod is a share of [kg m²]: positive, also below a point mass.
+    """Return what the axial inertia of a rod is a share of [kg m²]: positive, and scaled as units are.
 
-    tr J + m ℓ² of the body that hangs by it, which keeps its size when units change.
+    tr J of the body that hangs by it; of a point mass m ℓ².
     """
-    of_joints = model.mass * model.length[: model.n] ** 2
-    return np.asarray(np.trace(model.inertia, axis1=1, axis2=2) + of_joints)
+    of_body = np.trace(model.inertia, axis1=1, axis2=2)
+    return np.where(of_body > 0, of_body, model.mass * model.length[: model.n] ** 2)
 
 
 def mass_matrix(model: Model, state: State) -> Float[Array, "... nu nu"]:
