@@ -84,6 +84,12 @@ def test_a_step_too_coarse_for_100_s_is_judged_where_it_is_not():
     assert energy.extra["by 100 s"] > 3.0 > energy.extra["scale"] / 2
 
 
+def test_runs_whose_steps_add_up_to_other_ends_have_the_same_windows():
+    """Steps of 0.002 … 0.0005 s, whose sums are rounded."""
+    energy = run_long("double-loaded-rods", "mujoco", "Euler", 4.0)["energy_drift_long"]
+    assert energy.verdict == "agrees" and energy.compared_until == 4.0
+
+
 def test_two_steps_below_one_that_is_too_coarse_cannot_disagree():
     """The drift of a rod driven to 100 rad/s falls with order 1.6 to 2⁻⁹ s, with 5 and more from there."""
     energy = run_long("driven-rod", "mujoco", "RK4")["energy_drift_long"]
