@@ -402,12 +402,13 @@ def _keep(m: Any, d: Any) -> None:
 
 
 def _in_frames(spec: Any) -> Any:
-    """Put every body in two frames, one in the other."""
-    frames = Pose(FIXED_PLACE, PROBE_ATTITUDE), Pose(FIXED_PLACE[::-1], OTHER_TURN)
-    back = (frames[0] * frames[1]).inverse()
+    """Put every body in two frames, one in the other, no farther than it is: bodies may be at the origin."""
     for body in bodies_of(spec):
+        pose = Pose(np.array(body.pos), np.array(body.quat) / np.linalg.norm(body.quat))
+        place = np.linalg.norm(pose.r) * FIXED_PLACE
+        frames = Pose(place, PROBE_ATTITUDE), Pose(place[::-1], OTHER_TURN)
         outer, inner = (body.parent.add_frame(pos=frame.r, quat=frame.p) for frame in frames)
-        own = back * Pose(np.array(body.pos), np.array(body.quat) / np.linalg.norm(body.quat))
+        own = (frames[0] * frames[1]).inverse() * pose
         body.pos, body.quat = own.r, own.p
         inner.set_frame(outer)
         body.set_frame(inner)

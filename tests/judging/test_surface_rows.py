@@ -160,6 +160,13 @@ def test_a_wrong_function_is_seen_by_the_variant_of_its_name(given, name, plants
     assert {row.verdict for row in rows} & {Verdict.DISAGREES, Verdict.FAILED}
 
 
+def test_mujocos_frames_leave_a_body_at_the_origin_there():
+    s = catalogue_scenario("free-top")
+    adapter, states = copy(load_adapter("mujoco")), states_of(s, 2)
+    adapter.variants = [one for one in adapter.variants if "MjsFrame" in one.names]
+    assert_agree(rows_of_variants(state_truth(s.model, states), evaluate_variants(adapter, s.model, states)))
+
+
 def test_exudyns_sum_of_two_sensors_tells_them_apart(few_bodies, monkeypatch):
     model, states, truth = few_bodies
     weighted = exudyn_surface.weighted_sum
