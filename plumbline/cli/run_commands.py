@@ -155,7 +155,7 @@ def run(
     "--random-trajectories",
     type=click.IntRange(0, options.MAX_RANDOM_SCENARIOS),
     default=20,
-    help="Number of random motions besides, which are compared at every level; the others only at states.",
+    help="Number of random motions besides, which are compared at every level; the others at states and steps.",
 )
 @click.option(
     "--seed",
