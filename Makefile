@@ -26,7 +26,7 @@ install: .venv/truth.tried  ## install what runs need, then try it: one scenario
 		'  . .venv/bin/activate                 then `plumbline` is a command; `plumbline --help` lists what it does' \
 		'  plumbline run double-tumbling-balls  another scenario, with its motion; `plumbline list scenarios` has all' \
 		'  plumbline model FILE                 what importers make of your URDF or MJCF file' \
-		'  make run                             the whole catalogue (6 to 18 minutes)'
+		'  make run                             the whole catalogue (6 to 19 minutes)'
 
 run: .venv/truth.tried  ## the main job: the whole catalogue on all engines, table and report
 	$(PYTHON) -m plumbline run

@@ -22,7 +22,7 @@ MADE = {"Plumbline": "version", "commit": "commit", "date": "started", "command"
 
 
 def write(folder: Path, document: Record) -> Path:
-    """Write model.json, model.html, junit.xml and model.sarif.
+    """Write model.json, model.html, junit.xml and model.sarif in place of the results of a run.
 
     Args:
         document: result of a run, as the command prints it with --json.
@@ -33,6 +33,7 @@ def write(folder: Path, document: Record) -> Path:
     """
     document = replace_unprintable(document)
     text = json.dumps(document, ensure_ascii=False, indent=1)
+    (folder / "results.json").unlink(missing_ok=True)
     write_atomically(folder / "model.json", text.encode())
     path = folder / "model.html"
     write_atomically(path, render(document).encode())

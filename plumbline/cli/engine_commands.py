@@ -12,6 +12,7 @@ import click
 from plumbline.cli import options
 from plumbline.cli.help_texts import command, examples
 from plumbline.engines import specifications
+from plumbline.processes.exceptions import describe_exception
 from plumbline.processes.line_process import BadSpecification
 from plumbline.processes.worker_pool import Limits
 from plumbline.storage.results_store import row_record, write_atomically
@@ -31,8 +32,8 @@ def serve(engine: str) -> None:
 
     try:
         adapter = load_adapter(specifications.resolve(engine, Path.cwd()))
-    except (BadSpecification, ImportError, AttributeError) as error:
-        raise click.BadParameter(str(error), param_hint="ENGINE") from None
+    except Exception as error:  # of the user's file, which may do anything
+        raise click.BadParameter(describe_exception(error), param_hint="ENGINE") from None
     serve_standard_streams(adapter)
 
 

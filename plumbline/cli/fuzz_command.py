@@ -31,7 +31,7 @@ MAX_MINUTES = 1e5
 A session:
   random mechanisms of seed 2875430316 (--seed repeats them)
   new: mujoco-joint-forces-without-springs-between-points (random-mechanism-2875430316-5)
-  96 scenarios, 1 new finding, 31 s
+  96 mechanisms, 1 new finding, 31 s
   ✗ mujoco-joint-forces-without-springs-between-points  3.13.0
     behaves as if it returned the joint reaction without spring 1
     2 rows, random-mechanism-2875430316-5, up to 1.2e+12 times the tolerance

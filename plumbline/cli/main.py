@@ -30,7 +30,7 @@ START = """
 Start with:
   python -m plumbline list scenarios
   python -m plumbline run double-tumbling-balls
-  python -m plumbline run                  (everything; about ten minutes)
+  python -m plumbline run                  (everything; 6 to 19 minutes)
 """
 
 

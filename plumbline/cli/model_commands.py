@@ -168,6 +168,8 @@ def _write_scenario(files: Sequence[str], base: Any, root: Path | None, to: Path
     """Write a model file as a scenario file, and what the mechanism leaves out."""
     if len(files) != 1:
         raise click.UsageError("--to-scenario takes one model file")
+    if to.exists() and Path(files[0]).exists() and to.samefile(files[0]):
+        raise click.BadParameter("would overwrite the model file", param_hint="--to-scenario")
     try:
         scenario, document = load_model_file(Path(files[0]), base, root)
     except ScenarioError as error:
@@ -309,10 +311,11 @@ def _reasons(name: str, rows: Sequence[Row], file: FileResult) -> list[str]:
     silent = (Verdict.AGREES, Verdict.INFORMATION, Verdict.NOT_INSTALLED)
     bad = [row for row in rows if row.verdict not in silent and row.known_issue is None]
     explanation = file.explanations.get(name) or Explanation(is_proved=True)
-    refused = [row for row in rows if row.verdict == Verdict.INFORMATION and row.extra.get(IS_REFUSED)]
+    informed = [row for row in rows if row.verdict == Verdict.INFORMATION]
+    not_read = [row for row in informed if row.extra.get(IS_REFUSED) or row.quantity == "all"]
     unexplained = [row for row in bad if row.diagnosis is None]
     lines = [f"{coloured_glyph(bad[0])} {escape(cause.sentence)}" for cause in explanation.causes if bad]
-    for row in (*unexplained, *refused):
+    for row in (*unexplained, *not_read):
         words = shorten(" ".join(row.reason.split()), MAX_REASON)
         lines.append(f"{coloured_glyph(row)} {escape(f'{row.engine}: {words}')}")
     if bad and not explanation.is_proved:

@@ -439,11 +439,12 @@ def choose_scenarios(names: Sequence[str], families: Sequence[str]) -> list[scen
     return [s for s in found if not families or s.family in families]
 
 
-def claim_folder(folder: Path) -> Path:
+def claim_folder(folder: Path, param_hint: str = "--out") -> Path:
     """Make the output folder, try to write to it and lock it until the command ends, before any work is done.
 
     Args:
         folder: the folder; parents are made too.
+        param_hint: the parameter that names it.
 
     Raises:
         BadParameter: the folder cannot be made or written to, or another command uses it (exit code 2).
@@ -455,11 +456,11 @@ def claim_folder(folder: Path) -> Path:
     except LockHeld:
         raise click.BadParameter(
             f"another command writes to {folder} at present; wait until it has ended, or name another folder",
-            param_hint="--out",
+            param_hint=param_hint,
         ) from None
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise click.BadParameter(f"cannot write to {folder}: {reason}", param_hint="--out") from None
+        raise click.BadParameter(f"cannot write to {folder}: {reason}", param_hint=param_hint) from None
     click.get_current_context().with_resource(lock)
     return folder
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Sequence
@@ -38,7 +39,7 @@ MAX_DURATION = 1000.0  # s; two bodies take minutes for 30 s
 @click.option(
     "--duration",
     type=options.FiniteNumber(0, MAX_DURATION, min_open=True),
-    help="Seconds to enclose, in the scenario's sample interval. Default: the scenario's own.",
+    help="Seconds to enclose, rounded up to sample intervals of the scenario. Default: the scenario's own.",
 )
 @click.option(
     "--precision",
@@ -119,7 +120,7 @@ def _require_provable(chosen: Sequence[Scenario], option: str) -> None:
 def _times(scenario: Scenario, duration: float | None) -> Any:
     if duration is None:
         return scenario.times
-    count = max(1, round(duration / scenario.sample_interval))
+    count = math.ceil(round(duration / scenario.sample_interval, 9)) or 1  # 1.1 / 0.1 is 11.000000000000002
     return np.arange(count + 1) * scenario.sample_interval
 
 

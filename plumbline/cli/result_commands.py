@@ -12,17 +12,19 @@ from plumbline import layout
 from plumbline.cli import options
 from plumbline.cli.help_texts import examples
 from plumbline.cli.terminal_output import count_noun, line_width, log, make_console, print_json, print_table
+from plumbline.engines.registry import SCRIPTED_IMPORTERS
 from plumbline.judging.rows import Verdict
 from plumbline.scenario.line_and_column_errors import did_you_mean
 from plumbline.storage.results_store import Record, read_results
 
-MAKES_ONE = "`python -m plumbline nightly` makes one in the folder `nightly`"
+NIGHTS = layout.output_folder("nightly")
+MAKES_ONE = f"`python -m plumbline nightly` makes one in the folder `{NIGHTS}`"
 
 
 @click.command(
     epilog=examples("history nightly", 'history nightly --key "double-*/mujoco/state/*"'),
 )
-@click.argument("folder", default="nightly", type=options.FolderPath())
+@click.argument("folder", default=NIGHTS, type=options.FolderPath())
 @click.option("--key", "pattern", help="Trend of the rows whose key matches (* and ?).")
 @options.json_option
 def history(folder: Path, pattern: str | None, as_json: bool) -> None:
@@ -53,7 +55,7 @@ def _print_issue(folder: Path, name: str) -> None:
         verdicts = {row["key"]: row["verdict"] for row in results.rows}
         wrong = [key for key in finding["rows"] if verdicts[key] == Verdict.DISAGREES]
         if wrong and results.scripts.keys().isdisjoint(finding["rows"]):
-            written = write_scripts(options.claim_folder(folder), wrong[:1])
+            written = write_scripts(options.claim_folder(folder, "FOLDER"), wrong[:1])
             for reason in written.reasons.values():
                 log(f"no script: {reason}")
             results = Results.load(folder)
@@ -120,10 +122,11 @@ def _reproduce_model(folder: Path, keys: tuple[str, ...], form: str | None) -> N
             click.echo(f"{key}: {row['diagnosis'] or row['reason']}")
         log(count_noun(len(found), "difference") if found else "nothing differs")
         return
-    chosen, changes = options.claim_folder(folder), read_version_changes(folder)
     for key in keys:
         if key not in found:
             raise click.UsageError(f"no difference {key!r}; without KEY the command lists them")
+    chosen, changes = options.claim_folder(folder, "RESULT"), read_version_changes(folder)
+    for key in keys:
         row = found[key]
         engine, since = row["engine"].partition("@")[0], str(changes.get(key, {}).get("note", ""))
         plan = ModelPlan.of_row(row, document["options"])
@@ -163,7 +166,7 @@ def report(folder: Path, history_folder: Path | None, issue: str | None) -> None
         _check_history_folder(history_folder)
     with options.exit_on_damaged_results():
         read_results(folder)  # before the folder is made writable: there may be none
-        click.echo(f"report: {reports.write(options.claim_folder(folder), history_folder)}")
+        click.echo(f"report: {reports.write(options.claim_folder(folder, 'FOLDER'), history_folder)}")
 
 
 @click.command(
@@ -175,6 +178,7 @@ def report(folder: Path, history_folder: Path | None, issue: str | None) -> None
 @click.argument("keys", nargs=-1, metavar="[KEY]...")
 @click.option(
     "--form",
+    type=click.Choice(SCRIPTED_IMPORTERS),
     help="Of results of `model`: the engine whose calls the script uses. Default: the importer's own.",
 )
 def reproduce(folder: Path, keys: tuple[str, ...], form: str | None) -> None:
@@ -187,6 +191,8 @@ def reproduce(folder: Path, keys: tuple[str, ...], form: str | None) -> None:
     if (folder / "model.json").is_file():
         _reproduce_model(folder, keys, form)
         return
+    if form is not None:
+        raise click.UsageError("--form is for results of `model`; these are of a run")
     from plumbline.reproduce.write import list_disagreements, write_scripts
 
     with options.exit_on_damaged_results():
@@ -197,7 +203,7 @@ def reproduce(folder: Path, keys: tuple[str, ...], form: str | None) -> None:
             log(count_noun(len(found), "disagreement") if found else "nothing disagrees")
             return
         read_results(folder)
-        written = write_scripts(options.claim_folder(folder), keys)
+        written = write_scripts(options.claim_folder(folder, "RESULT"), keys)
     for path in dict.fromkeys(written.files.values()):
         click.echo(str(path))
     for key, reason in written.reasons.items():

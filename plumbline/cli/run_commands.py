@@ -155,7 +155,7 @@ def run(
     "--random-trajectories",
     type=click.IntRange(0, options.MAX_RANDOM_SCENARIOS),
     default=20,
-    help="Number of random motions besides, which are compared at every level; the others only at states.",
+    help="Number of random motions besides, which are compared at every level; others at states and steps.",
 )
 @click.option(
     "--seed",
@@ -234,7 +234,9 @@ def _seen_findings(nights: Path | None) -> frozenset[str]:
         return frozenset()
     from plumbline.storage.history_of_nights import last_findings
 
-    return last_findings(nights)
+    if nights.exists() and not nights.is_dir():
+        raise click.BadParameter(f"{nights} is a file and no folder of nights", param_hint="--new-only")
+    return last_findings(nights, log)
 
 
 def _read_known_issues(files: Sequence[Path], chosen: Sequence[Scenario]) -> list[KnownIssue]:

@@ -42,6 +42,7 @@ IMPORTERS = {
     "dart": "adapters.dart_importer:DartImporter",
     "pybullet": "adapters.pybullet_importer:PybulletImporter",
 }
+SCRIPTED_IMPORTERS = ("mujoco", "pinocchio", "exudyn", "drake", "dart")  # in whose calls scripts are written
 
 
 def load_adapter(name: str) -> Adapter:

@@ -150,13 +150,11 @@ def found_engines(folder: Path) -> Iterator[tuple[str, str, Path | None]]:
     """
     path = folder / PROJECT_FILE
     try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, ValueError):
-        text = ""
-    try:
-        table = tomllib.loads(text).get("engines", {})
-    except tomllib.TOMLDecodeError as error:
-        raise BadSpecification(f"{PROJECT_FILE}: {error}") from None
+        table = tomllib.loads(path.read_text(encoding="utf-8")).get("engines", {})
+    except FileNotFoundError:
+        table = {}
+    except (OSError, ValueError) as error:
+        raise BadSpecification(f"{PROJECT_FILE}: {getattr(error, 'strerror', None) or error}") from None
     if not isinstance(table, dict) or not all(isinstance(value, str) for value in table.values()):
         raise BadSpecification(f"{PROJECT_FILE}: [engines] must have a specification, a text, for each name")
     yield from ((name, value, path) for name, value in table.items())

@@ -18,6 +18,7 @@ import numpy as np
 from plumbline.engines.engine_calls import run_script
 from plumbline.engines.environments import split_version
 from plumbline.engines.importer_calls import evaluate_model_file
+from plumbline.engines.registry import SCRIPTED_IMPORTERS
 from plumbline.importers.neutral_model import CanonicalState, NeutralModel, without_passive_forces
 from plumbline.importers.xml_tree import Element, write_xml
 from plumbline.judging.rows import Verdict
@@ -32,7 +33,6 @@ from plumbline.processes.worker_pool import Limits, Task, WorkerPool
 from plumbline.reproduce.render import template_environment
 from plumbline.scenario.line_and_column_errors import Problem
 
-FORMS = ("mujoco", "pinocchio", "exudyn", "drake", "dart")
 SHRINKING_SECONDS = 60.0
 SHRINKING_STATES = 2
 TASK_SECONDS = 30.0
@@ -102,7 +102,7 @@ def write_model_script(
 
     Args:
         plan: of one file and the importer that differs, with or without a version.
-        form: engine whose calls the script uses, one of `FORMS`.
+        form: engine whose calls the script uses, one of `SCRIPTED_IMPORTERS`.
         seconds: time for the search for a smaller file.
         since: a sentence about the versions that show it.
 
@@ -114,8 +114,8 @@ def write_model_script(
 
     """
     ((shown,), (importer,)) = plan.files, plan.importers
-    if form not in FORMS:
-        raise NoModelScript(f"there are scripts for {', '.join(FORMS)}, not for {form}")
+    if form not in SCRIPTED_IMPORTERS:
+        raise NoModelScript(f"there are scripts for {', '.join(SCRIPTED_IMPORTERS)}, not for {form}")
     if split_version(importer)[0] != form:
         raise NoModelScript(f"{importer} differs; a script for {form} cannot show that")
     plan = replace(plan, state_count=SHRINKING_STATES, limits=Limits(TASK_SECONDS))

@@ -651,7 +651,7 @@ class ClosingJoint(SchemaModel):
 
 
 class Document(SchemaModel):
-    """A scenario file: one open chain of rigid bodies, its initial state, its loads."""
+    """A scenario file: chains, trees and loops of rigid bodies, their initial state, their loads."""
 
     omitted = ("level", "springs", "closes", "seed")
     schema_version: Literal[1] = _field("Version of this format: 1.")

@@ -24,7 +24,6 @@ from plumbline.scenario.line_and_column_errors import (
 from plumbline.scenario.schema import SCHEMA_VERSION, Body, BodySequence, Document
 from plumbline.scenario.yaml_source import FieldPath, YamlSource, dotted_path
 
-KINDS = "one of kind: " + ", ".join(JOINT_KINDS)
 MAX_NUMBER_LENGTH = 100  # characters; a longer text is not taken for a mistyped number
 KEY_OF_MAPPING = "[key]"  # pydantic's word in the place of an error about a key
 BOUNDS = {"greater_than": "above", "greater_than_equal": "at least", "less_than": "below"} | {
@@ -88,6 +87,12 @@ def _fields(model: type[BaseModel]) -> dict[str, FieldInfo]:
 def _kinds(model: type[BaseModel]) -> tuple[str, ...]:
     """Kinds of joints that a model describes."""
     return get_args(model.model_fields["kind"].annotation) if "kind" in model.model_fields else ()
+
+
+def _kinds_phrase(info: FieldInfo | None) -> str:
+    """Write the kinds of joints that a field may have."""
+    found = {tag for model in _models_in_annotation(info and info.annotation) for tag in _kinds(model)}
+    return "one of kind: " + ", ".join(kind for kind in JOINT_KINDS if kind in found)
 
 
 def _tags(model: type[BaseModel]) -> tuple[str, ...]:
@@ -198,9 +203,9 @@ def _message_and_valid(error: ErrorDetails, at: _Location, root: type[BaseModel]
         case "union_tag_not_found":
             close = [k for k in given if did_you_mean(k, ["kind"])] if isinstance(given, dict) else []
             hint = f" ({_quote(close[0])} is not a field of it)" if close else ""
-            return f"has no kind{hint}", KINDS
+            return f"has no kind{hint}", _kinds_phrase(info)
         case "union_tag_invalid":
-            return f"has the kind {_quote(context.get('tag'))}", KINDS
+            return f"has the kind {_quote(context.get('tag'))}", _kinds_phrase(info)
         case "int_type" | "int_from_float" | "int_parsing" | "int_parsing_size":
             return f"is {_describe_value(given)}, not a whole number", "a whole number"
         case "bool_type" | "bool_parsing":
@@ -248,6 +253,8 @@ def _describe_non_number(given: Any) -> str:
         return f"is {_describe_value(given)}, not a number"
     if re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", given):
         return f"is the text {_quote(given)}, not a number: leave out the quotes"
+    if re.fullmatch(r"[-+]?\d+,\d+", given):
+        return f"is the text {_quote(given)}: write {given.replace(',', '.')}, with a point"
     if match := re.fullmatch(r"\s*([-+.\deE]*\d)\s*([^\d\s].*)", given):
         return f"is the text {_quote(given)}: write the number alone, {match[1]}, without {match[2]!r}"
     return f"is {_describe_value(given)}, not a number"

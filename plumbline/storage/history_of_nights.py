@@ -7,10 +7,9 @@ night, so only their counts are compared.  The command `history` and the report 
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -317,16 +316,23 @@ class History:
         return json.loads(json.dumps(document, default=str))  # type: ignore[no-any-return]
 
 
-def stored_runs(folder: Path) -> Iterator[StoredRun]:
+def stored_runs(folder: Path, log: Callable[[str], None] = lambda _: None) -> Iterator[StoredRun]:
     """Read the runs of a folder whose results.json is readable.
+
+    Args:
+        folder: as of `night_folders`.
+        log: gets a line for each run that is left out.
 
     Yields:
         One run at a time, in the order of the folders' names.
 
     """
     for path in night_folders(folder):
-        with contextlib.suppress(OSError, DamagedResults):
+        try:
             document = read_results(path)
+        except (OSError, DamagedResults) as error:
+            log(f"damaged, left out: {path.name}: {shorten(' '.join(str(error).split()), MAX_REASON)}")
+        else:
             yield StoredRun(path, document["run"], document["findings"])
 
 
@@ -356,9 +362,9 @@ def _read_complete_run(folder: Path) -> StoredRun:
     return run
 
 
-def last_findings(folder: Path) -> frozenset[str]:
+def last_findings(folder: Path, log: Callable[[str], None] = lambda _: None) -> frozenset[str]:
     """Return the names of the findings of the last night of a folder; none where it has no night."""
-    last = max(stored_runs(folder), key=lambda run: run.order, default=None)
+    last = max(stored_runs(folder, log), key=lambda run: run.order, default=None)
     return frozenset() if last is None else frozenset(finding["name"] for finding in last.findings)
 
 

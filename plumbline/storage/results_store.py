@@ -103,6 +103,9 @@ _MADE_OF_RESULTS = (
     "findings.sarif",
     "scripts/index.json",
     "scripts/*.py",
+    "model.json",  # of `plumbline model`, whose results a folder has instead of those of a run
+    "model.html",
+    "model.sarif",
 )
 
 
@@ -344,7 +347,8 @@ def read_model_results(folder: Path) -> Record:
         sound &= about["base"] in ("auto", "fixed", "free") and isinstance(about["strip_geometry"], bool)
         sound &= isinstance(about["root"], str | None)
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise DamagedResults(f"{path}: no results of `plumbline model`: {error!r}") from None
+        found = shorten(f"{type(error).__name__}: {error}", 200)
+        raise DamagedResults(f"{path}: no results of `plumbline model` ({found})") from None
     if not sound:
         raise DamagedResults(f"{path}: no results of `plumbline model`: a row or an option is damaged")
     return document  # type: ignore[no-any-return]

@@ -189,6 +189,25 @@ def test_a_refusal_is_an_answer_and_a_gap_only_where_the_importer_was_named(tmp_
     assert others == {"agrees", "information"}
 
 
+def test_an_importer_of_another_format_says_so(tmp_path, monkeypatch):
+    for module in ("model_run", "model_rows"):
+        monkeypatch.setattr(
+            f"plumbline.model_files.{module}.declared_importer_attribute", lambda *_: ["mjcf"]
+        )
+    path = tmp_path / "arm.urdf"
+    path.write_text(ROBOT)
+    assert "pinocchio: Pinocchio reads MJCF files only" in run(path, "--engine", "pinocchio", code=1).stdout
+
+
+def test_a_scenario_file_never_replaces_its_model_file(tmp_path):
+    path, link = tmp_path / "arm.urdf", tmp_path / "link.urdf"
+    path.write_text(ROBOT)
+    link.symlink_to(path)
+    for to in (path, link):
+        result = run(path, "--to-scenario", to, code=2)
+        assert "would overwrite the model file" in result.stderr and path.read_text() == ROBOT
+
+
 def test_one_state_can_be_given(tmp_path):
     path = tmp_path / "arm.urdf"
     path.write_text(ROBOT)

@@ -40,6 +40,7 @@ def test_a_folder_that_another_command_writes_to_is_refused(results, tmp_path, c
     with FileLock(results / LOCK_FILE):
         result = invoke(command, *words, code=ExitCode.BAD_USAGE)
         assert "another command writes to" in " ".join(result.stderr.split())
+        assert ("--out" in result.stderr) == ("--out" in words)
     assert before.items() == {path: path.stat().st_mtime_ns for path in results.rglob("*")}.items()
 
 

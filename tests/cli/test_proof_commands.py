@@ -50,6 +50,11 @@ def test_prove_writes_a_certificate_and_prints_radii(certificate):
     assert len(document["times"]) == round(0.25 / scenario.sample_interval) + 1
 
 
+def test_a_duration_between_samples_is_proved_to_the_sample_after_it(tmp_path):
+    document = json.loads(gzip.decompress(prove("tumbling-ball", 0.1, tmp_path)[0].read_bytes()))
+    assert float.fromhex(document["times"][-1]) >= 0.1
+
+
 @pytest.mark.parametrize("name", ["../../evil", "/ABSOLUTE/evil", "sub/evil", "..\\evil", ".evil"])
 def test_a_name_never_leads_out_of_the_folder(tmp_path, name):
     source = find_scenario_file("tumbling-ball").read_text()

@@ -100,12 +100,29 @@ def test_words_of_a_command_reach_the_program_as_they_are(tmp_path):
 
 def test_a_bad_project_file_is_bad_usage(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for text in ("[engines", "[engines]\nx = 1\n", "engines = 3\n"):
-        Path("plumbline.toml").write_text(text)
+    for text in ("[engines", "[engines]\nx = 1\n", "engines = 3\n", "# \xe9"):
+        Path("plumbline.toml").write_bytes(text.encode("latin-1"))
         done = invoke(*RUN, "--engine", "mine", code=2)
         assert "plumbline.toml" in done.stderr
-    with pytest.raises(BadSpecification):
+    Path("plumbline.toml").unlink()
+    Path("plumbline.toml").mkdir()
+    with pytest.raises(BadSpecification, match=r"plumbline\.toml: Is a directory"):
         list(specifications.found_engines(tmp_path))
+
+
+@pytest.mark.parametrize(
+    "text, engine, reason",
+    [
+        ("", "math:pi", "must be a class derived from Adapter"),
+        ("from plumbline.engines.adapter import Adapter", "mine.py:Adapter", "TypeError: "),
+        ("def", "mine.py:Mine", "SyntaxError: "),
+        ("1 / 0", "mine.py:Mine", "ZeroDivisionError: division by zero"),
+    ],
+)
+def test_an_adapter_that_cannot_be_served_is_bad_usage(tmp_path, monkeypatch, text, engine, reason):
+    monkeypatch.chdir(tmp_path)
+    Path("mine.py").write_text(text)
+    assert reason in " ".join(invoke("serve", engine, code=2).stderr.split())
 
 
 def test_an_adapter_of_a_file_is_a_column(tmp_path):

@@ -68,6 +68,8 @@ def test_installed_it_compares_engines_and_writes_one_folder(unpacked, tmp_path)
     assert agreed(done.stdout) >= 14
     run = read_results(tmp_path / "plumbline-out")["run"]
     assert run["commit"] is None and "certified" in run["truth"]
+    done = run_plumbline("history", cwd=tmp_path, path=[unpacked], code=2)
+    assert "no folder plumbline-out/nightly" in done.stderr
 
 
 @pytest.mark.timeout(300)

@@ -124,7 +124,9 @@ def test_the_command_lists_and_writes(tmp_path):
     assert listed.exit_code == 0
     key = listed.stdout.split(": ")[0]
     assert key.endswith("moon.xml/pinocchio/model/-/gravity_force")
-    assert runner.invoke(main, ["reproduce", str(out), "no/such/key"]).exit_code == 2
+    for words in ((key, "no/such/key"), (key, "--form", "pinochio")):
+        assert runner.invoke(main, ["reproduce", str(out), *words]).exit_code == 2
+        assert not (out / "scripts").exists()
     wrong = runner.invoke(main, ["reproduce", str(out), key, "--form", "drake"])
     assert wrong.exit_code == 1
     assert "pinocchio differs; a script for drake cannot show that" in wrong.stderr

@@ -89,6 +89,8 @@ def test_the_command_lists_and_writes(results):
     code, refused = command("reproduce", results, "nothing")
     assert code == 2 and "no row 'nothing' disagrees here" in refused
     assert "did you mean 'a'?" in command("reproduce", results, "aa")[1]
+    code, refused = command("reproduce", results, "a", "--form", "mujoco")
+    assert code == 2 and "--form is for results of `model`" in refused
     code, refused = command("reproduce", results, "b")
     assert code == 1 and "relations of runs have no script" in refused
 

@@ -55,6 +55,13 @@ def test_a_loop_that_cannot_be_is_refused_with_its_place(old, new, message):
     assert re.match(r"^\S+:\d+:\d+: ", problem)
 
 
+def test_a_loop_is_closed_by_any_joint_but_a_free_one():
+    closing = FOUR_BAR[FOUR_BAR.rindex("  - body") :]
+    (problem,) = problems(closing, closing.replace("kind: hinge", "kind: free"))
+    assert "has the kind 'free'; valid would be one of kind: rod, ball, hinge, " in problem
+    assert problem.endswith(", weld")
+
+
 def test_rates_that_open_the_loop_are_refused():
     rates = re.sub(r"(coordinates: \[[-0-9.]+\])\}", r"\1, rates: [1.0]}", FOUR_BAR)
     with pytest.raises(ScenarioError, match="opens: rates differ by"):

@@ -146,6 +146,28 @@ def test_a_damaged_night_is_named_and_left_out(tmp_path, name, spoil, words):
         assert "20260103" in shown.stdout and "damaged, left out: 20260102T000000Z: " in shown.stderr
 
 
+def test_only_new_findings_of_nights_that_can_be_read(tmp_path):
+    store_run(tmp_path / "nights", 1, ["agrees"])
+    (tmp_path / "nights" / "20260101T000000Z" / "results.json").write_text("{")
+    out = tmp_path / "out"
+    words = (
+        "run",
+        "rest",
+        "--engine",
+        "reference",
+        "--level",
+        "state",
+        "--jobs",
+        1,
+        "--out",
+        out,
+        "--new-only",
+    )
+    assert "damaged, left out: 20260101T000000Z: " in invoke(*words, tmp_path / "nights", code=0).stderr
+    (tmp_path / "file").write_text("")
+    assert "is a file and no folder of nights" in invoke(*words, tmp_path / "file", code=2).stderr
+
+
 def test_an_empty_folder_has_no_nights(tmp_path):
     document = History(tmp_path).to_document("*")
     assert document.pop("last_green") is None

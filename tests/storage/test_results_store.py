@@ -13,6 +13,7 @@ import pytest
 from plumbline.judging.rows import Row, RowContext
 from plumbline.storage import results_store
 from plumbline.storage.results_schema import DamagedResults
+from reports import model_page
 from tests.helpers import ROOT
 from tests.helpers.nightly_tests import SLOW
 
@@ -181,6 +182,23 @@ def test_temporary_files_of_a_killed_run_are_removed(tmp_path):
         (tmp_path / name).write_text("half")
     write_results(tmp_path)
     assert not list(tmp_path.glob(".*"))
+
+
+def test_a_folder_has_results_of_a_run_or_of_model(tmp_path):
+    options = {"at": None, "base": "auto", "root": None, "strip_geometry": False}
+    document = {"files": [], "problems": [], "options": options, "engines": {}}
+    write_results(tmp_path)
+    model_page.write(tmp_path, document | dict.fromkeys(("version", "commit", "started", "command"), ""))
+    assert not (tmp_path / "results.json").exists() and (tmp_path / "model.json").is_file()
+    write_results(tmp_path)
+    assert (tmp_path / "results.json").is_file() and not list(tmp_path.glob("model.*"))
+
+
+def test_a_damaged_document_of_model_is_one_short_sentence(tmp_path):
+    (tmp_path / "model.json").write_bytes(bytes(range(128, 256)) * 1000)
+    with pytest.raises(DamagedResults, match="no results of `plumbline model`") as error:
+        results_store.read_model_results(tmp_path)
+    assert len(str(error.value)) < 400 + len(str(tmp_path))
 
 
 def assert_damaged(path, words, read, *arguments):
