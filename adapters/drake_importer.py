@@ -19,8 +19,8 @@ transmissions are not compared.
 
 from __future__ import annotations
 
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -40,7 +40,6 @@ from adapters.importer_common import (
 )
 from plumbline.importers.importer import ModelFile
 from plumbline.importers.neutral_model import ElementaryJoint, ModelQuantities, NeutralBody
-from plumbline.importers.xml_tree import read_xml
 from plumbline.model.datatypes import Array
 from plumbline.model.kinematics import rotation_matrix
 
@@ -183,8 +182,7 @@ class DrakeImporter(LoadingImporter):
         plant = MultibodyPlant(0.0)
         Parser(plant).AddModels(file.path)
         if file.format == "urdf" and file.base == "fixed":
-            joints = read_xml(Path(file.path), file.path).find_all("joint")
-            children = {child.attributes.get("link") for j in joints for child in j.find_all("child")}
+            children = {child.get("link") for child in ElementTree.parse(file.path).iterfind("joint/child")}
             for index in range(1, plant.num_bodies()):
                 body = plant.get_body(BodyIndex(index))
                 if body.name() not in children:
