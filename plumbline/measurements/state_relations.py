@@ -52,7 +52,6 @@ from plumbline.model.redescription import (
 )
 from plumbline.model.welding import split_bodies
 from plumbline.truth.rounding_bound import (
-    MAX_RELATIVE_BOUND,
     RoundingBound,
     rounding_bounds,
     state_rounding_bound,
@@ -63,8 +62,9 @@ ROOT_MOVED, JOINTS_AS_RODS = "root moved", "joints as rods"
 INERTIA_AS_ROTORS, SPRINGS_AS_LOADS = "inertia as rotors", "springs as loads"
 REDESCRIPTIONS = (ROOT_MOVED, JOINTS_AS_RODS, INERTIA_AS_ROTORS, SPRINGS_AS_LOADS)
 MAX_STATES, LONG_CHAIN_BODIES = 4, 12  # states per relation; half of them for chains of more bodies
-# What an engine may add to rounding by the uncertainty of its limit: as much again, or what hides no mistake.
-LIMIT_SHARE = 2.0
+# What an engine may add to rounding by the uncertainty of its limit: as much again, or this share of the
+# quantity's scale.  Limits of MuJoCo's loops of rods are uncertain by up to 1e-7 of it (bricard).
+LIMIT_SHARE, MAX_UNCERTAINTY = 2.0, 1e-6
 MAX_LOOSENESS = 1e-3  # of both together, over the quantity's scale; bounds of light bodies may be near it
 Q = np.array([1.0, 2.0, 3.0, 4.0]) / np.sqrt(30.0)  # unit quaternion that rotates no axis into an axis
 QUANTITIES = (
@@ -401,7 +401,7 @@ def check_state_relation(
                 theirs_allowed = np.max(theirs_allowed)
             both = np.asarray(bounds[index].tolerance(q)) + theirs_allowed
             scale = np.asarray(bounds[index].scale[q])
-            most = np.maximum(LIMIT_SHARE * both, MAX_RELATIVE_BOUND * scale)
+            most = np.maximum(LIMIT_SHARE * both, MAX_UNCERTAINTY * scale)
             most = np.minimum(most, np.where(scale > 0, MAX_LOOSENESS * scale, np.inf))
             both = both + sum((answer.limit_error or {}).get(q, 0.0) for answer in (here, other))
             loose[q] += bool(np.any(both > most))
