@@ -18,14 +18,13 @@ import numpy as np
 
 from plumbline.engines.adapter import Adapter, EngineInfo
 from plumbline.engines.environments import declared_attribute
-from plumbline.engines.missing_names import FAILED_PARTS, IS_APART, MISSING_NAMES, OWN_PACKAGES
+from plumbline.engines.missing_names import FAILED_PARTS, IS_APART, LATER_CALLS, MISSING_NAMES, OWN_PACKAGES
 from plumbline.engines.no_answer import NoAnswer, attempt
 from plumbline.engines.registry import load_adapter
 from plumbline.engines.variants import VariantKind
 from plumbline.model.datatypes import (
     Array,
     Call,
-    EngineFailure,
     Float,
     Integrator,
     Model,
@@ -202,16 +201,13 @@ def evaluate_variants(adapter: Adapter, model: Model, states: Sequence[State]) -
 
 
 def stack_answers(answers: Sequence[SurfaceAnswer]) -> dict[str, dict[Call, Array]]:
-    """Put the answers at all states into one array per call, up to the first state at which a part failed.
+    """Put the answers at all states into one array per call, up to the first state that lacks it.
 
     Args:
         answers: of the surface, one per state; later states may lack calls of the first.
 
-    Raises:
-        EngineFailure: a call is missing at a state where no part failed, and not at a later one.
-
     """
-    found = dict[str, dict[Call, list[Array]]]()
+    found, later = dict[str, dict[Call, list[Array]]](), dict[Call, Array]()
     for place, one in enumerate(answers):
         for quantity, by_call in one.items():
             for call, value in by_call.items():
@@ -220,9 +216,8 @@ def stack_answers(answers: Sequence[SurfaceAnswer]) -> dict[str, dict[Call, Arra
                 if not without or quantity in (FAILED_PARTS, MISSING_NAMES):
                     stacked.append(value)
                 elif not any(FAILED_PARTS in other for other in without):
-                    at = f"{len(stacked)}, but not at state {place}"
-                    raise EngineFailure(f"the {quantity} by {', '.join(call)} is missing at state {at}")
-    return {
+                    later[call] = np.zeros((1, 1, 1))
+    return ({LATER_CALLS: later} if later else {}) | {
         quantity: {call: np.array(values) for call, values in calls.items() if values}
         for quantity, calls in found.items()
     }

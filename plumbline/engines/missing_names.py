@@ -16,6 +16,8 @@ FoundAnswer = dict[str, dict[Call, Array]]  # a `SurfaceAnswer` while it is made
 # Under these names an answer of the surface has the names of the engine that its version lacks, and what
 # parts failed by, each with the place of what was raised.
 MISSING_NAMES, FAILED_PARTS = "missing names", "failed parts"
+# And the calls that it has at later states than one at which it lacks them, where no part failed.
+LATER_CALLS = "later calls"
 # Whether each part has a process of its own, that a crash ends alone.
 IS_APART = ContextVar("IS_APART", default=False)
 # The labels of the parts that run; None: all of them do.

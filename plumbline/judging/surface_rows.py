@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plumbline.engines.engine_calls import Evaluation
-from plumbline.engines.missing_names import FAILED_PARTS, MISSING_NAMES
+from plumbline.engines.missing_names import FAILED_PARTS, LATER_CALLS, MISSING_NAMES
 from plumbline.judging.rows import (
     FAILED_CALLS,
     WRONG_CALL,
@@ -23,6 +23,8 @@ from plumbline.model.datatypes import Array
 from plumbline.truth.ground_truth import StateTruth
 from plumbline.truth.rounding_bound import MAX_RELATIVE_BOUND, TINY, bound_over_scale
 from plumbline.truth.surface_truth import SURFACE_QUANTITIES, SurfaceTruth
+
+NOTES = (FAILED_PARTS, LATER_CALLS, MISSING_NAMES)  # in a surface, beside the quantities
 
 
 def judge_surface(context: RowContext, truth: StateTruth, evaluation: Evaluation) -> list[Row]:
@@ -43,12 +45,16 @@ def judge_surface(context: RowContext, truth: StateTruth, evaluation: Evaluation
         for name in SURFACE_QUANTITIES
         if name in truth.surface and evaluation.surface.get(name)
     ]
-    if unknown := sorted({*evaluation.surface} - {*SURFACE_QUANTITIES, FAILED_PARTS, MISSING_NAMES}):
+    if unknown := sorted({*evaluation.surface} - {*SURFACE_QUANTITIES, *NOTES}):
         reason = f"the surface of {context.title} has unknown quantities: {', '.join(unknown)}"
         rows.append(context.make_row("surface", "-", "all", Verdict.FAILED, reason))
     if parts := sorted(evaluation.surface.get(FAILED_PARTS, ())):
         reason, place = ("; ".join(some) for some in zip(*parts, strict=True))
         rows.append(context.make_row("surface", "-", "all", Verdict.FAILED, reason, place=place))
+    if later := evaluation.surface.get(LATER_CALLS):
+        calls = "; ".join(", ".join(call) for call in later)
+        reason = f"compared up to the first state at which {context.title} does not report it: by {calls}"
+        rows.append(context.make_row("surface", "-", "all", Verdict.INFORMATION, reason))
     if missing := evaluation.surface.get(MISSING_NAMES):  # what was not compared is no agreement
         names = ", ".join(name for call in missing for name in call)
         reason = f"version {context.version} has no {names}: what they report is not compared"

@@ -377,7 +377,7 @@ def without_first_velocity(answers):
     ("change", "verdict", "reason"),
     [
         (refused, Verdict.UNSUPPORTED, "it has not converged"),
-        (without_first_velocity, Verdict.FAILED, "is missing at state 0, but not at state 1"),
+        (without_first_velocity, Verdict.INFORMATION, "up to the first state at which The engine does not"),
         (lambda answers: answers[:1], Verdict.FAILED, "pinocchio._surface answered 1 of 3 states"),
         (lambda answers: [one | {"frame_velocitty": {("f",): np.ones((1, 3))}} for one in answers],
          Verdict.FAILED, "the surface of The engine has unknown quantities: frame_velocitty"),
