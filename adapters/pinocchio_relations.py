@@ -138,6 +138,7 @@ def _velocity_map(s: Probed) -> Array:
 def _add_tangent_maps(s: Probed) -> None:
     m, q, v, back = s.m, s.q, s.v, _velocity_map(s)
     T = np.linalg.pinv(back)
+    T[np.abs(T) < 1e-15] = 0.0  # rounding between coordinates that do not meet, of which one may rest
     compact = np.reshape(pin.compactTangentMap(m, q), (m.nq, -1))
     sizes, starts = map(list, pin.getTangentToConfigurationSparsitySegment(m))
     rows = [row[:n] @ v[at : at + n] for row, at, n in zip(compact, starts, sizes, strict=True)]
