@@ -23,6 +23,7 @@ from plumbline.judging.rows import WRONG_CALL, RowContext
 from plumbline.processes.remote_python import call_fresh, call_remote
 from plumbline.processes.worker_pool import Limits, Task, WorkerPool
 from plumbline.truth.certified_state import certify_state
+from plumbline.truth.rounding_bound import state_rounding_bound
 from tests.helpers.catalogue import catalogue_scenario
 from tests.helpers.commands import invoke
 from tests.helpers.exudyn_initial_accelerations import initial_accelerations
@@ -180,7 +181,8 @@ def test_columns_load_without_the_names_of_later_versions(engine, column, scenar
     s = catalogue_scenario(scenario)
     asked = engine, LATER_NAMES[engine], column, s.model, s.state
     found = call_fresh(PYTHON, acceleration_without, *asked)
-    np.testing.assert_allclose(found, certify_state(s.model, s.state).quantities.acceleration, rtol=1e-9)
+    off = np.linalg.norm(found - certify_state(s.model, s.state).quantities.acceleration, axis=1)
+    assert np.all(off <= state_rounding_bound(s.model, s.state).acceleration)
 
 
 # --- real versions: fetched once, then from the cache ------------------------------------------
@@ -291,7 +293,7 @@ MENDED = [
     ("helical-screw", "pinocchio@3.7.0", "add mimic momenta: crashed", ["all"]),
     ("helical-screw", "pinocchio@3.8.0", "appendModel, FrameType.BODY",
      by("spelling", *MOTION, *FORCES, *BODIES)),
-    ("tumbling-ball", "exudyn@1.8.0", "add started bodies", ["all"]),
+    ("tumbling-ball", "exudyn@1.8.0", "the frame axes by MainSystem.CreateRigidBody", ["frame_axes"]),
     ("sprung-hinge", "exudyn@1.10.0", "MainSystem.CreateTorsionalSpringDamper", ["all_by_spelling"]),
     ("tree-of-seven", "exudyn-tree@1.11.0", "",
      [*MOTION, *by("option", *MOTION), *by("spelling", *MOTION)]),
