@@ -9,10 +9,10 @@ The neutral model's conventions are MuJoCo's: ordered joints in a body, coordina
 
 What is not compared is switched off after compiling: actuators with their armature and damping, forces of
 tendons and flexes, terms of joint springs and dampers that are not linear, buoyancy and drag of a fluid,
-gravity compensation.  Contacts, limits, equalities and friction loss do not enter these
-quantities.  A URDF's root link is fused with the world, MuJoCo's default; with a free base links are not
-fused and the root link gets a free joint.  Of
-MuJoCo's extension <mujoco> in a URDF only the places of files hold: the other importers do not read it.
+gravity compensation.  Contacts, limits, equalities and friction loss do not enter these quantities.  A URDF's
+root link is fused with the world, MuJoCo's default; with a free base links are not fused and the root link
+gets a free joint.  Of MuJoCo's extension <mujoco> in a URDF only the folders of files are used: the other
+importers do not read it.
 """
 
 from __future__ import annotations

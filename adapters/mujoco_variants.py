@@ -388,7 +388,7 @@ def _never_asleep(spec: Any) -> Any:
 
 
 def _forward_after_steps(m: Any, d: Any) -> None:
-    """Take steps of no time, after which what may sleep does."""
+    """Take steps of zero length, until all that may fall asleep has."""
     step, m.opt.timestep = m.opt.timestep, 0.0
     d.xfrc_applied[:] += 0.0  # −0 is a load that keeps bodies awake
     for _ in range(MAX_AWAKE):

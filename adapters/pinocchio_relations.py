@@ -62,7 +62,7 @@ def _add_configurations(s: Probed) -> None:
         long[at] *= LONG
 
     def is_told_apart() -> bool:
-        """Whether q, and of others only q, is said to be normalized and the same as q."""
+        """Whether Pinocchio tells q from configurations that are not normalized, or not the same."""
         is_unit = [pin.isNormalized(m, x) for x in (q, long)]
         is_same = [pin.isSameConfiguration(m, q, x, 1e-9) for x in (q.copy(), before)]
         return is_unit == [True, bool(np.array_equal(q, long))] and is_same == [True, False]

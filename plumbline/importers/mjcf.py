@@ -317,9 +317,8 @@ class DefaultClasses:
         self.classes: dict[str, list[Element]] = {}  # name → the elements <default>, the own one first
         self.class_of: dict[int, str] = {}  # id of an element of the worldbody → its class
         tops = root.find_all("default")[::-1]  # each is the class of all elements, whatever its name
-        stack = [
-            (top, tops[place:]) for place, top in enumerate(tops)
-        ]  # a class copies what is set before it
+        # a class copies what is set before it
+        stack = [(top, tops[place:]) for place, top in enumerate(tops)]
         while stack:
             element, chain = stack.pop()
             if "class" in element.attributes:

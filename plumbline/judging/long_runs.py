@@ -52,7 +52,7 @@ def judge_long_runs(
     """
     cost = sum(run.cpu_time for run in study.runs)
     if missing := _missing_runs(study):
-        row = context.make_row_of_none(
+        row = context.make_no_answer_row(
             "invariants", integrator.name, ALL_LONG, *missing,
             cpu_time=cost, extra={"asked": study.plan.requested_seconds},
         )  # fmt: skip

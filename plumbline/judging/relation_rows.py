@@ -25,7 +25,7 @@ def judge_relations(context: RowContext, results: Sequence[RelationResult]) -> J
 def _relation_row(context: RowContext, result: RelationResult) -> Row:
     integrator, name = result.integrator, result.relation
     if result.no_answer:
-        return context.make_row_of_none("relations", integrator, name, result.no_answer)
+        return context.make_no_answer_row("relations", integrator, name, result.no_answer)
     if result.ratio is None:
         reason = f"not compared: {result.note}"
         return context.make_row("relations", integrator, name, Verdict.INFORMATION, reason)

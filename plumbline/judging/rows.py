@@ -278,7 +278,7 @@ class RowContext:
             verdict=verdict, reason=reason, **more,
         )  # fmt: skip
 
-    def make_row_of_none(
+    def make_no_answer_row(
         self, level: Level, integrator: str, quantity: str, found: NoAnswer, before: str = "", **more: Any
     ) -> Row:
         """Make a row of what an engine refused or failed at.

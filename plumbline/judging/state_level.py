@@ -63,7 +63,7 @@ def judge_states(context: RowContext, truth: StateTruth, evaluation: Evaluation)
 
     """
     if evaluation.no_answer:
-        return JudgingResult([context.make_row_of_none("state", "-", "all", evaluation.no_answer)])
+        return JudgingResult([context.make_no_answer_row("state", "-", "all", evaluation.no_answer)])
     result = JudgingResult(fingerprints=state_fingerprints(evaluation.quantities))
     for quantity, unit in STATE_UNITS.items():
         if all(getattr(true, quantity) is None for true in truth.quantities):

@@ -109,7 +109,7 @@ def _single_step_rows(
         return [context.make_row("step", integrator.name, "all", verdict, reason)]
 
     def none(found: NoAnswer) -> list[Row]:
-        return [context.make_row_of_none("step", integrator.name, "all", found)]
+        return [context.make_no_answer_row("step", integrator.name, "all", found)]
 
     attempts, runs = [attempt for attempt in answer.attempts if attempt.run is not None], answer.runs
     is_constrained = isinstance(method, ConstrainedMethod)  # where fewer steps than asked for have failed
@@ -195,7 +195,7 @@ def _run_rows(
         return [context.make_row("step", integrator.name, "run", verdict, reason)]
 
     def none(found: NoAnswer, before: str = "") -> list[Row]:
-        return [context.make_row_of_none("step", integrator.name, "run", found, before)]
+        return [context.make_no_answer_row("step", integrator.name, "run", found, before)]
 
     run, h = attempt.run, attempt.step
     failed = none(attempt.failure, f"in a run of {h:g} s per step: ") if attempt.failure else []

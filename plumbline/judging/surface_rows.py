@@ -39,7 +39,7 @@ def judge_surface(context: RowContext, truth: StateTruth, evaluation: Evaluation
 
     """
     if evaluation.surface_failure and truth.surface:
-        return [context.make_row_of_none("surface", "-", "all", evaluation.surface_failure)]
+        return [context.make_no_answer_row("surface", "-", "all", evaluation.surface_failure)]
     rows = [
         _row(context, name, truth.surface[name], evaluation)
         for name in SURFACE_QUANTITIES

@@ -54,7 +54,7 @@ def judge_trajectory(
         The rows, and the tables of convergence, curves over time and poses.
 
     """
-    missing = partial(context.make_row_of_none, "trajectory", integrator.name, "all")
+    missing = partial(context.make_no_answer_row, "trajectory", integrator.name, "all")
     if study.refusal:
         return JudgingResult([missing(study.refusal)])
     finest = study.runs[-1]

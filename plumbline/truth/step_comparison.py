@@ -76,7 +76,9 @@ DISTURBANCE = 1e-9  # of rates, to measure the growth of perturbations
 ANGLE_ROUNDINGS = 4
 MAX_STRETCH = 2e-15  # of a joint's quaternions
 MIN_MIDDLE_COSINE = 0.1  # of the second of two or three angles: at 0 two of their axes are one
-STRAY = 1e-3  # from the declared end of a step, over the sizes there: such an end tells nothing of the step
+# Distance of a sample from the declared end of its step, over the sizes there, beyond which bounds and
+# effects do not use the sample: it would widen its own bound.
+STRAY = 1e-3
 MAX_DISTANCE = 10.0  # of bodies from where their mechanism hangs, or from its free body, over its size
 MAX_COSINE_CHANGE = 1 / 2  # of that cosine in a step, over itself
 MAX_TURN = 1.0  # rad, step × fastest rate: beyond it explicit methods become unstable, and bounds do not hold
@@ -562,7 +564,8 @@ def _formula_errors(model: Model, states: State, scale: Array) -> Array:
 
     Its recursion loses digits where light bodies carry heavy ones, as in doubles, where the same loss shows
     and is larger by the ratio of the two precisions.  Of the samples of a run, the largest loss counts, in
-    itself or over ``scale`` (S, 2, N), whichever is less: one wild sample tells little of the others.
+    itself or over ``scale`` (S, 2, N), whichever is less, so that one sample that is far off does not
+    widen the bounds of the others.
     """
     count = len(states.p)
     some = _every_few(count)
